@@ -1,0 +1,1 @@
+"""What a benchmark does with methods: run, time, tabulate, report."""

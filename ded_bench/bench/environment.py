@@ -1,0 +1,55 @@
+"""What a row's times depend on: hardware, package and solver versions, date."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import hashlib
+import importlib.metadata
+import os
+import platform
+from pathlib import Path
+
+PACKAGES = ("pyomo", "casadi", "highspy", "torch", "numpy", "scipy", "pandas")
+
+
+@functools.cache
+def host() -> str:
+    """The machine in words, with a short hash of its name to tell equal machines apart."""
+    name = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+    return f"{_cpu()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()} ({name})"
+
+
+@functools.cache
+def version() -> str:
+    """Version of this package."""
+    return importlib.metadata.version("ded-bench")
+
+
+def now() -> str:
+    """The time, ISO 8601 in UTC."""
+    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def environment() -> dict[str, str]:
+    """Versions and hardware for the report."""
+    facts = {"ded-bench": version(), "python": platform.python_version()}
+    facts |= {name: importlib.metadata.version(name) for name in PACKAGES}
+    return facts | {"host": host(), "memory": _memory()}
+
+
+def _cpu() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown processor"
+
+
+def _memory() -> str:
+    try:
+        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
+    except (OSError, ValueError):
+        return "unknown"

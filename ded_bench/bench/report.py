@@ -1,0 +1,389 @@
+"""The report of a results folder: tables and figures → Markdown, one HTML page, LaTeX, CSV."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ded_bench.bench.environment import environment, now
+from ded_bench.bench.gallery import Gallery, draw
+from ded_bench.bench.layout import (
+    CERTIFICATE,
+    CLAIMS,
+    EXPLANATION,
+    GAPS,
+    LOADED_TIMES,
+    RATES,
+    TABLE_V,
+    TABLE_VI,
+    TIMING,
+    TRAINING,
+    VIOLATIONS,
+    WORST,
+)
+from ded_bench.bench.metrics import (
+    TIME_SHIFT_S,
+    claims,
+    judged_rows,
+    summary,
+    table_times,
+    title,
+    worst,
+)
+from ded_bench.bench.page import (
+    Block,
+    Heading,
+    Items,
+    Table,
+    Text,
+    Warnings,
+    render_html,
+    render_markdown,
+)
+from ded_bench.bench.paper import paper_numbers, table_v, table_vi
+from ded_bench.bench.results import Results
+from ded_bench.bench.tables import Column, to_latex, to_markdown
+from ded_bench.bench.timing import latest_host, read_timing, timing_frame
+from ded_bench.problem.arrays import read_arrays
+from ded_bench.problem.case import Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.sampling import load_manifest, load_split
+from ded_bench.problem.strict import read_text, write_atomically
+
+#: One-minute load average above which a timing was not alone on the machine.
+BUSY = 1.5
+
+
+def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
+    """Write tables, figures and the report of a results folder into it.
+
+    Whatever is missing (times, policies, a method, all rows) is said in the report.
+
+    Args:
+        folder: the results folder.
+        problems: folder of the case's instances, split and manifest.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: results.csv or timing.csv is wrong.
+    """
+    results = Results(folder)
+    everything = results.frame()
+    everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
+    frame = judged_rows(everything)
+    timings = timing_frame(read_timing(folder / "timing.csv"))
+    timing = latest_host(timings[timings["case"] == case.id])
+    paper = paper_numbers(case)
+    gallery = draw(case, results, frame, timing, problems)
+    frames = {
+        "table_v": table_v(frame, timing, paper),
+        "table_vi": table_vi(frame, paper),
+        "summary": summary(frame),
+        "claims": claims(frame),
+        "times_under_load": table_times(frame),
+        "worst": worst(frame),
+        "training": training_table(folder),
+    }
+    if len(everything) > len(frame):
+        frames["summary_all"] = summary(everything)
+    rows_from = rows_caption(frame, everything)
+    files = _write_tables(folder, frames, rows_from, timing)
+    notes = [*data_notes(frame, everything, timings, timing, case, problems), *gallery.notes]
+    blocks = [
+        *_opening(case, frame, everything, problems, notes),
+        *_results(frames, rows_from, timing, gallery),
+        *_details(frames, rows_from, timing, gallery),
+        *_training(frames["training"], folder, gallery),
+        *_closing(everything, gallery),
+    ]
+    write_atomically(folder / "report.md", render_markdown(blocks))
+    write_atomically(folder / "report.html", render_html(blocks, folder))
+    return [*files, *gallery.files, folder / "report.md", folder / "report.html"]
+
+
+def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
+    """Which rows the tables are about, in words."""
+    if not len(frame):
+        return "no rows yet"
+    instances = frame["instance"].nunique()
+    if (frame["split"] == "test").all():
+        left = len(everything) - len(frame)
+        return f"{instances} test instances" + (f"; {left} other rows left out" if left else "")
+    return f"all {instances} instances, none of them of the test split"
+
+
+def data_notes(
+    frame: pd.DataFrame,
+    everything: pd.DataFrame,
+    timings: pd.DataFrame,
+    timing: pd.DataFrame,
+    case: Case,
+    problems: Path,
+) -> list[str]:
+    """What a reader must know before comparing numbers."""
+    notes = []
+    versions = sorted(set(everything["problems_version"]))
+    try:
+        manifest = load_manifest(problems)
+        n_test = len(load_split(problems).test)
+    except InputError as error:
+        notes.append(f"The problem files cannot be read: {error}")
+        manifest, n_test = None, 0
+    if not len(everything):
+        notes.append(
+            f"No rows yet: `ded-bench solve --case {case.id} --method ded --regime NO,TO` makes some."
+        )
+    if len(versions) > 1:
+        notes.append(
+            f"Rows of different problem versions are not comparable: {', '.join(map(_named, versions))}."
+        )
+    elif manifest and versions and versions[0] != manifest.version:
+        notes.append(
+            f"Rows are of problem version {_named(versions[0])}, but the files are {manifest.version}."
+        )
+    if everything["version"].nunique() > 1:
+        notes.append(
+            f"Rows of several versions of ded-bench: {', '.join(sorted(set(everything['version'])))}."
+        )
+    if strange := sorted(set(frame["regime"]) - set(case.regimes)):
+        notes.append(f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}.")
+    unscored = frame[
+        frame["objective"].isna() & (frame["error"] == "") & frame["status"].isin(("Optimal", "Policy"))
+    ]
+    if len(unscored):
+        notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
+    short = summary(frame)
+    short = short[short["rows"] < n_test]
+    if n_test and len(short) and (frame["split"] == "test").all():
+        for count, rows in short.groupby("rows"):
+            names = ", ".join(f"{row.title} {row.regime}" for row in rows.itertuples())
+            notes.append(f"Only {count} of {n_test} test instances were run: {names}.")
+    if not len(timing):
+        notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
+    elif (timing["load_average"] > BUSY).any():
+        notes.append("Some methods were timed while the machine was busy (see the column load).")
+    if len(timings) > len(timing):
+        notes.append(f"Times of other hosts or cases are left out: {len(timings) - len(timing)} rows.")
+    stale = sorted(set(timing["problems_version"]) - set(versions)) if versions else []
+    if stale:
+        notes.append(f"Times were taken on problem version {', '.join(map(_named, stale))}.")
+    return notes
+
+
+def _named(version: str) -> str:
+    return version or "(none given)"
+
+
+def training_table(folder: Path) -> pd.DataFrame:
+    """How each policy of the folder was trained, from the headers of their files."""
+    rows: list[dict[str, Any]] = []
+    for path in sorted((folder / "policies").glob("*.safetensors")):
+        try:
+            _, header = read_arrays(path)
+        except InputError as error:
+            rows.append({"policy": path.stem, "problem": str(error)})
+            continue
+        facts = header.get("training")
+        kept = facts if isinstance(facts, dict) else {}
+        rows.append({"policy": path.stem, "problem": ""} | {c.name: kept.get(c.name) for c in TRAINING[1:-1]})
+    return pd.DataFrame(rows, columns=[column.name for column in TRAINING])
+
+
+def _write_tables(
+    folder: Path, frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame
+) -> list[Path]:
+    """CSV with every digit of all frames; Markdown of the same; LaTeX of the paper's two tables."""
+    tables = folder / "tables"
+    files = []
+    for name, frame in frames.items():
+        columns = PRINTED.get(name) or [Column(c, c) for c in frame.columns]
+        outputs = {f"{name}.csv": frame.to_csv(index=False), f"{name}.md": to_markdown(frame, columns)}
+        if name in ("table_v", "table_vi"):
+            caption = _captions(rows_from, timing)[name].split(": ", 1)[1].replace("`", "")
+            outputs[f"{name}.tex"] = to_latex(frame, columns, caption, f"tab:{name}")
+        for file, text in outputs.items():
+            write_atomically(tables / file, text)
+            files.append(tables / file)
+    return files
+
+
+PRINTED: dict[str, Sequence[Column]] = {
+    "table_v": TABLE_V,
+    "table_vi": TABLE_VI,
+    "claims": CLAIMS,
+    "times_under_load": LOADED_TIMES,
+    "worst": WORST,
+    "training": TRAINING,
+}
+
+
+def _captions(rows_from: str, timing: pd.DataFrame) -> dict[str, str]:
+    if len(timing):
+        counts = sorted(set(timing["instances"]))
+        timed = f"times: median on {'/'.join(map(str, counts))} instances, alone on {timing['host'].iloc[-1]}"
+    else:
+        timed = "times: not taken yet, run `ded-bench bench`"
+    return {
+        "table_v": f"Table V: Average Solution Time and Change in Objective ({rows_from}; {timed})",
+        "table_vi": f"Table VI: Average maximum constraint violation ({rows_from})",
+    }
+
+
+def _opening(
+    case: Case, frame: pd.DataFrame, everything: pd.DataFrame, problems: Path, notes: Sequence[str]
+) -> list[Block]:
+    counts = everything["split"].value_counts().to_dict()
+    parts = ", ".join(f"{count} on {_split_name(str(name))} instances" for name, count in counts.items())
+    names = ", ".join(dict.fromkeys(summary(frame)["title"])) or "none yet"
+    dates = [date for date in everything["date"] if date]
+    items = [
+        f"Case `{case.id}`: {len(case.buses)} buses, {len(case.generators)} generators besides the slack "
+        f"bus, {len(case.loads)} loads.",
+        f"Methods: {names}.",
+        "Regimes: "
+        + "; ".join(f"{r}, |ω| ≤ {limit.omega_hz:g} Hz" for r, limit in case.regimes.items())
+        + ".",
+        f"Rows: {len(everything)}" + (f" ({parts})." if parts else "."),
+        f"Problem version: {', '.join(map(_named, sorted(set(everything['problems_version'])))) or '–'}.",
+        f"Rows made: {min(dates)} to {max(dates)}." if dates else "Rows made: –.",
+    ]
+    blocks: list[Block] = [
+        Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
+        Warnings(tuple(notes)),
+        Heading("What was run"),
+        Items(tuple(items)),
+    ]
+    return blocks
+
+
+def _split_name(split: str) -> str:
+    return {"train": "training", "none": "other"}.get(split, split)
+
+
+def _results(
+    frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame, gallery: Gallery
+) -> list[Block]:
+    captions = _captions(rows_from, timing)
+    return [
+        Heading("The paper's result tables"),
+        Table(frames["table_v"], TABLE_V, captions["table_v"]),
+        Table(frames["table_vi"], TABLE_VI, captions["table_vi"]),
+        Heading("How to read them", 3),
+        Items(EXPLANATION),
+        Heading("The paper's result figures"),
+        *gallery.of("paper", "No trajectory can be drawn yet."),
+    ]
+
+
+def _details(
+    frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame, gallery: Gallery
+) -> list[Block]:
+    blocks: list[Block] = [
+        Heading("Each method in detail"),
+        Table(frames["summary"], GAPS, f"Gap to DED, % ({rows_from})"),
+        Table(frames["summary"], RATES, "Claimed and verified: shares of all rows"),
+        Table(frames["claims"], CLAIMS, "Solver status against the scorer's verdict, rows"),
+        Table(frames["summary"], VIOLATIONS, "Largest violation of each schedule"),
+    ]
+    if "summary_all" in frames:
+        all_rows = frames["summary_all"]
+        blocks += [Table(all_rows, GAPS, "Gap to DED, %, over all rows, training instances included")]
+    blocks += [Heading("Times")]
+    if len(timing):
+        named = timing.assign(
+            title=[title(m, s) for m, s in zip(timing["method"], timing["settings"], strict=True)]
+        )
+        caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
+        blocks.append(Table(named, TIMING, caption))
+    else:
+        blocks.append(Text("No method was timed alone yet; run `ded-bench bench`."))
+    blocks += [
+        Table(
+            frames["times_under_load"],
+            LOADED_TIMES,
+            "Under parallel load, from the results table: comparable by orders of magnitude only, s",
+        ),
+        Text(f"The shifted geometric mean uses a shift of {TIME_SHIFT_S:g} s."),
+        Heading("Gap against time"),
+        *gallery.of("tradeoff", "No gap yet: it needs rows of DED and of another method."),
+        *gallery.of("profile"),
+        Heading("Worst instances"),
+        Table(
+            frames["worst"], WORST, "The three largest gaps and the three largest violations of each method"
+        ),
+        *gallery.of("worst"),
+    ]
+    return blocks
+
+
+def _training(table: pd.DataFrame, folder: Path, gallery: Gallery) -> list[Block]:
+    blocks: list[Block] = [Heading("Koopman models"), *_rollout_errors(folder), *gallery.of("koopman")]
+    blocks.append(Heading("Training of the policies"))
+    if len(table):
+        blocks.append(Table(table, TRAINING))
+    else:
+        blocks.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
+    blocks += gallery.of("training")
+    blocks.append(Heading("Certificate"))
+    path = folder / "certificate.json"
+    if not path.is_file():
+        blocks.append(Text("No certificate was made for these results."))
+        return blocks
+    try:
+        facts = json.loads(read_text(path))
+        rows = _flat(facts) if isinstance(facts, (dict, list)) else [("", facts)]
+        blocks.append(Table(pd.DataFrame(rows, columns=["fact", "value"]).astype(str), CERTIFICATE))
+    except (InputError, ValueError, RecursionError) as error:
+        blocks.append(Warnings((f"The certificate cannot be read: {str(error)[:200]}",)))
+    return blocks
+
+
+def _rollout_errors(folder: Path) -> list[Block]:
+    """Tables that `train-ko` leaves beside the models; one that cannot be read is no table."""
+    blocks: list[Block] = []
+    for path in sorted((folder / "koopman").glob("*.errors.csv")):
+        try:
+            errors = pd.read_csv(path)
+        except (OSError, ValueError):
+            continue
+        columns = tuple(Column(str(name), str(name)) for name in errors.columns)
+        caption = "Rollouts over the whole horizon on simulated trajectories held out from the identification"
+        blocks.append(Table(errors, columns, caption))
+    return blocks
+
+
+def _flat(value: Any, path: str = "") -> list[tuple[str, Any]]:
+    """Nested JSON as (path, value) pairs."""
+    if isinstance(value, dict):
+        return [pair for key, part in value.items() for pair in _flat(part, f"{path} {key}".strip())]
+    if isinstance(value, list) and any(isinstance(part, (dict, list)) for part in value):
+        return [pair for i, part in enumerate(value) for pair in _flat(part, f"{path} {i + 1}".strip())]
+    return [(path, value)]
+
+
+def _closing(everything: pd.DataFrame, gallery: Gallery) -> list[Block]:
+    """The problems, and what made the rows."""
+
+    def listed(name: str) -> str:
+        return "; ".join(sorted({str(value) for value in everything[name] if value})) or "–"
+
+    masters = sorted({seed.split(" ")[0] for seed in everything["seed"] if seed})
+    items = [
+        f"Hosts of the rows: {listed('host')}.",
+        f"Versions of ded-bench: {listed('version')}; solvers: {listed('solver_version')}.",
+        f"Parallel workers: {listed('workers')}; one thread each.",
+        f"Master seeds of the instances: {', '.join(masters) or '–'}.",
+    ]
+    here = "; ".join(f"{name} {value}" for name, value in environment().items())
+    return [
+        Heading("The problems"),
+        *gallery.of("problem", "The instances' files are not at hand."),
+        Heading("Environment"),
+        Items((*items, f"This report was written {now()} with: {here}.")),
+    ]

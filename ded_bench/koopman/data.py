@@ -1,0 +1,126 @@
+"""Trajectories to identify and judge models with: simulated, without any optimisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.simulate import simulate_many
+
+KNOTS = 50
+#: `tracking` schedules: lag and smoothing in s, rate as a fraction of the ramp limit; uniform.
+LAG_S, SMOOTH_S, RATE = (0.1, 3.0), (0.02, 0.5), (0.4, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Simulated trajectories side by side, time first."""
+
+    instances: tuple[Instance, ...]
+    kinds: tuple[str, ...]
+    inputs: Array  # (n_points, batch, n_gen + n_load), pu
+    theta: Array  # (n_points, batch, n_bus), rad
+    omega: Array  # (n_points, batch, n_gen), rad/s
+    p_slack: Array  # (n_points, batch), pu
+
+    @property
+    def outputs(self) -> Array:
+        """(ω, P_s), shape (n_points, batch, n_gen + 1)."""
+        return np.concatenate([self.omega, self.p_slack[..., None]], axis=-1)
+
+
+def trajectories(
+    case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
+) -> Trajectories:
+    """Simulate schedules and stack the result."""
+    runs = simulate_many(case, instances, schedules)
+    return Trajectories(
+        tuple(instances),
+        tuple(kinds),
+        np.stack([np.hstack([run.p_gen, run.p_load]) for run in runs], axis=1),
+        np.stack([run.theta for run in runs], axis=1),
+        np.stack([run.omega for run in runs], axis=1),
+        np.stack([run.p_slack for run in runs], axis=1),
+    )
+
+
+def sample_trajectories(
+    case: Case, seed: int, count: int, first: int = 0, mix: Sequence[str] | None = None
+) -> Trajectories:
+    """Simulate `count` fresh instances under the kinds of schedules in `mix` (default: all) in turn."""
+    mix = mix or list(KINDS)
+    instances = [sample_instance(case, KOOPMAN_SEED + seed, i) for i in range(first, first + count)]
+    kinds = [mix[i % len(mix)] for i in range(count)]
+    schedules = []
+    for i, (instance, kind) in enumerate(zip(instances, kinds, strict=True)):
+        rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
+        schedules.append(Schedule(instance.grid, KINDS[kind](case, instance, rng)))
+    return trajectories(case, instances, schedules, kinds)
+
+
+def tracking(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """Follow the static dispatch with a lag and limited rates, smoothed: looks like an optimum.
+
+    The rate limit is drawn below the ramp limit, since a tight frequency bound allows no more.
+    """
+    p_load = instance.p_load(case)
+    target = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+    gain = instance.dt_s / rng.uniform(*LAG_S)
+    smooth = instance.dt_s / rng.uniform(*SMOOTH_S)
+    most = rng.uniform(*RATE) * case.ramp_pu_per_s * instance.dt_s
+    p = np.empty_like(target)
+    p[0] = instance.p_initial(case)
+    step = np.zeros(target.shape[1])
+    for k in range(len(p) - 1):
+        step += smooth * (np.clip(gain * (target[k + 1] - p[k]), -most, most) - step)
+        p[k + 1] = p[k] + step
+    return p
+
+
+def bang_bang(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """Ramp up, down or not at all at the limit, for random whiles, within the bounds."""
+    n_gen, n = len(case.generators), instance.steps
+    rate = np.zeros((n, n_gen))
+    for j in range(n_gen):
+        k = 0
+        while k < n:
+            stop = k + int(rng.uniform(0.5, 8.0) / instance.dt_s)
+            rate[k:stop, j] = rng.integers(-1, 2)
+            k = stop
+    return _within(case, instance, rate * case.ramp_pu_per_s * instance.dt_s)
+
+
+def random_knots(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """A random walk over the policy's knots, linear between them, within the ramp limit."""
+    knots = np.linspace(0.0, instance.horizon_s, KNOTS)
+    slopes = rng.uniform(-1, 1, (KNOTS - 1, len(case.generators))) * case.ramp_pu_per_s
+    at = np.minimum(np.searchsorted(knots, instance.grid[1:], side="left") - 1, KNOTS - 2)
+    return _within(case, instance, slopes[at] * instance.dt_s)
+
+
+def load_ramps(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """Generators stay where they are; only the loads move."""
+    return np.tile(instance.p_initial(case), (instance.steps + 1, 1))
+
+
+def _within(case: Case, instance: Instance, increments: Array) -> Array:
+    p = np.empty((instance.steps + 1, len(case.generators)))
+    p[0] = instance.p_initial(case)
+    for k, increment in enumerate(increments):
+        p[k + 1] = np.clip(p[k] + increment, case.p_min, case.p_max)
+    return p
+
+
+KINDS: dict[str, Callable[[Case, Instance, np.random.Generator], Array]] = {
+    "tracking": tracking,
+    "bang-bang": bang_bang,
+    "random knots": random_knots,
+    "load ramps": load_ramps,
+}

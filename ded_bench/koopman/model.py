@@ -1,0 +1,196 @@
+"""The Koopman surrogate: observables, K, B and G; sequential rollout and its condensed form.
+
+    ψ(x) = (ω, P_s, N(x))
+    ψ_{k+1} = K (ψ_k - B P_k) + B P_k + G (P_{k+1} - P_k)
+
+G = 0 is the paper's eq. (KO_dyn); G = (I - K) B is the same form with the newer input sample; any
+other G is a first-order hold. Inputs are P = (generators, loads). B's ω rows are zero and its P_s
+row is -1, so equilibria are exact: ψ = B P gives ω = 0 and P_s = -Σ P.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ded_bench.problem.arrays import read_arrays, write_arrays
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import Instance
+from ded_bench.truth.swing import Network
+
+SCHEMA = "ded-bench/koopman/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Koopman:
+    """A linear model of (ω, P_s) under generator and load inputs, for one case and time step.
+
+    `lift` maps the features (f at all buses, θ at all buses, ω, P_load, 1) to ψ; an MLP of the
+    paper's x = (θ_gen, P_s, ω), with tanh layers, may add to the last rows of ψ.
+    """
+
+    kind: str
+    case_id: str
+    case_fingerprint: str
+    dt_s: float
+    k: Array  # (n_psi, n_psi)
+    b: Array  # (n_psi, n_gen + n_load)
+    g: Array  # (n_psi, n_gen + n_load)
+    lift: Array  # (n_psi, 2 n_bus + n_gen + n_load + 1)
+    mlp: tuple[tuple[Array, Array], ...] = ()  # (weight, bias) of each layer
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def observables(self, network: Network, theta: Array, omega: Array, p_load: Array) -> Array:
+        """ψ(x), shape (..., n_psi), from angles (..., n_bus), ω (..., n_gen), loads (..., n_load)."""
+        injections = network.injections(theta)
+        one = np.ones((*theta.shape[:-1], 1))
+        psi = np.concatenate([injections, theta, omega, p_load, one], axis=-1) @ self.lift.T
+        if self.mlp:
+            slack = injections[..., [network.slack]]
+            x = np.concatenate([theta[..., network.generators], slack, omega], axis=-1)
+            for weight, bias in self.mlp[:-1]:
+                x = np.tanh(x @ weight.T + bias)
+            weight, bias = self.mlp[-1]
+            psi[..., -len(bias) :] += x @ weight.T + bias
+        return psi
+
+    def initial(self, network: Network, instances: Sequence[Instance]) -> Array:
+        """ψ(x_0) of instances, shape (batch, n_psi)."""
+        case = network.case
+        theta = np.stack([network.initial_angles(i) for i in instances])
+        omega = np.stack([i.omega_initial(case) for i in instances])
+        p_load = np.stack([i.p_load(case, np.zeros(1))[0] for i in instances])
+        return self.observables(network, theta, omega, p_load)
+
+    def rollout(self, psi: Array, inputs: Array) -> Array:
+        """Run the model step by step from ψ_0.
+
+        Args:
+            psi: ψ_0, shape (..., n_psi).
+            inputs: P_k, shape (n_points, ..., n_gen + n_load), pu.
+
+        Returns:
+            ψ_k, shape (n_points, ..., n_psi).
+        """
+        steady = inputs @ self.b.T
+        push = np.diff(inputs, axis=0) @ (self.g - self.b).T
+        away = np.empty((len(inputs), *np.broadcast_shapes(psi.shape, steady.shape[1:])))
+        away[0] = psi - steady[0]
+        for step in range(len(inputs) - 1):
+            away[step + 1] = away[step] @ self.k.T + push[step]
+        return away + steady
+
+    def condense(self, n_gen: int, grid: Array, knots: Array) -> Array:
+        """Γ: the response of (ω, P_s) at every grid point to generator power at the knots.
+
+        The rollout is affine in the knots: outputs = free response + Γ @ knots, where the free
+        response has the loads and ψ_0 but no generator power (see `free_response`).
+
+        Args:
+            n_gen: number of generators.
+            grid: times t_k, shape (n_points,), s.
+            knots: knot times, shape (n_knots,), s.
+
+        Returns:
+            Shape (n_points, n_gen + 1, n_knots, n_gen).
+        """
+        hats = hat_functions(grid, knots)
+        unit = np.zeros((len(grid), len(knots), n_gen, self.b.shape[1]))
+        for j in range(n_gen):
+            unit[:, :, j, j] = hats
+        response = self.rollout(np.zeros(len(self.k)), unit)
+        return np.moveaxis(response[..., : n_gen + 1], -1, 1)
+
+    def free_response(self, psi: Array, p_load: Array) -> Array:
+        """(ω, P_s) without generator power, shape (n_points, ..., n_gen + 1).
+
+        Args:
+            psi: ψ_0, shape (..., n_psi).
+            p_load: load injections, shape (n_points, ..., n_load), pu.
+        """
+        n_gen = self.b.shape[1] - p_load.shape[-1]
+        inputs = np.concatenate([np.zeros((*p_load.shape[:-1], n_gen)), p_load], axis=-1)
+        return self.rollout(psi, inputs)[..., : n_gen + 1]
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when the model's arrays do."""
+        arrays = [self.k, self.b, self.g, self.lift, *(a for layer in self.mlp for a in layer)]
+        return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
+
+    def save(self, path: Path) -> None:
+        """Write arrays and header (see `problem.arrays`)."""
+        arrays = {"k": self.k, "b": self.b, "g": self.g, "lift": self.lift}
+        for i, (weight, bias) in enumerate(self.mlp):
+            arrays |= {f"mlp.{i}.weight": weight, f"mlp.{i}.bias": bias}
+        header = {
+            "schema": SCHEMA,
+            "kind": self.kind,
+            "case": self.case_id,
+            "case_fingerprint": self.case_fingerprint,
+            "dt_s": self.dt_s,
+            "training": self.training,
+        }
+        write_arrays(path, arrays, header)
+
+    @staticmethod
+    def load(path: str | Path, case: Case) -> Koopman:
+        """Read a model of `case`.
+
+        Raises:
+            InputError: the file is wrong or belongs to another case.
+        """
+        arrays, header = read_arrays(path)
+        if header.get("schema") != SCHEMA:
+            raise InputError(path, "schema", f"expected {SCHEMA!r}")
+        if header.get("case_fingerprint") != case.fingerprint:
+            raise InputError(path, "case", f"was identified on another case than {case.id!r} as it is now")
+        try:
+            layers = sum(name.endswith(".bias") for name in arrays)
+            mlp = tuple((arrays[f"mlp.{i}.weight"], arrays[f"mlp.{i}.bias"]) for i in range(layers))
+            model = Koopman(
+                kind=str(header["kind"]),
+                case_id=case.id,
+                case_fingerprint=case.fingerprint,
+                dt_s=float(header["dt_s"]),
+                training=dict(header["training"]),
+                mlp=mlp,
+                **{name: arrays[name] for name in ("k", "b", "g", "lift")},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(path, str(error).strip("'")[:60], "is missing or mistyped") from None
+        model._check_shapes(path, case)
+        return model
+
+    def _check_shapes(self, path: str | Path, case: Case) -> None:
+        n, n_gen, n_in = len(self.k), len(case.generators), len(case.generators) + len(case.loads)
+        expected = {
+            "k": (n, n),
+            "b": (n, n_in),
+            "g": (n, n_in),
+            "lift": (n, 2 * len(case.buses) + n_in + 1),
+        }
+        width = 2 * n_gen + 1
+        for i, (weight, bias) in enumerate(self.mlp):
+            expected[f"mlp.{i}.weight"] = (len(bias), width)
+            width = len(bias)
+            if weight.shape != expected[f"mlp.{i}.weight"] or bias.ndim != 1:
+                raise InputError(path, f"mlp.{i}", "has the wrong shape")
+        for name in ("k", "b", "g", "lift"):
+            if getattr(self, name).shape != expected[name]:
+                raise InputError(
+                    path, name, f"has shape {getattr(self, name).shape}, expected {expected[name]}"
+                )
+        if n < n_gen + 1 or (width > n - n_gen - 1 and self.mlp):
+            raise InputError(path, "k", "has too few observables")
+
+
+def hat_functions(grid: Array, knots: Array) -> Array:
+    """Linear interpolation as a matrix, shape (n_grid, n_knots): values(grid) = hats @ values(knots)."""
+    return np.stack([np.interp(grid, knots, row) for row in np.eye(len(knots))], axis=1)

@@ -1,0 +1,78 @@
+"""METHODS, the registry: a new method is one module and one line here.
+
+A method's module offers `prepare(case, regime, settings) -> (instance -> Solution)` and `SETTINGS`, a
+mapping whose keys are the slugs of its settings. If it depends on a trained model or policy, it
+also offers `artifact(case, regime, settings) -> str`, a fingerprint of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from ded_bench.methods.solution import Settings, Solver
+from ded_bench.problem.case import Case
+from ded_bench.problem.errors import InputError
+
+
+@dataclass(frozen=True)
+class Method:
+    """A registered method; its module is imported when first used."""
+
+    name: str
+    module: str
+    title: str
+
+    @property
+    def _loaded(self) -> ModuleType:
+        return importlib.import_module(self.module)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The settings this method knows, by slug."""
+        known: Mapping[str, Any] = self._loaded.SETTINGS
+        return known
+
+    def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
+        """Return the function that solves one instance after another.
+
+        Raises:
+            InputError: unknown settings, or a model or policy that does not fit.
+        """
+        self._check(settings)
+        solver: Solver = self._loaded.prepare(case, regime, settings)
+        return solver
+
+    def artifact(self, case: Case, regime: str, settings: Settings) -> str:
+        """Fingerprint of the trained model or policy that answers depend on; empty if none."""
+        self._check(settings)
+        find = getattr(self._loaded, "artifact", None)
+        return str(find(case, regime, settings)) if find else ""
+
+    def _check(self, settings: Settings) -> None:
+        if settings.name not in self.settings:
+            known = ", ".join(self.settings)
+            raise InputError("--settings", settings.name, f"unknown to method {self.name} (known: {known})")
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("ded", "ded_bench.methods.ded", "DED"),
+        Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
+        Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),
+        Method("ded-dpc-paper", "ded_bench.methods.dpc.policy", "DED-DPC (paper's recipe)"),
+        Method("ded-dpc", "ded_bench.methods.dpc.ded_dpc", "DED-DPC"),
+        Method("ded-dpc-refined", "ded_bench.methods.dpc.ded_dpc_refined", "DED-DPC (refined)"),
+    )
+}
+
+
+def get_method(name: str) -> Method:
+    """Return a registered method; InputError with the known names if there is none."""
+    if name not in METHODS:
+        raise InputError("--method", name, f"unknown method (known: {', '.join(METHODS)})")
+    return METHODS[name]

@@ -1,0 +1,193 @@
+"""DED-KO: the paper's linear program over all points of the horizon, on a Koopman model."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyomo.environ as pyo
+
+from ded_bench.koopman.model import Koopman
+from ded_bench.koopman.store import find_model
+from ded_bench.methods.ipopt import LINEAR_OPTIONS
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solvers import Compiled, compile_model
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.swing import Network
+
+#: Solver and its options by settings slug; the default is the fastest of those tried.
+SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "default": ("piqp", {}),
+    "ipopt": ("ipopt", LINEAR_OPTIONS),
+    "executable": ("ipopt-executable", LINEAR_OPTIONS),
+    "highs": ("highs", {}),
+}
+
+
+def artifact(case: Case, regime: str, settings: Settings) -> str:
+    """Fingerprint of the Koopman model that `prepare` would use."""
+    return find_model(case, settings.model, settings.search).fingerprint
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return a solver of single instances on the Koopman model that the settings name."""
+    return prepare_with(case, find_model(case, settings.model, settings.search), regime, settings)
+
+
+def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:
+    """Return a solver of single instances; one compiled program per process serves them all."""
+    case.check_regimes([regime])
+
+    def solve(instance: Instance) -> Solution:
+        check_step(koopman, instance)
+        started = time.perf_counter()
+        program = _Program(case, koopman.fingerprint, instance.steps, koopman)
+        model = _built(program)
+        set_instance(model, case, koopman, instance, regime)
+        build_s = time.perf_counter() - started
+        outcome = _compiled(program, settings.name).solve(settings.time_limit_s)
+        return Solution(
+            status=outcome.status,
+            schedule=schedule_of(model, case, instance) if outcome.has_values else None,
+            iterations=outcome.iterations,
+            build_s=build_s,
+            setup_s=outcome.setup_s,
+            solve_s=outcome.solve_s,
+            solver_objective=outcome.objective,
+            solver_version=outcome.version,
+            error="" if outcome.has_values else outcome.message,
+        )
+
+    return solve
+
+
+def check_step(koopman: Koopman, instance: Instance) -> None:
+    """Raise InputError unless the model's time step is the instance's."""
+    if abs(koopman.dt_s - instance.dt_s) > 1e-9 * instance.dt_s:
+        problem = f"is {instance.dt_s:g}, but the Koopman model was identified at {koopman.dt_s:g}"
+        raise InputError(f"instance {instance.id}", "dt_s", problem)
+
+
+@dataclass(frozen=True)
+class _Program:
+    """What a built model depends on; Koopman models are equal if their fingerprints are."""
+
+    case: Case
+    fingerprint: str
+    steps: int
+    koopman: Koopman = field(compare=False)
+
+
+@functools.lru_cache(maxsize=1)
+def _built(program: _Program) -> pyo.ConcreteModel:
+    return build_ded_ko(program.case, program.koopman, program.steps)
+
+
+@functools.lru_cache(maxsize=1)
+def _compiled(program: _Program, slug: str) -> Compiled:
+    return compile_model(_built(program), *SETTINGS[slug])
+
+
+def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
+    """Return the unsolved LP of the paper's eq. (DED_KO) for any instance of a case.
+
+    What instances differ in - costs, loads, ψ_0, initial power, the regime's bound - are bounds and
+    variables that `set_instance` fixes by their bounds. With P = (generators, loads) and the G of
+    `Koopman`, eq. (KO_dyn) is ψ_{k+1} = K ψ_k + ((I - K) B - G) P_k + G P_{k+1}.
+    """
+    n_gen, n_psi = len(case.generators), len(koopman.k)
+    m = pyo.ConcreteModel()
+    m.point = pyo.RangeSet(0, steps)
+    m.step = pyo.RangeSet(1, steps)
+    m.gen = pyo.Set(initialize=case.generators, ordered=True)
+    m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
+    m.observable = pyo.RangeSet(0, n_psi - 1)
+
+    # Data, fixed by bounds.
+    m.cost = pyo.Var(m.gen)
+    m.cost_slack = pyo.Var()
+    m.p_load = pyo.Var(m.load_bus, m.point)
+
+    # Variables; frequencies in rad/s, powers in pu. ψ = (ω, P_s, N).
+    m.psi = pyo.Var(m.observable, m.point)
+    m.p_gen = pyo.Var(m.gen, m.point)
+    m.p_slack_up = pyo.Var(m.point, bounds=(0, None))
+    m.p_slack_down = pyo.Var(m.point, bounds=(0, None))
+
+    # Constraints.
+    inputs = [(m.p_gen, g) for g in case.generators] + [(m.p_load, bus) for bus in case.loads]
+    before = (np.eye(n_psi) - koopman.k) @ koopman.b - koopman.g
+
+    @m.Constraint(m.observable, m.step)
+    def eq_dynamics(m: Any, i: int, k: int) -> Any:
+        terms = [koopman.k[i, j] * m.psi[j, k - 1] for j in m.observable if koopman.k[i, j]]
+        for j, (p, bus) in enumerate(inputs):
+            terms += [before[i, j] * p[bus, k - 1]] if before[i, j] else []
+            terms += [koopman.g[i, j] * p[bus, k]] if koopman.g[i, j] else []
+        return m.psi[i, k] == pyo.quicksum(terms)
+
+    @m.Constraint(m.point)
+    def eq_slack(m: Any, k: int) -> Any:
+        return m.p_slack_up[k] - m.p_slack_down[k] == m.psi[n_gen, k]
+
+    @m.Constraint(m.gen, m.step)
+    def ineq_ramp(m: Any, g: str, k: int) -> Any:
+        rate = (m.p_gen[g, k] - m.p_gen[g, k - 1]) / koopman.dt_s
+        return pyo.inequality(-case.ramp_pu_per_s, rate, case.ramp_pu_per_s)
+
+    @m.Objective()
+    def cost_total(m: Any) -> Any:
+        generation = pyo.quicksum(m.cost[g] * m.p_gen[g, k] for g in m.gen for k in m.point)
+        slack = pyo.quicksum(m.cost_slack * (m.p_slack_up[k] + m.p_slack_down[k]) for k in m.point)
+        return generation + slack
+
+    return m
+
+
+def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
+    """Give a built model the data of one instance and reset its initial point (cold start).
+
+    The initial point is ψ_0 and P_0 held for the whole horizon.
+    """
+    psi = koopman.initial(Network(case), [instance])[0].tolist()
+    bound = case.omega_bound(regime)
+    n_gen = len(case.generators)
+    _fix(m.cost_slack, instance.cost_slack(case))
+    for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
+        for k, value in enumerate(column):
+            _fix(m.p_load[bus, k], value)
+    for i, value in enumerate(psi):
+        limit = bound if i < n_gen else None
+        for k in m.point:
+            _reset(m.psi[i, k], value, None if limit is None else -limit, limit)
+        _fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies
+    for g, value in zip(case.generators, instance.p_initial(case).tolist(), strict=True):
+        _fix(m.cost[g], instance.cost[g])
+        for k in m.point:
+            _reset(m.p_gen[g, k], value, case.machines[g].p_min, case.machines[g].p_max)
+        _fix(m.p_gen[g, 0], value)
+    for k in m.point:
+        m.p_slack_up[k].set_value(max(psi[n_gen], 0.0), skip_validation=True)
+        m.p_slack_down[k].set_value(max(-psi[n_gen], 0.0), skip_validation=True)
+
+
+def _fix(variable: pyo.Var, value: float) -> None:
+    _reset(variable, value, value, value)
+
+
+def _reset(variable: pyo.Var, value: float, lower: float | None, upper: float | None) -> None:
+    variable.setlb(lower)
+    variable.setub(upper)
+    variable.set_value(value, skip_validation=True)
+
+
+def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:
+    """Read the generator powers of a solved model, shape (n_points, n_gen), pu."""
+    values: Array = np.array([[m.p_gen[g, k].value for g in case.generators] for k in m.point])
+    return Schedule(t=instance.grid, p=values)

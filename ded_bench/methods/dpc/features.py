@@ -1,0 +1,46 @@
+"""What a policy sees of an instance: the paper's parameters ζ = (loads, c, x_0, P_0)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.truth.swing import Network
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Raw inputs of a batch of instances, in the units of the files."""
+
+    p_load: Array  # loads at the knots, (batch, n_knots, n_load), pu
+    cost: Array  # (slack, generators), (batch, 1 + n_gen)
+    state: Array  # x_0 = (θ without slack, P_s, ω), (batch, n_bus - 1 + 1 + n_gen)
+    p_initial: Array  # P_0, (batch, n_gen), pu
+
+    @staticmethod
+    def of(network: Network, instances: Sequence[Instance], knots: Array) -> Features:
+        """Collect the features of instances; solves one power flow for all of them."""
+        case: Case = network.case
+        p_load = np.stack([i.p_load(case, knots) for i in instances])
+        p_initial = np.stack([i.p_initial(case) for i in instances])
+        omega = np.stack([i.omega_initial(case) for i in instances])
+        cost = np.array([[i.cost[bus] for bus in (case.slack, *case.generators)] for i in instances])
+        return Features.from_arrays(network, p_load, cost, p_initial, omega)
+
+    @staticmethod
+    def from_arrays(network: Network, p_load: Array, cost: Array, p_initial: Array, omega: Array) -> Features:
+        """Collect features from stacked arrays; x_0 follows from the power flow at t = 0."""
+        theta = network.power_flow(p_initial, p_load[:, 0])
+        p_slack = -p_initial.sum(axis=1) - p_load[:, 0].sum(axis=1)
+        state = np.concatenate([theta[:, network.unknown], p_slack[:, None], omega], axis=1)
+        return Features(p_load, cost, state, p_initial)
+
+    def channels(self) -> Array:
+        """All features as channels over the knots, constants repeated, (batch, n_channels, n_knots)."""
+        constant = np.concatenate([self.cost, self.state, self.p_initial], axis=1)
+        repeated = np.broadcast_to(constant[:, :, None], (*constant.shape, self.p_load.shape[1]))
+        return np.concatenate([self.p_load.transpose(0, 2, 1), repeated], axis=1)

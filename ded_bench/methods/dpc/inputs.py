@@ -1,0 +1,142 @@
+"""What `ded-dpc` sees of instances: stacked arrays, and channels over the knots made from them.
+
+The angles at t = 0 are no input: they follow from P_0 and the initial loads, which are, so that no
+power flow has to be solved. Loads enter as forecasts at the knots, with their bend between two
+knots, and as the static dispatch that they would have if nothing had inertia.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Instances of one case as stacked arrays, in the units of the files."""
+
+    ramps: Array  # initial (pu), start (s), duration (s), rate (pu/s); (batch, n_load, 4)
+    cost: Array  # (slack, generators), (batch, 1 + n_gen)
+    p_initial: Array  # P_0, (batch, n_gen), pu
+    omega: Array  # ω(0), (batch, n_gen), rad/s
+
+    @staticmethod
+    def of(case: Case, instances: Sequence[Instance]) -> Inputs:
+        """Stack instances."""
+        machines = (case.slack, *case.generators)
+        ramps = [
+            [(r.initial, r.start, r.duration, r.rate) for r in (i.load[bus] for bus in case.loads)]
+            for i in instances
+        ]
+        return Inputs(
+            np.array(ramps),
+            np.array([[i.cost[bus] for bus in machines] for i in instances]),
+            np.array([[i.initial.power[bus] for bus in case.generators] for i in instances]),
+            np.array([[i.initial.omega[bus] for bus in case.generators] for i in instances]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.ramps)
+
+    def __getitem__(self, rows: slice) -> Inputs:
+        return Inputs(self.ramps[rows], self.cost[rows], self.p_initial[rows], self.omega[rows])
+
+    def p_load(self, times: Array) -> Array:
+        """Load injections, shape (batch, n_times, n_load), pu."""
+        initial, start, duration, rate = (self.ramps[:, None, :, i] for i in range(4))
+        into = np.minimum(np.maximum(times[:, None] - start, 0.0), duration)
+        return np.asarray(initial + rate * into)
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """What the network reads, not yet normalised, and the static dispatch that it corrects."""
+
+    sequence: Array  # (batch, n_knots, n_sequence)
+    constants: Array  # (batch, n_constants)
+    prior: Array  # static dispatch of the loads at each knot, (batch, n_knots, n_gen), pu
+
+    @staticmethod
+    def of(case: Case, inputs: Inputs, knots: Array) -> Channels:
+        """Compute the channels at knots, shape (n_knots,), s."""
+        p_load, bend = _loads_and_bends(inputs, knots)
+        demand = -p_load.sum(axis=-1)
+        prior = _dispatch(case, inputs.cost, demand)
+        p_slack = demand - prior.sum(axis=-1)
+        cost, slack = inputs.cost[:, 1:], inputs.cost[:, :1]
+        first, second = _pairs(cost.shape[1])
+        constants = (
+            inputs.cost / _positive(inputs.cost.sum(axis=1, keepdims=True)),
+            cost / _positive(cost + slack),
+            (cost[:, first] - cost[:, second]) / _positive(cost[:, first] + cost[:, second]),
+            inputs.p_initial,
+            inputs.omega,
+        )
+        sequence = np.concatenate([p_load, bend, prior, p_slack[:, :, None]], axis=-1)
+        return Channels(sequence, np.concatenate(constants, axis=1), prior)
+
+    def static_cost(self, inputs: Inputs) -> Array:
+        """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""
+        p_slack = self.sequence[:, :, -1]
+        cost = self.prior @ inputs.cost[:, 1:, None]
+        return np.asarray((cost[:, :, 0] + inputs.cost[:, :1] * np.abs(p_slack)).mean(axis=1))
+
+
+def n_channels(case: Case) -> tuple[int, int]:
+    """Number of sequence channels and of constants."""
+    n_gen, n_load = len(case.generators), len(case.loads)
+    return 2 * n_load + n_gen + 1, (1 + n_gen) + n_gen + n_gen * (n_gen - 1) // 2 + 2 * n_gen
+
+
+def _loads_and_bends(inputs: Inputs, knots: Array) -> tuple[Array, Array]:
+    """Loads at the knots, and how far their mean since the last knot is off the chord; pu.
+
+    The bend tells where between two knots a ramp starts or ends; each is (batch, n_knots, n_load).
+    """
+    initial, start, duration, rate = (inputs.ramps[:, None, :, i] for i in range(4))
+    since = np.maximum(knots[:, None] - start, 0.0)
+    into = np.minimum(since, duration)
+    p_load = initial + rate * into
+    area = into * (since - 0.5 * into)  # ∫ into dt
+    mean = rate * (area[:, 1:] - area[:, :-1]) / (knots[1] - knots[0])
+    bend = np.zeros_like(p_load)
+    bend[:, 1:] = mean - 0.5 * rate * (into[:, 1:] + into[:, :-1])
+    return p_load, bend
+
+
+def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
+    """`problem.dispatch.merit_order` for costs that are the same at all knots.
+
+    Args:
+        cost: (slack, generators), shape (batch, 1 + n_gen).
+        demand: shape (batch, n_knots), pu.
+    """
+    cost_gen, cost_slack = cost[:, 1:], cost[:, :1]
+    room = np.where(cost_gen < cost_slack, case.p_max - case.p_min, 0.0)
+    # what generators that come earlier in the merit order can deliver; ties go by position
+    earlier = (cost_gen[:, None, :] < cost_gen[:, :, None]) | (
+        (cost_gen[:, None, :] == cost_gen[:, :, None]) & _before(room.shape[1])
+    )
+    below = (earlier * room[:, None, :]).sum(axis=2)
+    residual = (demand - case.p_min.sum())[:, :, None] - below[:, None]
+    return np.asarray(case.p_min + np.minimum(np.maximum(residual, 0.0), room[:, None]))
+
+
+@functools.cache
+def _pairs(n_gen: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.triu_indices(n_gen, 1)
+
+
+@functools.cache
+def _before(n_gen: int) -> np.ndarray:
+    return np.tri(n_gen, k=-1, dtype=bool)
+
+
+def _positive(value: Array) -> Array:
+    return np.maximum(value, 1e-9)

@@ -1,0 +1,172 @@
+"""DED-DPC: a trained policy that answers with a schedule in less than a millisecond.
+
+`ded-dpc-paper` is the paper's architecture: three Conv1d layers over 50 knots, tanh to the generator
+bounds, linear interpolation. Policy files are safetensors: arrays and a JSON header.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ded_bench.methods.dpc.features import Features
+from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.store import (
+    Scope,
+    find_policy_file,
+    load_weights,
+    read_policy,
+    weights_fingerprint,
+    write_policy,
+)
+from ded_bench.methods.dpc.store import policy_file as policy_file
+from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.swing import Network
+
+SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
+METHOD = "ded-dpc-paper"
+N_KNOTS, FILTERS, WINDOWS = 50, 30, (5, 10, 5)
+
+
+class PaperNetwork(nn.Module):
+    """The paper's control policy: channels over the knots in, generator powers at the knots out."""
+
+    def __init__(self, n_channels: int, p_min: Array, p_max: Array) -> None:
+        super().__init__()
+        first, middle, last = WINDOWS
+        self.layers = nn.Sequential(
+            _same_padding(first),
+            nn.Conv1d(n_channels, FILTERS, first),
+            nn.ReLU(),
+            _same_padding(middle),
+            nn.Conv1d(FILTERS, FILTERS, middle),
+            nn.ReLU(),
+            _same_padding(last),
+            nn.Conv1d(FILTERS, len(p_min), last),
+        )
+        self.register_buffer("mean", torch.zeros(n_channels, 1))
+        self.register_buffer("scale", torch.ones(n_channels, 1))
+        self.register_buffer("p_min", torch.as_tensor(p_min, dtype=torch.float32)[:, None])
+        self.register_buffer("p_max", torch.as_tensor(p_max, dtype=torch.float32)[:, None])
+
+    mean: Tensor
+    scale: Tensor
+    p_min: Tensor
+    p_max: Tensor
+
+    def normalise(self, channels: Tensor) -> None:
+        """Set the affine input normalisation from training data, (batch, n_channels, n_knots)."""
+        self.mean.copy_(channels.mean(dim=(0, 2))[:, None])
+        self.scale.copy_(channels.std(dim=(0, 2))[:, None].clamp_min(1e-6))
+
+    def forward(self, channels: Tensor) -> Tensor:
+        """Map (batch, n_channels, n_knots) to powers, (batch, n_knots, n_gen), pu, within bounds."""
+        out = self.layers((channels - self.mean) / self.scale)
+        power = self.p_min + 0.5 * (1.0 + torch.tanh(out)) * (self.p_max - self.p_min)
+        return power.transpose(1, 2)
+
+
+def _same_padding(window: int) -> nn.Module:
+    """Zeros on both sides, so that a convolution with this window keeps the length."""
+    return nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained network with all that is needed to apply it, for one case, regime and horizon."""
+
+    case: Case
+    regime: str
+    horizon_s: float
+    network: PaperNetwork
+    training: dict[str, Any]
+
+    @functools.cached_property
+    def knots(self) -> Array:
+        """Knot times, shape (n_knots,), s."""
+        return knot_times(self.horizon_s, N_KNOTS)
+
+    @functools.cached_property
+    def _grid(self) -> Network:
+        return Network(self.case)
+
+    def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
+        """Schedules of one instance or several, on the knots.
+
+        Raises:
+            InputError: an instance belongs to another case or horizon.
+        """
+        batch = [instances] if isinstance(instances, Instance) else list(instances)
+        self._scope.check(batch)
+        channels = Features.of(self._grid, batch, self.knots).channels()
+        with torch.inference_mode():
+            powers = self.network(torch.as_tensor(channels, dtype=torch.float32)).double().numpy()
+        powers = np.clip(powers, self.case.p_min, self.case.p_max)  # the bounds again, in float64
+        return [Schedule(self.knots, p) for p in powers]
+
+    @property
+    def _scope(self) -> Scope:
+        return Scope(self.case, self.regime, self.horizon_s)
+
+    def save(self, path: Path) -> None:
+        """Write weights, normalisation and header."""
+        write_policy(path, METHOD, self._scope, self.network, self.training)
+
+    @staticmethod
+    def load(path: str | Path, case: Case, regime: str) -> Policy:
+        """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
+        arrays, scope, training = read_policy(path, METHOD, case, regime)
+        network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
+        load_weights(network, arrays, path)
+        return Policy(case, regime, scope.horizon_s, network.eval(), training)
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when any weight does."""
+        return weights_fingerprint(self.network)
+
+
+def n_channels(case: Case) -> int:
+    """Channels of `Features`: loads, costs, x_0 and P_0."""
+    return len(case.loads) + (1 + len(case.generators)) + len(case.buses) + 2 * len(case.generators)
+
+
+def find_policy(case: Case, regime: str, settings: Settings) -> Policy:
+    """Return the policy given in the settings, else the first one in the folders to search.
+
+    Raises:
+        InputError: there is none (names the command that trains one), or it does not fit.
+    """
+    return Policy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
+
+
+def artifact(case: Case, regime: str, settings: Settings) -> str:
+    """Fingerprint of the policy that `prepare` would use."""
+    return find_policy(case, regime, settings).fingerprint
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return the policy as a method; `solve_s` covers features, network and all grid points."""
+    policy = find_policy(case, regime, settings)
+
+    def solve(instance: Instance) -> Solution:
+        policy(instance)  # the first call of a process pays for libraries, not for inference
+        started = time.perf_counter()
+        schedule = policy(instance)[0]
+        schedule.at(instance.grid)
+        elapsed = time.perf_counter() - started
+        version = f"torch {torch.__version__}"
+        return Solution(Status.POLICY, schedule, solve_s=elapsed, solver_version=version)
+
+    return solve

@@ -1,0 +1,223 @@
+"""Case: buses, lines, machines and limits of one grid, and the ranges its instances are drawn from."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.strict import Record, read_record
+
+Array = NDArray[np.float64]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Range = tuple[float, float]
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+#: Cases that come with the suite: beside a checkout, or inside an installed package.
+SHIPPED_CASES = next(
+    (p for p in (REPOSITORY / "problems", REPOSITORY / "ded_bench" / "_problems") if p.is_dir()),
+    REPOSITORY / "problems",
+)
+
+
+class Bus(Record):
+    """A node with fixed voltage magnitude `v` in pu (paper, Table I)."""
+
+    id: Name
+    kind: Literal["slack", "generator", "load", "junction"]
+    v: Positive
+    p_nominal: float | None = None  # loads only: nominal injection in pu, negative
+
+
+class Line(Record):
+    """A series impedance r + jx in pu between two buses (paper, Table II)."""
+
+    from_bus: Name = Field(alias="from")
+    to_bus: Name = Field(alias="to")
+    r: NonNegative
+    x: Positive
+
+
+class Machine(Record):
+    """Inertia m (s² pu/rad), damping d (s pu/rad) and power limits in pu of one generator."""
+
+    m: Positive
+    d: NonNegative
+    p_nominal: float
+    p_min: float
+    p_max: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Machine:
+        if not self.p_min < self.p_max:
+            raise ValueError("p_min must be below p_max")
+        return self
+
+
+class Limits(Record):
+    """One operating regime: |omega| at every generator stays within `omega_hz`."""
+
+    omega_hz: Positive
+
+
+class Sampling(Record):
+    """Ranges of the sampler (paper, Table III); uniform unless said otherwise."""
+
+    horizon_s: Positive
+    dt_s: Positive
+    load_relative: NonNegative
+    start_s: Range
+    duration_s: Range
+    rate_pu_per_s: Range
+    rate_zero_probability: Probability
+    perturbation: Range
+    omega_rad_per_s: Range
+    cost: Range
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Sampling:
+        for name, value in self:
+            if isinstance(value, tuple) and value[0] > value[1]:
+                raise ValueError(f"{name}: lower end above upper end")
+            if name in ("start_s", "duration_s", "rate_pu_per_s", "cost") and value[0] < 0:
+                raise ValueError(f"{name}: must not be negative")
+        return self
+
+
+class Case(Record):
+    """One grid. Buses keep the file's order; generators and loads are named by their bus."""
+
+    schema_: Literal["ded-bench/case/1"] = Field(alias="schema")
+    id: Name
+    f0_hz: Positive
+    buses: tuple[Bus, ...]
+    lines: tuple[Line, ...]
+    machines: dict[Name, Machine]
+    ramp_pu_per_s: Positive
+    regimes: dict[Name, Limits]
+    sampling: Sampling
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Case:
+        names = [bus.id for bus in self.buses]
+        if len(set(names)) != len(names):
+            raise ValueError("buses: two buses have the same id")
+        if [bus.kind for bus in self.buses].count("slack") != 1:
+            raise ValueError("buses: exactly one slack bus is needed")
+        if not self.generators or not self.loads:
+            raise ValueError("buses: at least one generator and one load bus are needed")
+        if set(self.machines) != set(self.generators):
+            raise ValueError("machines: must name exactly the generator buses")
+        if not self.regimes:
+            raise ValueError("regimes: at least one regime is needed")
+        for bus in self.buses:
+            if (bus.kind == "load") != (bus.p_nominal is not None):
+                raise ValueError(f"buses: {bus.id}: p_nominal belongs to load buses, and to all of them")
+        for line in self.lines:
+            if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - set(names):
+                raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
+        self._check_connected(set(names))
+        return self
+
+    def _check_connected(self, names: set[str]) -> None:
+        reached = {self.slack}
+        for _ in names:
+            for line in self.lines:
+                if reached & {line.from_bus, line.to_bus}:
+                    reached |= {line.from_bus, line.to_bus}
+        if names - reached:
+            raise ValueError(f"lines: bus {min(names - reached)} is not connected to the slack bus")
+
+    @staticmethod
+    def load(name_or_path: str | Path) -> Case:
+        """Read a case by the name of a shipped one, its folder, or its case.json.
+
+        Raises:
+            InputError: there is no such case, or its file is wrong.
+        """
+        path = Path(name_or_path)
+        if path.is_dir():
+            path = path / "case.json"
+        elif not path.exists() and (SHIPPED_CASES / path / "case.json").is_file():
+            path = SHIPPED_CASES / path / "case.json"
+        elif not path.exists():
+            known = ", ".join(sorted(p.parent.name for p in SHIPPED_CASES.glob("*/case.json")))
+            raise InputError(name_or_path, "", f"no such case (shipped: {known})")
+        return read_record(Case, path)
+
+    @functools.cached_property
+    def slack(self) -> str:
+        """Id of the slack bus."""
+        return next(bus.id for bus in self.buses if bus.kind == "slack")
+
+    @functools.cached_property
+    def generators(self) -> tuple[str, ...]:
+        """Ids of the generator buses (the paper's 𝒢, without the slack)."""
+        return tuple(bus.id for bus in self.buses if bus.kind == "generator")
+
+    @functools.cached_property
+    def loads(self) -> tuple[str, ...]:
+        """Ids of the load buses (the paper's ℒ)."""
+        return tuple(bus.id for bus in self.buses if bus.kind == "load")
+
+    @functools.cached_property
+    def p_min(self) -> Array:
+        """Lower generator limits, shape (n_gen,), pu."""
+        return np.array([self.machines[g].p_min for g in self.generators])
+
+    @functools.cached_property
+    def p_max(self) -> Array:
+        """Upper generator limits, shape (n_gen,), pu."""
+        return np.array([self.machines[g].p_max for g in self.generators])
+
+    @functools.cached_property
+    def p_nominal(self) -> Array:
+        """Nominal generator power, shape (n_gen,), pu."""
+        return np.array([self.machines[g].p_nominal for g in self.generators])
+
+    @functools.cached_property
+    def load_nominal(self) -> Array:
+        """Nominal load injections, shape (n_load,), pu (negative)."""
+        return np.array([bus.p_nominal for bus in self.buses if bus.kind == "load"], dtype=float)
+
+    def omega_bound(self, regime: str) -> float:
+        """Bound on |omega| in rad/s.
+
+        Raises:
+            InputError: the case has no such regime.
+        """
+        self.check_regimes([regime])
+        return 2 * np.pi * self.regimes[regime].omega_hz
+
+    def check_regimes(self, regimes: Iterable[str]) -> None:
+        """Raise InputError unless the case knows every one of the regimes."""
+        for regime in regimes:
+            if regime not in self.regimes:
+                raise InputError(
+                    f"case {self.id}",
+                    "regime",
+                    f"unknown regime {regime!r} (known: {', '.join(self.regimes)})",
+                )
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when anything in the case does."""
+        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
+
+    def __eq__(self, other: object) -> bool:
+        """Equal content; cached arrays do not count."""
+        return isinstance(other, Case) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        """Cases are dictionary keys of models that are built once per case."""
+        return hash(self.fingerprint)

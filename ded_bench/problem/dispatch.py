@@ -1,0 +1,37 @@
+"""Static economic dispatch by merit order, without a solver (the paper's P_opt)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ded_bench.problem.case import Array, Case
+
+
+def merit_order(case: Case, cost_gen: Array, cost_slack: Array | float, p_load: Array) -> Array:
+    """Solve min Σ c_i P_i + c_s |P_s| with Σ P = 0 and generator bounds, in closed form.
+
+    Cheapest generators first, each raised while it is cheaper than the slack bus and the slack bus
+    still delivers; the remainder is the slack's, of either sign.
+
+    Args:
+        case: gives the generator bounds.
+        cost_gen: generator costs, shape (..., n_gen).
+        cost_slack: slack cost, shape (...).
+        p_load: load injections, shape (..., n_load), pu.
+
+    Returns:
+        Generator powers in pu, shape (..., n_gen); leading dimensions broadcast.
+    """
+    demand = -np.asarray(p_load).sum(axis=-1)
+    shape = np.broadcast_shapes(demand.shape, np.shape(cost_slack), np.shape(cost_gen)[:-1])
+    cost = np.broadcast_to(cost_gen, (*shape, len(case.generators)))
+    order = np.argsort(cost, axis=-1, kind="stable")
+    room = np.broadcast_to(case.p_max - case.p_min, cost.shape)
+    room = np.where(cost < np.asarray(cost_slack)[..., None], room, 0.0)
+    room = np.take_along_axis(room, order, axis=-1)
+    residual = np.broadcast_to(demand - case.p_min.sum(), shape)
+    below = np.cumsum(room, axis=-1) - room
+    raised = np.clip(residual[..., None] - below, 0.0, room)
+    result = np.empty(cost.shape)
+    np.put_along_axis(result, order, raised, axis=-1)
+    return result + case.p_min

@@ -1,0 +1,1 @@
+"""What really happens: the swing equations, their simulation, and the scorer; knows no method."""

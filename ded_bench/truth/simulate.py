@@ -1,0 +1,100 @@
+"""What really happens under a schedule: the index-1 swing DAE, integrated with scipy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import RK45
+
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.swing import Network, PowerFlowError
+
+#: Local error control of the integrator; steps of one grid interval are well inside it.
+RTOL, ATOL = 1e-9, 1e-10
+
+
+class SimulationError(ArithmeticError):
+    """The system lost synchronism: the algebraic equations have no solution any more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """What one instance does under one schedule, at the grid points t_k."""
+
+    t: Array  # (n,), s
+    theta: Array  # (n, n_bus), rad, relative to the slack
+    omega: Array  # (n, n_gen), rad/s, deviation from nominal
+    p_gen: Array  # (n, n_gen), pu
+    p_load: Array  # (n, n_load), pu
+    p_slack: Array  # (n,), pu
+
+
+def simulate(case: Case, instance: Instance, schedule: Schedule) -> Trajectory:
+    """Integrate one instance under one schedule; see `simulate_many`."""
+    return simulate_many(case, [instance], [schedule])[0]
+
+
+def simulate_many(
+    case: Case, instances: Sequence[Instance], schedules: Sequence[Schedule]
+) -> list[Trajectory]:
+    """Integrate instances side by side with scipy's explicit Runge-Kutta 5(4).
+
+    Load-bus angles are solved by Newton's method at every evaluation of the right-hand side. No
+    step spans a grid point, where schedules and loads may have kinks; within a step the inputs are
+    linear in time.
+
+    Raises:
+        ValueError: the instances do not share one time grid.
+        SimulationError: some instance has no solution at some time.
+        InputError: an instance is of another case, or a schedule does not span its horizon.
+    """
+    for instance, schedule in zip(instances, schedules, strict=True):
+        instance.check_case(case)
+        schedule.check(instance.horizon_s)
+    if len({(i.steps, i.dt_s) for i in instances}) != 1:
+        raise ValueError("instances simulated side by side must share one time grid")
+    grid, dt = instances[0].grid, instances[0].dt_s
+    network = Network(case)
+    n_gen, batch = len(case.generators), len(instances)
+    p_gen = np.stack([s.at(grid) for s in schedules], axis=1)  # time first: one row per step
+    p_load = np.stack([i.p_load(case) for i in instances], axis=1)
+    injection = network.load_injections(p_load)
+    theta = np.empty((len(grid), batch, network.n_bus))
+    omega = np.empty((len(grid), batch, n_gen))
+    try:
+        theta[0] = np.stack([network.initial_angles(i) for i in instances])
+        omega[0] = np.stack([i.omega_initial(case) for i in instances])
+        angles = theta[0].copy()
+
+        def rhs(t: float, y: Array) -> Array:
+            angle, speed = y.reshape(2, batch, n_gen)
+            inside = (t - grid[step]) / dt
+            angles[:, network.generators] = angle
+            wanted = injection[step] + inside * (injection[step + 1] - injection[step])
+            angles[:] = network.solve_loads(angles, wanted)
+            power = p_gen[step] + inside * (p_gen[step + 1] - p_gen[step])
+            force = network.injections(angles)[:, network.generators]
+            return np.concatenate([speed.ravel(), network.acceleration(speed, power, force).ravel()])
+
+        for step in range(len(grid) - 1):
+            y = np.concatenate([theta[step][:, network.generators].ravel(), omega[step].ravel()])
+            start, stop = grid[step], grid[step + 1]
+            solver = RK45(rhs, start, y, stop, first_step=stop - start, rtol=RTOL, atol=ATOL)
+            while solver.status == "running":
+                solver.step()
+            if solver.status == "failed":
+                raise SimulationError("the integrator's step size vanished")
+            angle, omega[step + 1] = solver.y.reshape(2, batch, n_gen)
+            angles[:, network.generators] = angle
+            theta[step + 1] = angles[:] = network.solve_loads(angles, injection[step + 1])
+    except PowerFlowError as error:
+        raise SimulationError(f"the system cannot follow this schedule: {error}") from None
+    p_slack = network.injections(theta)[:, :, network.slack]
+    return [
+        Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b])
+        for b in range(batch)
+    ]

@@ -1,0 +1,97 @@
+"""Cases that generic tests run on, and small factories for records."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.strict import Record, parse_record
+
+#: Generic properties are tested on every case here: the shipped one, and a chain
+#: slack - load - generator whose power flow, load angle and modes have closed forms.
+CASE_FILES = {
+    "9bus": SHIPPED_CASES / "9bus" / "case.json",
+    "threebus": Path(__file__).parent / "cases" / "threebus" / "case.json",
+}
+
+R = TypeVar("R", bound=Record)
+
+
+@pytest.fixture(scope="session", params=list(CASE_FILES))
+def case_file(request: pytest.FixtureRequest) -> Path:
+    """Path of each case's file in turn."""
+    return CASE_FILES[request.param]
+
+
+@pytest.fixture(scope="session")
+def case(case_file: Path) -> Case:
+    """Each case in turn."""
+    return Case.load(case_file)
+
+
+@pytest.fixture(scope="session")
+def ninebus() -> Case:
+    """The shipped 9-bus case, for its known numbers."""
+    return Case.load(CASE_FILES["9bus"])
+
+
+@pytest.fixture(scope="session")
+def threebus() -> Case:
+    """The three-bus chain, for closed forms."""
+    return Case.load(CASE_FILES["threebus"])
+
+
+def _alter(record: Record, **changes: Any) -> Record:
+    data = json.loads(record.model_dump_json(by_alias=True))
+    return parse_record(type(record), json.dumps(data | changes), "altered record")
+
+
+@pytest.fixture(scope="session")
+def alter() -> Callable[..., Any]:
+    """`alter(record, **fields)`: a validated copy with top-level fields replaced by plain JSON data."""
+    return _alter
+
+
+def _quiet_instance(case: Case, **changes: Any) -> Instance:
+    data = {
+        "schema": "ded-bench/instance/1",
+        "id": f"{case.id}-quiet",
+        "case": case.id,
+        "seed": 0,
+        "horizon_s": case.sampling.horizon_s,
+        "dt_s": case.sampling.dt_s,
+        "cost": {bus: 0.5 for bus in (case.slack, *case.generators)},
+        "load": {
+            bus: {"initial": value, "start": 0.0, "duration": 0.0, "rate": 0.0}
+            for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+        },
+        "initial": {
+            "power": dict(zip(case.generators, case.p_nominal.tolist(), strict=True)),
+            "omega": {bus: 0.0 for bus in case.generators},
+        },
+    }
+    return parse_record(Instance, json.dumps(data | changes), "quiet instance")
+
+
+@pytest.fixture(scope="session")
+def quiet_instance() -> Callable[..., Instance]:
+    """`quiet_instance(case, **fields)`: at rest at nominal power, no load ramps, unless fields say so."""
+    return _quiet_instance
+
+
+def _constant(instance: Instance, power: Any) -> Schedule:
+    return Schedule(t=np.array([0.0, instance.horizon_s]), p=np.array([power, power], dtype=float))
+
+
+@pytest.fixture(scope="session")
+def constant() -> Callable[..., Schedule]:
+    """`constant(instance, power)`: the schedule that holds `power`, shape (n_gen,), pu."""
+    return _constant

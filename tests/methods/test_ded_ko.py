@@ -1,0 +1,289 @@
+"""DED-KO over all points and on knots: optima agree, solutions replay, statuses are honest."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pyomo.environ as pyo
+import pytest
+from scipy.optimize import linprog
+
+from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.physics import injection_lift, linear_model
+from ded_bench.methods import ded_ko, ded_ko_knots
+from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
+from ded_bench.methods.solution import Settings, Solution, Status
+from ded_bench.methods.solvers import compile_model
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.swing import Network
+
+HORIZON = 3.0
+METHODS = (ded_ko, ded_ko_knots)
+#: Settings that need nothing installed beside the package's dependencies.
+SLUGS = sorted(set(SETTINGS) - {"executable"})
+
+
+def short(case: Case, index: int, **changes) -> Instance:
+    """An instance whose loads ramp from the start and whose slack costs differ with the index."""
+    instance = sample_instance(case, 77, index)
+    load = {bus: ramp.model_copy(update={"start": 0.5}) for bus, ramp in instance.load.items()}
+    return instance.model_copy(update={"horizon_s": HORIZON, "load": load, **changes})
+
+
+@pytest.fixture(scope="module")
+def koopman(case: Case) -> Koopman:
+    """The linearisation, starting from exact equilibria."""
+    return dataclasses.replace(linear_model(case), lift=injection_lift(case))
+
+
+class Replay(NamedTuple):
+    """What the Koopman model makes of a schedule, computed step by step."""
+
+    objective: float
+    omega: Array
+    p_slack: Array
+
+
+def replay(case: Case, koopman: Koopman, instance: Instance, schedule: Schedule) -> Replay:
+    p_gen = schedule.at(instance.grid)
+    psi = koopman.initial(Network(case), [instance])[0]
+    out = koopman.rollout(psi, np.hstack([p_gen, instance.p_load(case)]))
+    n_gen = len(case.generators)
+    p_slack = out[:, n_gen]
+    cost = p_gen @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(p_slack)
+    return Replay(float(cost.sum()), out[:, :n_gen], p_slack)
+
+
+def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Solution, regime: str) -> Replay:
+    """Every constraint at every point, and the objective that the solver claims."""
+    assert solution.status == Status.OPTIMAL
+    p_gen = solution.schedule.at(instance.grid)
+    model = replay(case, koopman, instance, solution.schedule)
+    assert model.objective == pytest.approx(solution.solver_objective, rel=1e-8)
+    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 2 * np.pi * 1e-8
+    assert np.abs(np.diff(p_gen, axis=0)).max() <= case.ramp_pu_per_s * instance.dt_s + 1e-9
+    assert (p_gen - case.p_max).max() <= 1e-8
+    assert (case.p_min - p_gen).max() <= 1e-8
+    assert p_gen[0].tolist() == instance.p_initial(case).tolist()
+    return model
+
+
+def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
+    """The optimum on knots with every row there is, and a variable above |P_s| at every point."""
+    n_gen, grid = len(case.generators), instance.grid
+    knots = np.linspace(0.0, grid[-1], ded_ko_knots.N_KNOTS)
+    gamma = koopman.condense(n_gen, grid, knots).reshape(len(grid), n_gen + 1, -1)
+    free = koopman.free_response(koopman.initial(Network(case), [instance])[0], instance.p_load(case))
+    n_x, n_s = gamma.shape[2], len(grid)
+    slack, omega = gamma[:, n_gen], gamma[1:, :n_gen].reshape(-1, n_x)
+    ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
+    above, none, bound = np.eye(n_s), np.zeros, case.omega_bound(regime)
+    rows = [np.hstack([slack, -above]), np.hstack([-slack, -above])]
+    right = [-free[:, n_gen], free[:, n_gen]]
+    for sign in (1, -1):
+        rows += [np.hstack([sign * omega, none((len(omega), n_s))])]
+        right += [bound - sign * free[1:, :n_gen].ravel()]
+        rows += [np.hstack([sign * ramps, none((len(ramps), n_s))])]
+        right += [np.full(len(ramps), case.ramp_pu_per_s * knots[1])]
+    weight = np.outer(hat_functions(grid, knots).sum(axis=0), instance.cost_gen(case)).ravel()
+    p_initial = instance.p_initial(case)
+    bounds = [(p, p) for p in p_initial] + (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True))
+    answer = linprog(
+        np.append(weight, np.full(n_s, instance.cost_slack(case))),
+        A_ub=np.vstack(rows),
+        b_ub=np.concatenate(right),
+        bounds=bounds + n_s * [(0, None)],
+    )
+    assert answer.status == 0
+    return float(answer.fun)
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_solvers_agree_and_their_solution_replays_on_the_model(
+    case: Case, koopman: Koopman, regime: str
+) -> None:
+    instance = short(case, 3)
+    solve = [ded_ko.prepare_with(case, koopman, regime, Settings(name=slug)) for slug in SLUGS]
+    solutions = [each(instance) for each in solve]
+    for solution in solutions:
+        check_limits(case, koopman, instance, solution, regime)
+        assert solution.iterations > 0
+        assert solution.solve_s > 0
+        assert solution.solver_objective == pytest.approx(solutions[0].solver_objective, rel=1e-7)
+    assert len({solution.solver_version for solution in solutions}) == len(SLUGS)
+
+
+def test_program_variables_follow_the_rollout(case: Case, koopman: Koopman) -> None:
+    """ψ and the split of P_s in the solved Pyomo model are those of the step-by-step rollout."""
+    instance = short(case, 1)
+    model = build_ded_ko(case, koopman, instance.steps)
+    set_instance(model, case, koopman, instance, "NO")
+    assert compile_model(model, "piqp").solve().status == Status.OPTIMAL
+    schedule = ded_ko.schedule_of(model, case, instance)
+    result = replay(case, koopman, instance, schedule)
+    psi = np.array([[model.psi[i, k].value for i in model.observable] for k in model.point])
+    split = np.array([model.p_slack_up[k].value - model.p_slack_down[k].value for k in model.point])
+    np.testing.assert_allclose(psi[:, : result.omega.shape[1]], result.omega, atol=1e-8)
+    np.testing.assert_allclose(split, result.p_slack, atol=1e-7)
+    assert pyo.value(model.cost_total) == pytest.approx(result.objective, rel=1e-8)
+
+
+@pytest.mark.parametrize("slug", SLUGS)
+def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Koopman, slug: str) -> None:
+    """In whatever order instances and regimes come, one built model serves them all."""
+    first, last = short(case, 0), short(case, 1)
+    for regime in ("TO", "NO"):
+        solve = ded_ko.prepare_with(case, koopman, regime, Settings(name=slug))
+        solve(first)
+        again = solve(last)
+        model = build_ded_ko(case, koopman, last.steps)
+        set_instance(model, case, koopman, last, regime)
+        fresh = compile_model(model, *SETTINGS[slug]).solve()
+        assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
+        assert again.build_s < 0.5  # built before
+        assert again.setup_s < 0.5
+
+
+@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_knots_reach_the_optimum_of_the_program_with_all_rows(
+    case: Case, koopman: Koopman, regime: str, index: int
+) -> None:
+    instance = short(case, index)
+    solution = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
+    check_limits(case, koopman, instance, solution, regime)
+    every_row = knots_with_all_rows(case, koopman, instance, regime)
+    assert solution.solver_objective == pytest.approx(every_row, rel=1e-6)
+    assert solution.schedule.p.shape == (ded_ko_knots.N_KNOTS, len(case.generators))
+
+
+def test_tight_bounds_and_signs_need_more_rounds_than_one(ninebus: Case) -> None:
+    """Where frequency limits bind and P_s changes sign, rows must have been added, or nothing was tested."""
+    koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))
+    bound = ninebus.omega_bound("TO")
+    touched = crossed = 0
+    for index in range(4):
+        instance = short(ninebus, index)
+        solution = ded_ko_knots.prepare_with(ninebus, koopman, "TO", Settings())(instance)
+        model = replay(ninebus, koopman, instance, solution.schedule)
+        touched += bool((np.abs(model.omega[1:]) > bound * (1 - 1e-6)).any())
+        crossed += bool(np.ptp(np.sign(model.p_slack)) > 0)
+    assert touched
+    assert crossed
+
+
+def test_all_points_are_never_worse_than_knots(case: Case, koopman: Koopman) -> None:
+    for regime in case.regimes:
+        for index in range(3):
+            instance = short(case, index)
+            points = ded_ko.prepare_with(case, koopman, regime, Settings())(instance)
+            knots = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
+            assert points.solver_objective <= knots.solver_objective * (1 + 1e-8)
+            # 50 knots in 3 s leave little to be gained.
+            assert knots.solver_objective <= points.solver_objective * 1.01
+
+
+def test_a_looser_regime_is_never_dearer(case: Case, koopman: Koopman) -> None:
+    for method in METHODS:
+        for index in range(3):
+            loose, tight = (
+                method.prepare_with(case, koopman, regime, Settings())(short(case, index)).solver_objective
+                for regime in ("NO", "TO")
+            )
+            assert loose <= tight * (1 + 1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_models_of_other_forms_serve_as_well(method, case: Case, koopman: Koopman) -> None:
+    """The paper's form (G = 0) is solved on its own rollout; one more observable changes nothing."""
+    instance = short(case, 2)
+    paper = dataclasses.replace(koopman, g=np.zeros_like(koopman.g))
+    n = len(koopman.k)
+    wider = dataclasses.replace(
+        koopman,
+        k=np.block([[koopman.k, np.zeros((n, 1))], [np.zeros((1, n)), np.full((1, 1), 0.5)]]),
+        b=np.vstack([koopman.b, np.ones((1, koopman.b.shape[1]))]),
+        g=np.vstack([koopman.g, np.zeros((1, koopman.g.shape[1]))]),
+        lift=np.vstack([koopman.lift, np.ones((1, koopman.lift.shape[1]))]),
+    )
+    own, plain, more = (
+        method.prepare_with(case, model, "NO", Settings())(instance) for model in (paper, koopman, wider)
+    )
+    check_limits(case, paper, instance, own, "NO")
+    assert more.solver_objective == pytest.approx(plain.solver_objective, rel=1e-7)
+    assert own.solver_objective != pytest.approx(plain.solver_objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: Koopman) -> None:
+    instance = short(case, 0)
+    outside = dict(zip(case.generators, (case.p_max + 0.05).tolist(), strict=True))
+    far = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": outside})})
+    spinning = dict.fromkeys(case.generators, 2.0)
+    fast = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": spinning})})
+    for bad, slug in [(bad, slug) for bad in (far, fast) for slug in method.SETTINGS if slug in SLUGS]:
+        solution = method.prepare_with(case, koopman, "NO", Settings(name=slug))(bad)
+        assert solution.status == Status.INFEASIBLE
+        assert solution.schedule is None
+        assert solution.solver_objective is None
+        assert solution.error
+    again = method.prepare_with(case, koopman, "NO", Settings())(instance)
+    assert again.status == Status.OPTIMAL
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_only_just_impossible_is_infeasible_too(method, ninebus: Case) -> None:
+    """On a model that answers loads a step late, this instance's frequency cannot be held in time."""
+    late = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))
+    late = dataclasses.replace(late, g=np.zeros_like(late.g))
+    solution = method.prepare_with(ninebus, late, "TO", Settings())(short(ninebus, 2))
+    assert solution.status == Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, koopman: Koopman) -> None:
+    """P_0 is given, wherever it lies; the limits hold from t_1 on."""
+    instance = short(case, 0)
+    step = case.ramp_pu_per_s * instance.dt_s
+    just = dict(zip(case.generators, (case.p_max + 0.5 * step).tolist(), strict=True))
+    near = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": just})})
+    solution = method.prepare_with(case, koopman, "NO", Settings())(near)
+    assert solution.status == Status.OPTIMAL
+    p_gen = solution.schedule.at(instance.grid)
+    assert p_gen[0].tolist() == near.p_initial(case).tolist()
+    assert (p_gen[1:] - case.p_max).max() <= 1e-8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_time_limit_is_never_called_optimal(method, case: Case, koopman: Koopman) -> None:
+    for slug in set(method.SETTINGS) & set(SLUGS):
+        settings = Settings(name=slug, time_limit_s=1e-5)
+        solution = method.prepare_with(case, koopman, "TO", settings)(short(case, 0))
+        assert solution.status == Status.TIME_LIMIT
+        assert solution.error or solution.schedule is not None
+    enough = Settings(time_limit_s=100.0)
+    assert method.prepare_with(case, koopman, "TO", enough)(short(case, 0)).status == Status.OPTIMAL
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> None:
+    with pytest.raises(InputError, match="unknown regime"):
+        method.prepare_with(case, koopman, "XX", Settings())
+    with pytest.raises(InputError, match=r"identified at 0\.01"):
+        method.prepare_with(case, koopman, "NO", Settings())(short(case, 0, dt_s=0.02))
+    with pytest.raises(InputError, match="no such model"):
+        method.prepare(case, "NO", Settings(model="nowhere"))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_prepare_finds_the_model_that_the_settings_name(method, case: Case) -> None:
+    settings, instance = Settings(model="linear"), short(case, 0)
+    assert method.artifact(case, "NO", settings) == linear_model(case).fingerprint
+    solution = method.prepare(case, "NO", settings)(instance)
+    check_limits(case, linear_model(case), instance, solution, "NO")

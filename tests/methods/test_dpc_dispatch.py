@@ -1,0 +1,337 @@
+"""Our policy: what holds for any weights, its two networks, its loss, training, files, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from ded_bench.koopman.physics import linear_model
+from ded_bench.methods.dpc import ded_dpc_train
+from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, DispatchPolicy, prepare
+from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
+from ded_bench.methods.dpc.follower import Clip, Follow, follow
+from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
+from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.network import NumpyNetwork, ResidualNetwork
+from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.store import Scope, policy_file
+from ded_bench.methods.solution import Settings, Status
+from ded_bench.problem.case import Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.truth.score import score_many
+from ded_bench.truth.swing import Network
+
+HORIZON = 4.0
+KNOTS = knot_times(HORIZON, N_KNOTS)
+
+
+def some_instances(case: Case, count: int, first: int = 0, horizon: float = HORIZON) -> list[Instance]:
+    """Instances whose load ramps lie within a short horizon."""
+    chosen = []
+    for i in range(first, first + count):
+        drawn = sample_instance(case, POLICY_SEED, i)
+        load = {
+            bus: ramp.model_copy(update={"start": ramp.start * horizon / drawn.horizon_s})
+            for bus, ramp in drawn.load.items()
+        }
+        chosen.append(drawn.model_copy(update={"horizon_s": horizon, "load": load}))
+    return chosen
+
+
+def random_network(case: Case, size: float = 1.0) -> ResidualNetwork:
+    """A network whose last layer is not zero, with inputs normalised."""
+    torch.manual_seed(0)
+    network = ResidualNetwork.make(case)
+    torch.nn.init.normal_(network.last.weight, std=size)
+    network.normalise(Channels.of(case, Inputs.of(case, some_instances(case, 20)), KNOTS))
+    return network.eval()
+
+
+def random_policy(case: Case, size: float = 1.0, horizon: float = HORIZON) -> DispatchPolicy:
+    scope = Scope(case, next(iter(case.regimes)), horizon)
+    return DispatchPolicy(scope, random_network(case, size), {"seed": 0})
+
+
+def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
+    inputs = Inputs.of(case, some_instances(case, 30))
+    inputs.cost[:10] = np.round(inputs.cost[:10])  # ties, and costs of zero
+    channels = Channels.of(case, inputs, KNOTS)
+    expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(KNOTS))
+    np.testing.assert_allclose(channels.prior, expected, atol=1e-12)
+    p_slack = -inputs.p_load(KNOTS).sum(axis=2) - expected.sum(axis=2)
+    total = (expected * inputs.cost[:, None, 1:]).sum(axis=2) + inputs.cost[:, :1] * np.abs(p_slack)
+    np.testing.assert_allclose(channels.static_cost(inputs), total.mean(axis=1), atol=1e-12)
+    assert (channels.sequence.shape[2], channels.constants.shape[1]) == n_channels(case)
+
+
+def test_bends_say_what_loads_do_between_knots(case: Case) -> None:
+    instances = some_instances(case, 5)
+    channels = Channels.of(case, Inputs.of(case, instances), KNOTS)
+    n_load, spacing = len(case.loads), KNOTS[1]
+    for b, instance in enumerate(instances):
+        fine = np.linspace(0.0, HORIZON, (N_KNOTS - 1) * 400 + 1)
+        values = instance.p_load(case, fine)
+        halves = 0.5 * (values[1:] + values[:-1]) * (fine[1] - fine[0])
+        mean = halves.reshape(N_KNOTS - 1, 400, n_load).sum(axis=1) / spacing
+        at = instance.p_load(case, KNOTS)
+        np.testing.assert_allclose(channels.sequence[b, :, :n_load], at, atol=1e-14)
+        expected = mean - 0.5 * (at[1:] + at[:-1])
+        np.testing.assert_allclose(channels.sequence[b, 1:, n_load : 2 * n_load], expected, atol=1e-8)
+        assert np.abs(expected).max() > 1e-5
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, 1e3])
+def test_bounds_ramps_and_initial_input_hold_for_any_weights(case: Case, size: float) -> None:
+    horizon = case.sampling.horizon_s
+    instances = [sample_instance(case, POLICY_SEED, i) for i in range(40)]
+    policy = random_policy(case, size, horizon)
+    for instance, schedule in zip(instances, policy(instances), strict=True):
+        p = schedule.at(instance.grid)
+        ramp = case.ramp_pu_per_s * instance.dt_s
+        assert len(p) == instance.steps + 1
+        assert np.abs(np.diff(p, axis=0)).max() <= ramp + 1e-12
+        assert np.maximum(p - case.p_max, case.p_min - p).max() <= 1e-12
+        np.testing.assert_array_equal(p[0], instance.p_initial(case))
+    moved = np.abs(np.diff([s.p for s in policy(instances)], axis=1)).max()
+    assert moved == pytest.approx(policy.step)  # the limit was reached
+
+
+def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case) -> None:
+    instances = some_instances(case, 4)
+    schedules = random_policy(case)(instances)
+    for verdict in score_many(case, instances, schedules, [next(iter(case.regimes))] * 4):
+        assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) <= 1e-12
+
+
+def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:
+    rng = np.random.default_rng(0)
+    targets, start = rng.uniform(-1, 1, (7, 20, 3)), rng.uniform(-1, 1, (7, 3))
+    p = follow(targets, start, 0.3)
+    for b in range(7):
+        np.testing.assert_array_equal(follow(targets[b : b + 1], start[b : b + 1], 0.3)[0], p[b])
+    torch_p = Follow.apply(torch.as_tensor(targets), torch.as_tensor(start), 0.3)
+    np.testing.assert_array_equal(torch_p.numpy(), p)
+    slow = follow(targets, start, 10.0)
+    np.testing.assert_array_equal(slow[:, 1:], targets)  # without a limit it is where it should be
+
+
+def test_gradient_of_the_follower_is_the_recursions() -> None:
+    rng = np.random.default_rng(1)
+    targets = torch.tensor(rng.uniform(-1, 1, (5, 12, 2)), requires_grad=True)
+    start = torch.tensor(rng.uniform(-1, 1, (5, 2)))
+    weight = torch.tensor(rng.normal(size=(5, 13, 2)))
+    (weight * Follow.apply(targets, start, 0.4)).sum().backward()
+    plain = targets.detach().clone().requires_grad_()
+    p = [start]
+    for target in plain.unbind(1):
+        p.append(p[-1] + (target - p[-1]).clamp(-0.4, 0.4))
+    (weight * torch.stack(p, dim=1)).sum().backward()
+    torch.testing.assert_close(targets.grad, plain.grad)
+    assert 0 < int((targets.grad == 0).sum()) < targets.numel()
+
+
+def test_clip_lets_descent_lead_back_inside() -> None:
+    value = torch.tensor([-2.0, -2.0, 0.5, 3.0, 3.0], requires_grad=True)
+    low, high = torch.tensor(0.0), torch.tensor(1.0)
+    clipped = Clip.apply(value, low, high)
+    (clipped * torch.tensor([1.0, -1.0, 2.0, 1.0, -1.0])).sum().backward()
+    torch.testing.assert_close(clipped.detach(), torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0]))
+    torch.testing.assert_close(value.grad, torch.tensor([0.0, -1.0, 2.0, 1.0, 0.0]))
+
+
+def test_numpy_twin_equals_the_torch_network(case: Case) -> None:
+    network = random_network(case)
+    channels = Channels.of(case, Inputs.of(case, some_instances(case, 9)), KNOTS)
+    with torch.no_grad():
+        expected = network(
+            *(torch.as_tensor(a, dtype=torch.float32) for a in (channels.sequence, channels.constants))
+        )
+    twin = NumpyNetwork(network)
+    np.testing.assert_allclose(twin(channels), expected.numpy(), rtol=1e-4, atol=1e-5)
+    assert expected.abs().max() > 0.1
+
+
+def test_batches_threads_and_single_calls_agree(threebus: Case) -> None:
+    policy, instances = random_policy(threebus), some_instances(threebus, 2 * CHUNK + 3)
+    inputs = Inputs.of(threebus, instances)
+    whole = policy.powers(inputs)
+    assert policy([]) == []
+    assert whole.shape == (len(instances), N_KNOTS, len(threebus.generators))
+    np.testing.assert_array_equal(policy.powers(inputs, threads=2), whole)
+    for b in (0, CHUNK, len(instances) - 1):
+        np.testing.assert_allclose(policy(instances[b])[0].p, whole[b], atol=1e-5)
+
+
+def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
+    model, instances = linear_model(case), some_instances(case, 3)
+    network, grid = Network(case), instances[0].grid
+    inputs, stride = Inputs.of(case, instances), coarse_stride(instances[0].dt_s, instances[0].steps)
+    assert stride > 1
+    p_load = np.stack([i.p_load(case) for i in instances], axis=1)
+    fine = model.free_response(model.initial(network, instances), p_load).transpose(1, 2, 0)
+    coarse = coarse_free_response(network, model, inputs, grid, stride)
+    np.testing.assert_allclose(coarse, fine[:, :, ::stride], atol=1e-6)
+
+    p_gen = torch.as_tensor(random_policy(case).powers(inputs))
+    cost = torch.as_tensor(inputs.cost)
+    values = []
+    for step, free in ((1, fine), (stride, fine[:, :, ::stride])):
+        objective = Objective.make(case, model, grid, KNOTS, step, torch.float64)
+        omega, p_slack = objective.rollout(torch.as_tensor(free.copy()), p_gen)
+        values.append((objective.cost(p_gen, p_slack, cost), omega.abs().amax(dim=(1, 2))))
+    torch.testing.assert_close(values[0][0], values[1][0], rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(values[0][1], values[1][1], rtol=1e-2, atol=0.0)
+    # the fine cost is the sum that the scorer takes
+    powers = np.stack([np.interp(grid, KNOTS, p_gen[0, :, g]) for g in range(p_gen.shape[2])], axis=1)
+    one = Objective.make(case, model, grid, KNOTS, 1, torch.float64)
+    _, slack = one.rollout(torch.as_tensor(fine[:1].copy()), p_gen[:1])
+    total = (powers @ inputs.cost[0, 1:]).sum() + inputs.cost[0, 0] * np.abs(slack.numpy()).sum()
+    assert float(values[0][0][0]) == pytest.approx(total, rel=1e-12)
+
+
+def test_gradient_of_the_loss_matches_finite_differences(threebus: Case) -> None:
+    model, instances = linear_model(threebus), some_instances(threebus, 3)
+    inputs, stride = Inputs.of(threebus, instances), 10
+    channels = Channels.of(threebus, inputs, KNOTS)
+    free = coarse_free_response(Network(threebus), model, inputs, instances[0].grid, stride)
+    pool = Pool.of(threebus, channels, inputs, free, len(instances[0].grid))
+    pool = Pool(*(getattr(pool, name).double() for name in pool.__dataclass_fields__))
+    low, high = torch.as_tensor(threebus.p_min) - 5, torch.as_tensor(threebus.p_max) + 5  # `Clip` is apart
+    objective = Objective.make(threebus, model, instances[0].grid, KNOTS, stride, torch.float64)
+    loss = Loss(objective, low, high, 1.0, 1e-3, 0.1)
+    network = random_network(threebus, 0.1).double()
+
+    def total() -> torch.Tensor:
+        cost, excess = loss(loss.powers(network, pool), pool, 0.03)
+        return cost.sum() + ded_dpc_train._penalty(excess).sum()
+
+    total().backward()
+    for weight, index in (
+        (network.last.bias, (0,)),
+        (network.mix[2].bias, (3,)),
+        (network.embed[2].bias, (40,)),
+    ):
+        with torch.no_grad():
+            weight[index] += 1e-6
+            above = total()
+            weight[index] -= 2e-6
+            below = total()
+            weight[index] += 1e-6
+        numeric = float(above - below) / 2e-6
+        assert abs(numeric) > 1e-3
+        assert float(weight.grad[index]) == pytest.approx(numeric, rel=1e-3)
+
+
+def short_training(case: Case, out: Path, **options: object) -> DispatchPolicy:
+    """A few epochs on few instances."""
+    defaults = {"seed": 3, "epochs": 6, "fresh": 300}
+    regime = next(iter(case.regimes))
+    return train(case, regime, some_instances(case, 10), linear_model(case), out, **(defaults | options))
+
+
+def test_training_beats_the_static_dispatch_and_repeats(threebus: Case, tmp_path: Path) -> None:
+    one = short_training(threebus, tmp_path / "a.safetensors")
+    two = short_training(threebus, tmp_path / "b.safetensors")
+    assert one.fingerprint == two.fingerprint
+    history = pd.read_csv(tmp_path / "a.history.csv")
+    assert history["epoch"].tolist() == [1, 2, 3, 4, 5, 6]
+    assert history["held out"].iloc[-1] < history["held out"].iloc[0]
+    assert one.training["held_out_loss"] == pytest.approx(history["held out"].min())
+    assert one.training["instances"] == 300
+    assert one.training["fresh"]
+    other = short_training(threebus, tmp_path / "c.safetensors", seed=4)
+    assert other.fingerprint != one.fingerprint
+    given = short_training(threebus, tmp_path / "d.safetensors", fresh=0)
+    assert (given.training["instances"], given.training["held_out"]) == (8, 2)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_weights(
+    threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = short_training(threebus, tmp_path / "a.safetensors")
+    save, saved = ded_dpc_train._Run._save, []
+
+    def save_twice(run: ded_dpc_train._Run) -> None:
+        save(run)
+        saved.append(run.epoch)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ded_dpc_train._Run, "_save", save_twice)
+        with pytest.raises(KeyboardInterrupt):
+            short_training(threebus, tmp_path / "b.safetensors")
+    assert saved == [1, 2]
+    resumed = short_training(threebus, tmp_path / "b.safetensors", resume=True)
+    assert resumed.fingerprint == whole.fingerprint
+    assert resumed.training["steps"] == whole.training["steps"]
+
+
+def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path) -> None:
+    policy = short_training(threebus, tmp_path / "a.safetensors", epochs=10_000, seconds=0.5)
+    assert 0.5 <= policy.training["seconds"] < 5.0
+    assert policy.training["epochs"] < 10_000
+
+
+def test_policy_files_round_trip_and_serve_as_a_method(threebus: Case, tmp_path: Path) -> None:
+    policy = random_policy(threebus)
+    regime = policy.scope.regime
+    path = policy_file(tmp_path, METHOD, regime)
+    policy.save(path)
+    loaded = DispatchPolicy.load(path, threebus, regime)
+    assert loaded.fingerprint == policy.fingerprint
+    instances = some_instances(threebus, 3)
+    for a, b in zip(loaded(instances), policy(instances), strict=True):
+        np.testing.assert_array_equal(a.p, b.p)
+    solution = prepare(threebus, regime, Settings(search=(tmp_path,)))(instances[0])
+    assert solution.status == Status.POLICY
+    assert solution.solve_s > 0
+    np.testing.assert_array_equal(solution.schedule.p, policy(instances[0])[0].p)
+
+
+def test_the_exported_network_is_the_same_function(case: Case, tmp_path: Path) -> None:
+    policy = random_policy(case)
+    policy.export(tmp_path / "policy.pt2")
+    exported = torch.export.load(str(tmp_path / "policy.pt2")).module()
+    for count in (1, 7):
+        channels = Channels.of(case, Inputs.of(case, some_instances(case, count)), KNOTS)
+        tensors = [torch.as_tensor(a, dtype=torch.float32) for a in (channels.sequence, channels.constants)]
+        with torch.no_grad():
+            torch.testing.assert_close(exported(*tensors), policy.network(*tensors))
+
+
+def test_policy_refuses_what_it_was_not_trained_for(
+    threebus: Case, ninebus: Case, tmp_path: Path, alter
+) -> None:
+    policy, path = random_policy(threebus), tmp_path / "p.safetensors"
+    policy.save(path)
+    regime = policy.scope.regime
+    other_regime = next(r for r in threebus.regimes if r != regime)
+    with pytest.raises(InputError, match="regime"):
+        DispatchPolicy.load(path, threebus, other_regime)
+    with pytest.raises(InputError, match="case"):
+        DispatchPolicy.load(path, ninebus, regime)
+    with pytest.raises(InputError, match="case_fingerprint"):
+        DispatchPolicy.load(path, alter(threebus, ramp_pu_per_s=0.01), regime)
+    with pytest.raises(InputError, match="horizon"):
+        policy(some_instances(threebus, 1, horizon=2.0))
+    with pytest.raises(InputError, match="case"):
+        policy(some_instances(ninebus, 1))
+    with pytest.raises(InputError, match=r"train-dpc --method ded-dpc .* --settings train400"):
+        prepare(threebus, regime, Settings(name="train400", search=(tmp_path,)))
+    broken = DispatchPolicy(policy.scope, policy.network, {"seed": 0})
+    broken.network.dilations = (1, 2, 70)
+    broken.save(path)
+    with pytest.raises(InputError, match="dilations"):
+        DispatchPolicy.load(path, threebus, regime)
+    broken.network.dilations = (1, 2)
+    broken.save(path)
+    with pytest.raises(InputError, match=r"embed|spread|mix"):
+        DispatchPolicy.load(path, threebus, regime)

@@ -1,0 +1,147 @@
+"""The refined policy: what its steps converge to, and what holds after any number of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+
+from ded_bench.koopman.model import hat_functions
+from ded_bench.koopman.physics import linear_model
+from ded_bench.methods.dpc import refine
+from ded_bench.methods.dpc.ded_dpc import N_KNOTS, DispatchPolicy
+from ded_bench.methods.dpc.ded_dpc_refined import SETTINGS, artifact, prepare
+from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.network import ResidualNetwork
+from ded_bench.methods.dpc.objective import coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.refine import Refiner
+from ded_bench.methods.dpc.store import Scope, policy_file
+from ded_bench.methods.solution import Settings, Status
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.truth.swing import Network
+
+
+def some_instances(case: Case, count: int) -> list[Instance]:
+    return [sample_instance(case, POLICY_SEED, i) for i in range(count)]
+
+
+def tightest(case: Case) -> str:
+    return min(case.regimes, key=case.omega_bound)
+
+
+def static_policy(case: Case, regime: str) -> DispatchPolicy:
+    """The follower of the static dispatch: a network that corrects nothing."""
+    network = ResidualNetwork.make(case).eval()
+    return DispatchPolicy(Scope(case, regime, case.sampling.horizon_s), network, {"seed": 0})
+
+
+def optimum(case: Case, regime: str, instance: Instance) -> float:
+    """The condensed problem's optimum, written as a linear program for another solver."""
+    model, n_gen = linear_model(case), len(case.generators)
+    knots = knot_times(instance.horizon_s, N_KNOTS)
+    stride = coarse_stride(instance.dt_s, instance.steps, refine.SPACING_S)
+    inputs = Inputs.of(case, [instance])
+    free = coarse_free_response(Network(case), model, inputs, instance.grid, stride)[0]
+    gamma = model.condense(n_gen, instance.grid, knots)[::stride].reshape(-1, n_gen + 1, N_KNOTS * n_gen)
+    n = len(gamma)
+    slack, omega = gamma[:, n_gen], gamma[:, :n_gen].transpose(1, 0, 2).reshape(n * n_gen, -1)
+    bound = case.omega_bound(regime) * (1.0 - refine.MARGIN)
+    unit = np.eye(N_KNOTS * n_gen)
+    change = unit[n_gen:] - unit[:-n_gen]
+    weights = hat_functions(instance.grid, instance.grid[::stride]).sum(axis=0)
+    held = hat_functions(instance.grid, knots).sum(axis=0)
+    cost = np.concatenate([np.outer(held, inputs.cost[0, 1:]).ravel(), inputs.cost[0, 0] * weights])
+    none = np.zeros((len(omega), n))
+    above = np.vstack(
+        [
+            np.hstack([slack, -np.eye(n)]),
+            np.hstack([-slack, -np.eye(n)]),
+            np.hstack([omega, none]),
+            np.hstack([-omega, none]),
+            np.hstack([change, np.zeros((len(change), n))]),
+            np.hstack([-change, np.zeros((len(change), n))]),
+        ]
+    )
+    flat = free[:n_gen].ravel().astype(float)
+    step = np.full(2 * len(change), case.ramp_pu_per_s * knots[1])
+    limits = np.concatenate([-free[n_gen], free[n_gen], bound - flat, bound + flat, step])
+    bounds = [*zip(np.tile(case.p_min, N_KNOTS), np.tile(case.p_max, N_KNOTS), strict=True)]
+    bounds[:n_gen] = [(p, p) for p in inputs.p_initial[0]]
+    result = linprog(cost, above, limits, bounds=bounds + [(0, None)] * n)
+    assert result.status == 0
+    return float(result.fun)
+
+
+def condensed_cost(refiner: Refiner, instances: list[Instance], p_gen: np.ndarray) -> np.ndarray:
+    """Cost of schedules on the coarse points, by the model."""
+    case, inputs = refiner.case, Inputs.of(refiner.case, instances)
+    n_gen = len(case.generators)
+    free = coarse_free_response(refiner.network, refiner.model, inputs, refiner.grid, refiner.stride)
+    knots = knot_times(refiner.grid[-1], N_KNOTS)
+    gamma = refiner.model.condense(n_gen, refiner.grid, knots)[:: refiner.stride]
+    p_slack = free[:, n_gen] + np.einsum("tkg,bkg->bt", gamma[:, n_gen], p_gen)
+    generators = (np.einsum("bkg,k->bg", p_gen, refiner.held) * inputs.cost[:, 1:]).sum(axis=1)
+    return generators + inputs.cost[:, 0] * (np.abs(p_slack) @ refiner.stands_for)
+
+
+def test_many_steps_reach_the_optimum_of_the_linear_program(case: Case) -> None:
+    instances, regime = some_instances(case, 3), tightest(case)
+    policy = static_policy(case, regime)
+    inputs = Inputs.of(case, instances)
+    refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
+    start = policy.powers(inputs)
+    best = np.array([optimum(case, regime, i) for i in instances])
+    gaps = [
+        condensed_cost(refiner, instances, refiner(inputs, start, steps)) / best - 1.0
+        for steps in (200, 3000)
+    ]
+    assert np.abs(gaps[1]).max() < 5e-4
+    assert np.abs(gaps[1]).max() <= np.abs(gaps[0]).max()
+
+
+@pytest.mark.parametrize("steps", [0, 1, 30])
+def test_hard_limits_hold_after_any_number_of_steps(case: Case, steps: int) -> None:
+    instances, regime = some_instances(case, 6), tightest(case)
+    policy = static_policy(case, regime)
+    inputs = Inputs.of(case, instances)
+    refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
+    start = policy.powers(inputs)
+    p_gen = refiner(inputs, start, steps)
+    assert np.abs(np.diff(p_gen, axis=1)).max() <= policy.step + 1e-12
+    assert np.maximum(p_gen - case.p_max, case.p_min - p_gen).max() <= 1e-12
+    np.testing.assert_array_equal(p_gen[:, 0], inputs.p_initial)
+    if not steps:
+        np.testing.assert_allclose(p_gen, start, atol=1e-6)
+
+
+def test_what_is_not_better_is_not_taken(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    instances, regime = some_instances(case, 4), tightest(case)
+    policy = static_policy(case, regime)
+    inputs = Inputs.of(case, instances)
+    refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
+    good = refiner(inputs, policy.powers(inputs), 1000)
+    monkeypatch.setattr(refine, "DUAL_STEP", 50.0)  # diverges
+    np.testing.assert_array_equal(refiner(inputs, good, 20), good)
+
+
+def test_it_serves_as_a_method(threebus: Case, tmp_path: Path) -> None:
+    regime, instance = tightest(threebus), some_instances(threebus, 1)[0]
+    policy = static_policy(threebus, regime)
+    policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
+    settings = {name: Settings(name=name, model="linear", search=(tmp_path,)) for name in SETTINGS}
+    answers = {name: prepare(threebus, regime, settings[name])(instance) for name in ("default", "steps25")}
+    assert {a.status for a in answers.values()} == {Status.POLICY}
+    assert answers["default"].iterations == refine.STEPS
+    assert answers["steps25"].iterations == 25
+    assert answers["default"].solve_s > 0
+    assert not np.array_equal(answers["default"].schedule.p, answers["steps25"].schedule.p)
+    before = artifact(threebus, regime, settings["default"])
+    torch.nn.init.ones_(policy.network.last.bias)
+    policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
+    assert artifact(threebus, regime, settings["default"]) != before

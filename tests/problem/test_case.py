@@ -1,0 +1,153 @@
+"""Cases: the published 9-bus data, every way a case.json can be wrong, and where names resolve."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.strict import parse_record
+
+
+def test_ninebus_holds_the_papers_tables(ninebus):
+    """Tables I, II and IV: voltages, lines, limits of half the nominal power to either side, ε = 5e-4."""
+    voltage = {bus.id: bus.v for bus in ninebus.buses}
+    assert voltage == {"s": 1.04, "2": 1.02533, "3": 1.02536} | {bus: 1.0 for bus in "456789"}
+    assert {frozenset((line.from_bus, line.to_bus)): line.x for line in ninebus.lines} == {
+        frozenset(("s", "4")): 0.0576,
+        frozenset(("4", "5")): 0.092,
+        frozenset(("5", "6")): 0.17,
+        frozenset(("3", "6")): 0.0586,
+        frozenset(("6", "7")): 0.1008,
+        frozenset(("7", "8")): 0.072,
+        frozenset(("8", "2")): 0.0625,
+        frozenset(("8", "9")): 0.161,
+        frozenset(("9", "4")): 0.085,
+    }
+    assert (ninebus.slack, ninebus.generators, ninebus.loads) == ("s", ("2", "3"), ("5", "7", "9"))
+    np.testing.assert_allclose(ninebus.p_min, 0.5 * ninebus.p_nominal, rtol=1e-15)
+    np.testing.assert_allclose(ninebus.p_max, 1.5 * ninebus.p_nominal, rtol=1e-15)
+    np.testing.assert_array_equal(ninebus.p_nominal, [1.63, 0.85])
+    np.testing.assert_array_equal(ninebus.load_nominal, [-0.9, -1.0, -1.25])
+    assert ninebus.ramp_pu_per_s * ninebus.sampling.dt_s == pytest.approx(5e-4, rel=1e-15)
+    assert ninebus.sampling.horizon_s / ninebus.sampling.dt_s == 6000
+
+
+def test_regime_bounds_are_in_rad_per_s(case):
+    """0.05 Hz and 0.0016 Hz, times 2π."""
+    assert case.omega_bound("NO") == pytest.approx(0.3141592653589793, rel=1e-15)
+    assert case.omega_bound("TO") == pytest.approx(0.010053096491487338, rel=1e-15)
+    with pytest.raises(InputError, match=r"unknown regime 'XX'.*NO, TO"):
+        case.omega_bound("XX")
+
+
+def test_a_case_resolves_from_name_folder_and_file(ninebus, tmp_path, monkeypatch):
+    """Shipped names work from any working directory; a path wins where one exists."""
+    monkeypatch.chdir(tmp_path)
+    shipped = SHIPPED_CASES / "9bus"
+    assert Case.load("9bus") == Case.load(shipped) == Case.load(shipped / "case.json") == ninebus
+    with pytest.raises(InputError, match=r"nowhere: no such case .*9bus"):
+        Case.load("nowhere")
+    with pytest.raises(InputError, match=r"case.json: cannot be read"):
+        Case.load(tmp_path)
+
+
+def test_fingerprint_follows_content(case, alter):
+    """Equal content, equal fingerprint; any change, another one."""
+    assert alter(case).fingerprint == case.fingerprint
+    assert alter(case, ramp_pu_per_s=case.ramp_pu_per_s * (1 + 1e-15)).fingerprint != case.fingerprint
+
+
+def _set(path: str, value: object):
+    """Return an edit of plain JSON data that sets the field at a dotted path."""
+
+    def edit(data):
+        *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+        for part in parents:
+            data = data[part]
+        data[last] = value
+
+    return edit
+
+
+def _drop(path: str):
+    def edit(data):
+        *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+        for part in parents:
+            data = data[part]
+        del data[last]
+
+    return edit
+
+
+def _append_line(start: str, stop: str):
+    return lambda data: data["lines"].append({"from": start, "to": stop, "r": 0.0, "x": 0.1})
+
+
+def _add_bus(**bus: object):
+    return lambda data: data["buses"].append(bus)
+
+
+@pytest.mark.parametrize(
+    ("edit", "field", "problem"),
+    [
+        (_set("colour", "red"), "colour", "extra inputs"),
+        (_set("machines.plant.colour", 1), "machines.plant.colour", "extra inputs"),
+        (_drop("f0_hz"), "f0_hz", "required"),
+        (_drop("lines.0.x"), "lines.0.x", "required"),
+        (_set("schema", "ded-bench/case/2"), "schema", "ded-bench/case/1"),
+        (_set("id", "../evil"), "id", "pattern"),
+        (_set("f0_hz", "60"), "f0_hz", "valid number"),
+        (_set("f0_hz", True), "f0_hz", "valid number"),
+        (_set("buses.0.v", 0.0), "buses.0.v", "greater than 0"),
+        (_set("buses.0.v", float("nan")), "buses.0.v", "finite"),
+        (_set("buses.0.kind", "windmill"), "buses.0.kind", "'slack', 'generator', 'load' or 'junction'"),
+        (_set("lines.0.x", 0.0), "lines.0.x", "greater than 0"),
+        (_set("lines.0.r", -0.1), "lines.0.r", "greater than or equal to 0"),
+        (_set("machines.plant.m", 0.0), "machines.plant.m", "greater than 0"),
+        (_set("machines.plant.d", -1.0), "machines.plant.d", "greater than or equal to 0"),
+        (_set("machines.plant.p_min", 0.9), "machines.plant", "p_min must be below p_max"),
+        (_set("machines", {}), "", "exactly the generator buses"),
+        (_set("ramp_pu_per_s", 0.0), "ramp_pu_per_s", "greater than 0"),
+        (_set("regimes", {}), "", "at least one regime"),
+        (_set("regimes.NO.omega_hz", -0.05), "regimes.NO.omega_hz", "greater than 0"),
+        (_set("sampling.start_s", [2.0, 1.0]), "sampling", "start_s: lower end above upper end"),
+        (_set("sampling.cost", [-1.0, 1.0]), "sampling", "cost: must not be negative"),
+        (_set("sampling.rate_zero_probability", 1.5), "sampling.rate_zero_probability", "less than or equal"),
+        (_set("buses.0.id", "s"), "", "same id"),
+        (_set("buses.0.p_nominal", None), "", "town: p_nominal belongs to load buses"),
+        (_set("buses.2.p_nominal", -1.0), "", "plant: p_nominal belongs to load buses"),
+        (_set("buses.1.kind", "junction"), "", "exactly one slack"),
+        (_set("buses.2.kind", "junction"), "", "at least one generator"),
+        (_append_line("town", "town"), "", "town-town does not join two known buses"),
+        (_append_line("town", "moon"), "", "town-moon does not join two known buses"),
+        (_add_bus(id="moon", kind="junction", v=1.0), "", "moon is not connected"),
+    ],
+)
+def test_a_wrong_case_is_refused(threebus, edit, field, problem):
+    """Each error names the source, the field, and what is wrong with it."""
+    data = json.loads(threebus.model_dump_json(by_alias=True))
+    edit(data)
+    with pytest.raises(InputError) as caught:
+        parse_record(Case, json.dumps(data), Path("bad/case.json"))
+    assert caught.value.source == str(Path("bad/case.json"))
+    assert caught.value.field == field
+    assert problem in caught.value.problem
+
+
+def test_equality_is_about_content_not_about_what_was_computed(case_file: Path) -> None:
+    used, fresh = Case.load(case_file), Case.load(case_file)
+    assert used.p_min.shape == (len(used.generators),)  # now cached in one of them
+    sent = copy.deepcopy(used)
+    assert used == fresh == sent
+    assert len({used, fresh, sent}) == 1
+    instance = sample_instance(used, 1, 2)
+    assert instance.grid[0] == 0.0
+    assert instance == sample_instance(fresh, 1, 2)
+    assert instance != sample_instance(fresh, 1, 3)

@@ -1,0 +1,279 @@
+"""The sampler against the paper's Table III, and the committed benchmark against the sampler."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.stats import binom, kstest
+
+from ded_bench.problem.case import SHIPPED_CASES
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import load_instances
+from ded_bench.problem.sampling import (
+    CERTIFICATE_SEED,
+    KOOPMAN_SEED,
+    POLICY_SEED,
+    draw_split,
+    load_manifest,
+    load_split,
+    sample_instance,
+    sample_instances,
+    write_benchmark,
+)
+
+COUNT, SEED = 500, 2022
+#: A sound sampler fails a test at this level once in a million; seeds are fixed, so never by chance later.
+LEVEL = 1e-6
+
+
+@pytest.fixture(scope="module")
+def drawn(case):
+    """500 instances of each case."""
+    return list(sample_instances(case, SEED, COUNT))
+
+
+@pytest.fixture(scope="module")
+def written(ninebus, tmp_path_factory):
+    """The folder that `ded-bench instances --count 500 --seed 2022` writes, and its manifest."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    shutil.copy(SHIPPED_CASES / "9bus" / "case.json", folder / "case.json")
+    return folder, write_benchmark(ninebus, COUNT, SEED, folder)
+
+
+def field(instances, pick) -> np.ndarray:
+    """One number per instance and bus, flattened."""
+    return np.array([list(pick(instance)) for instance in instances]).ravel()
+
+
+def draws_of(case, instances) -> dict[str, tuple[np.ndarray, float, float]]:
+    """Every independently drawn number of Table III with the ends of its range."""
+    ranges = case.sampling
+    ramps = [ramp for instance in instances for ramp in instance.load.values()]
+    moving = np.array([abs(ramp.rate) for ramp in ramps if ramp.rate != 0.0])
+    relative = np.array([i.p_load(case, np.zeros(1))[0] / case.load_nominal - 1 for i in instances]).ravel()
+    return {
+        "P_0 of loads": (relative, -ranges.load_relative, ranges.load_relative),
+        "t_0": (np.array([ramp.start for ramp in ramps]), *ranges.start_s),
+        "d": (np.array([ramp.duration for ramp in ramps]), *ranges.duration_s),
+        "|r|": (moving, *ranges.rate_pu_per_s),
+        "omega_0": (field(instances, lambda i: i.initial.omega.values()), *ranges.omega_rad_per_s),
+        "c": (field(instances, lambda i: i.cost.values()), *ranges.cost),
+    }
+
+
+def test_ninebus_ranges_are_those_of_table_iii(ninebus):
+    """The data of the shipped case; the sampler below is tested against whatever a case says."""
+    ranges = ninebus.sampling
+    assert ranges.load_relative == 0.25
+    assert (ranges.start_s, ranges.duration_s) == ((0, 60), (5, 20))
+    assert ranges.rate_pu_per_s == (0.01, 0.05)
+    assert ranges.rate_zero_probability == 0.15
+    assert ranges.perturbation == (0, 1)
+    assert ranges.omega_rad_per_s == (-0.01, 0.01)
+    assert ranges.cost == (0, 1)
+
+
+def test_draws_stay_within_their_ranges_and_fill_them_evenly(case, drawn):
+    """Bounds up to the ninth decimal, and Kolmogorov-Smirnov against the uniform distribution."""
+    for name, (values, low, high) in draws_of(case, drawn).items():
+        assert values.min() >= low - 1e-9, name
+        assert values.max() <= high + 1e-9, name
+        assert kstest(values, "uniform", args=(low, high - low)).pvalue > LEVEL, name
+
+
+def test_signs_and_zero_rates_have_their_probabilities(case, drawn):
+    """Counts within the central interval of the binomial distribution, per load bus."""
+    for bus in case.loads:
+        rates = np.array([instance.load[bus].rate for instance in drawn])
+        zero = case.sampling.rate_zero_probability
+        moving = int((rates != 0).sum())
+        low, high = binom.interval(1 - LEVEL, COUNT, zero)
+        assert low <= COUNT - moving <= high
+        low, high = binom.interval(1 - LEVEL, moving, 0.5)
+        assert low <= (rates > 0).sum() <= high
+
+
+def test_loads_are_drawn_independently(ninebus):
+    """No two columns of the drawn numbers are correlated (|r| < 5 standard errors)."""
+    instances = list(sample_instances(ninebus, SEED, COUNT))
+    columns = {}
+    for bus in ninebus.loads:
+        for name in ("initial", "start", "duration"):
+            columns[bus, name] = [getattr(i.load[bus], name) for i in instances]
+        columns[bus, "sign"] = [np.sign(i.load[bus].rate) for i in instances]
+        columns[bus, "zero"] = [float(i.load[bus].rate == 0) for i in instances]
+    for bus in ninebus.generators:
+        columns[bus, "omega"] = [i.initial.omega[bus] for i in instances]
+    for bus in (ninebus.slack, *ninebus.generators):
+        columns[bus, "cost"] = [i.cost[bus] for i in instances]
+    for one, other in combinations(columns, 2):
+        correlation = np.corrcoef(columns[one], columns[other])[0, 1]
+        assert abs(correlation) < 5 / np.sqrt(COUNT), (one, other)
+
+
+def test_initial_power_is_a_perturbed_optimum(case, drawn):
+    """P(0) = P_opt - ½ (P_opt - P_n) s: s, recovered with an LP's P_opt, is uniform per generator."""
+    recovered = []
+    for instance in drawn:
+        n_gen = len(case.generators)
+        optimum = linprog(
+            [*instance.cost_gen(case), instance.cost_slack(case), instance.cost_slack(case)],
+            A_eq=[[1.0] * n_gen + [1.0, -1.0]],
+            b_eq=[-instance.p_load(case, np.zeros(1)).sum()],
+            bounds=[*zip(case.p_min, case.p_max, strict=True), (0, None), (0, None)],
+        ).x[:n_gen]
+        off_nominal = optimum - case.p_nominal
+        power = instance.p_initial(case)
+        assert (power >= case.p_min).all()
+        assert (power <= case.p_max).all()
+        known = np.abs(off_nominal) > 1e-3  # else rounding hides s
+        recovered.append(np.where(known, 2 * (optimum - power) / np.where(known, off_nominal, 1), np.nan))
+    s = np.array(recovered)
+    low, high = case.sampling.perturbation
+    values = s[np.isfinite(s)]
+    assert len(values) > 0.9 * s.size
+    assert values.min() >= low - 1e-5
+    assert values.max() <= high + 1e-5
+    assert kstest(values, "uniform", args=(low, high - low)).pvalue > LEVEL
+    if s.shape[1] > 1:  # one draw per generator, not one per instance
+        both = s[np.isfinite(s).all(axis=1)]
+        assert abs(np.corrcoef(both.T)[0, 1]) < 5 / np.sqrt(len(both))
+
+
+def test_values_have_nine_decimals(drawn):
+    """What is written is what was drawn, on every machine."""
+    for instance in drawn[:100]:
+        ramps = [x for r in instance.load.values() for x in (r.initial, r.start, r.duration, r.rate)]
+        numbers = [*instance.cost.values(), *ramps]
+        numbers += [*instance.initial.power.values(), *instance.initial.omega.values()]
+        for value in numbers:
+            assert value == round(value, 9)
+
+
+def test_nothing_rounds_to_negative_zero(case, alter):
+    """Frequencies below the last decimal are written as 0.0, never as -0.0."""
+    ranges = case.sampling.model_dump() | {"omega_rad_per_s": [-1e-10, -1e-11]}
+    text = sample_instance(alter(case, sampling=ranges), 1, 0).model_dump_json()
+    assert '"omega":{"' in text
+    assert "-0.0," not in text
+    assert "-0.0}" not in text
+
+
+def test_an_instance_depends_only_on_master_and_index(case):
+    """Any order, any count: the same instance; another master or index: another one."""
+    forwards = list(sample_instances(case, 7, 5))
+    assert list(sample_instances(case, 7, 2, first=3)) == forwards[3:]
+    assert [sample_instance(case, 7, i) for i in (4, 0)] == [forwards[4], forwards[0]]
+    assert [instance.seed for instance in forwards] == [(7, i) for i in range(5)]
+    starts = [
+        tuple(ramp.start for ramp in sample_instance(case, master, index).load.values())
+        for master in (7, 8, SEED, POLICY_SEED, CERTIFICATE_SEED, KOOPMAN_SEED)
+        for index in range(20)
+    ]
+    assert len(set(starts)) == len(starts)
+
+
+def test_drawing_disturbs_no_global_generator(case):
+    """Each instance has a generator of its own."""
+    before = np.random.get_state()[1].copy()
+    sample_instance(case, 7, 0)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)
+
+
+def test_the_same_seed_gives_the_same_bytes(case, tmp_path):
+    """Two runs, also over leftovers of a larger one, differ in no byte and no file."""
+    write_benchmark(case, 12, 99, tmp_path / "a")
+    write_benchmark(case, 20, 99, tmp_path / "b")
+    write_benchmark(case, 12, 99, tmp_path / "b")
+    trees = [
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+        for root in (tmp_path / "a", tmp_path / "b")
+    ]
+    assert len(trees[0]) == 12 + 3
+    assert trees[0] == trees[1]
+    instances, own_case = load_instances(sorted((tmp_path / "a" / "instances").iterdir()))
+    assert own_case == case
+    assert instances == list(sample_instances(case, 99, 12))
+
+
+def test_the_version_changes_with_any_file(case, alter, tmp_path):
+    """Other seed, other count or other case: results are not comparable."""
+    versions = {
+        write_benchmark(case, 6, 1, tmp_path / "a").version,
+        write_benchmark(case, 6, 2, tmp_path / "b").version,
+        write_benchmark(case, 7, 1, tmp_path / "c").version,
+        write_benchmark(alter(case, ramp_pu_per_s=0.06), 6, 1, tmp_path / "d").version,
+    }
+    assert len(versions) == 4
+
+
+def test_a_folder_of_another_case_is_left_alone(threebus, ninebus, alter, tmp_path):
+    """Instances never lie beside a case that they were not drawn from, and nothing is deleted."""
+    write_benchmark(threebus, 3, 1, tmp_path)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    for other in (ninebus, alter(threebus, ramp_pu_per_s=0.06)):
+        with pytest.raises(InputError, match=r"case.json: is another case"):
+            write_benchmark(other, 2, 1, tmp_path)
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_committed_benchmark_is_what_the_sampler_writes(written):
+    """Every committed file, byte for byte; nothing is missing and nothing else lies there."""
+    folder, _ = written
+    committed = SHIPPED_CASES / "9bus"
+    names = [sorted(p.name for p in (root / "instances").iterdir()) for root in (folder, committed)]
+    assert names[0] == names[1]
+    for name in ["split.json", "MANIFEST.json", *(f"instances/{n}" for n in names[0])]:
+        assert (folder / name).read_bytes() == (committed / name).read_bytes(), name
+
+
+def test_committed_manifest_holds_the_checksums(written):
+    """SHA-256 of each committed file, computed here; the version follows from them."""
+    committed = SHIPPED_CASES / "9bus"
+    manifest = load_manifest(committed)
+    assert manifest is not None
+    assert manifest == written[1]
+    assert len(manifest.files) == COUNT + 2
+    for name, digest in manifest.files.items():
+        assert hashlib.sha256((committed / name).read_bytes()).hexdigest() == digest, name
+
+
+def test_committed_split_is_400_to_100_and_disjoint(written):
+    """Every instance once, in order; drawn at random, not the first hundred."""
+    split = load_split(SHIPPED_CASES / "9bus")
+    assert split.seed == SEED
+    assert (len(split.train), len(split.test)) == (400, 100)
+    names = sorted(p.stem for p in (written[0] / "instances").iterdir())
+    assert sorted(split.train + split.test) == names
+    assert list(split.train) == sorted(split.train)
+    assert list(split.test) == sorted(split.test)
+    # Positions of a random fifth: a Kolmogorov-Smirnov test sees any cluster.
+    positions = [names.index(name) for name in split.test]
+    assert kstest(positions, "uniform", args=(0, COUNT)).pvalue > 1e-3
+
+
+def test_splits_depend_on_the_seed_alone(tmp_path):
+    """Same seed, same split; another seed, another one; a single instance is for testing."""
+    names = [f"x-{i:04d}" for i in range(50)]
+    assert draw_split(names, 3) == draw_split(names, 3)
+    assert draw_split(names, 3).test != draw_split(names, 4).test
+    assert draw_split(["x"], 3).test == ("x",)
+    for seed in range(20):
+        split = draw_split(names, seed)
+        assert (len(split.train), len(split.test)) == (40, 10)
+        assert not set(split.train) & set(split.test)
+
+
+def test_committed_instances_read_back(written, ninebus):
+    """All 500 pass the strict reader from their place in the checkout."""
+    paths = sorted((SHIPPED_CASES / "9bus" / "instances").iterdir())
+    instances, case = load_instances(paths)
+    assert case == ninebus
+    assert instances == list(sample_instances(ninebus, SEED, COUNT))
+    assert json.loads(paths[7].read_text())["seed"] == [SEED, 7]

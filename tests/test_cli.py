@@ -1,0 +1,203 @@
+"""The command line as a user meets it: the road on a small case, kill -9, and every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ded_bench.bench.results import Results
+from ded_bench.cli import main
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from tests.conftest import CASE_FILES
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small benchmark folder on the three-bus case."""
+    folder = tmp_path_factory.mktemp("problems") / "threebus"
+    code = main(
+        ["instances", "--case", str(CASE_FILES["threebus"].parent), "--count", "5", "--out", str(folder)]
+    )
+    assert code == 0
+    return folder
+
+
+@pytest.fixture
+def instance_file(problem: Path) -> Path:
+    return problem / "instances" / "threebus-0000.json"
+
+
+@pytest.fixture
+def schedule_file(instance_file: Path, threebus: Case, tmp_path: Path) -> Path:
+    instance, case = Instance.load_file(instance_file)
+    power = instance.p_initial(case)
+    path = tmp_path / "mine.csv"
+    Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power])).write(path, case.generators)
+    return path
+
+
+def run_cli(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "ded_bench", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, check=False)
+
+
+def test_solve_prints_one_object_per_row_and_score_agrees(
+    problem: Path, instance_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["solve", "--method", "ded", "--regime", "NO,TO", "--instance", instance_file, "--out", out]
+    first = run_cli(*arguments, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    rows = [json.loads(line) for line in first.stdout.splitlines()]
+    assert {row["regime"] for row in rows} == {"NO", "TO"}
+    for row in rows:
+        assert row["status"] == "Optimal"
+        scored = run_cli(
+            "score",
+            "--instance",
+            instance_file,
+            "--schedule",
+            row["schedule"],
+            "--regime",
+            row["regime"],
+            "--json",
+        )
+        verdict = json.loads(scored.stdout)
+        for name in ("objective", "freq_violation_hz", "ramp_violation", "bound_violation"):
+            assert verdict[name] == pytest.approx(row[name], rel=1e-9, abs=1e-12)
+        assert verdict["feasible"] is row["feasible"]
+    again = run_cli(*arguments, cwd=tmp_path)
+    assert [json.loads(line) for line in again.stdout.splitlines()] == rows
+    assert len(Results(out).rows) == 2
+
+
+def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "ded_bench", "solve", "--method", "ded", "--regime", "NO,TO"]
+    command += ["--case", str(problem), "--split", "all", "--workers", "2", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(finished := Results(out).rows) < 2 and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    finished = Results(out).rows
+    assert 2 <= len(finished) < 10
+    rest = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert rest.returncode == 0, rest.stderr
+    after = Results(out).rows
+    assert len(after) == 10
+    assert all(row.objective is not None for row in after.values())
+    for key, row in finished.items():  # not solved a second time
+        assert (after[key].solve_s, after[key].date) == (row.solve_s, row.date)
+    assert not list(out.glob(".results.csv.*"))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that must end with code 2 and one line; return the line."""
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1, err
+    return err
+
+
+SOLVE = ("solve", "--method", "ded", "--regime", "NO")
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda d: d | {"colour": "red"}, "colour"),
+        (lambda d: {k: v for k, v in d.items() if k != "dt_s"}, "dt_s"),
+        (lambda d: d | {"horizon_s": float("nan")}, "horizon_s"),
+        (lambda d: d | {"horizon_s": 1.005}, "horizon_s"),
+        (lambda d: d | {"cost": d["cost"] | {"s": -1.0}}, "cost.s"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"duration": -1.0}}}, "load.town.duration"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"initial": -100.0}}}, "load"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"rate": -1e3, "start": 0.0}}}, "load"),
+        (lambda d: d | {"case": "atlantis"}, "atlantis"),
+    ],
+)
+@pytest.mark.parametrize("command", ["solve", "score"])
+def test_bad_instances(command, change, named, instance_file, schedule_file, tmp_path, capsys) -> None:
+    path = tmp_path / "bad.json"
+    path.write_text(json.dumps(change(json.loads(instance_file.read_text()))))
+    case = () if "atlantis" in named else ("--case", CASE_FILES["threebus"])
+    if command == "solve":
+        line = refused(capsys, *SOLVE, *case, "--instance", path, "--out", tmp_path / "out")
+    else:
+        line = refused(
+            capsys, "score", *case, "--instance", path, "--schedule", schedule_file, "--regime", "NO"
+        )
+    assert named in line
+    assert "bad.json" in line or named == "atlantis"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("t,P_plant\n0.5,0.6\n6,0.6\n", "must start at 0"),
+        ("t,P_plant\n0,0.6\n5,0.6\n", "must end at the horizon"),
+        ("t,P_plant\n0,0.6\n0,0.6\n6,0.6\n", "increase strictly"),
+        ("t,P_plant\n0,nan\n6,0.6\n", "line 2, P_plant"),
+        ("t,P_7\n0,0.6\n6,0.6\n", "P_plant"),
+        ("", "empty"),
+    ],
+)
+def test_bad_schedules(text, named, instance_file, tmp_path, capsys) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    line = refused(capsys, "score", "--instance", instance_file, "--schedule", path, "--regime", "NO")
+    assert "bad.csv" in line
+    assert named in line
+
+
+def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
+    out = ("--out", tmp_path / "out")
+    chosen = ("--instance", instance_file)
+    assert "magic" in refused(capsys, "solve", "--method", "magic", "--regime", "NO", *chosen, *out)
+    assert "'XX'" in refused(capsys, "solve", "--method", "ded", "--regime", "XX", *chosen, *out)
+    assert "magic" in refused(capsys, *SOLVE, "--settings", "magic", *chosen, *out)
+    assert "nowhere.json" in refused(capsys, *SOLVE, "--instance", tmp_path / "nowhere.json", *out)
+    assert "--workers" in refused(capsys, *SOLVE, "--workers", "0", *chosen, *out)
+    assert "--time-limit" in refused(capsys, *SOLVE, "--time-limit", "nan", *chosen, *out)
+    assert "'XX'" in refused(capsys, "score", *chosen, "--schedule", schedule_file, "--regime", "XX")
+    assert "train-ko" in refused(capsys, "solve", "--method", "ded-ko", "--regime", "NO", *chosen, *out)
+    assert "COMMAND" in refused(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_errors_do_not_depend_on_the_working_directory(instance_file: Path, tmp_path: Path) -> None:
+    shipped = CASE_FILES["9bus"].parent / "instances" / "9bus-0007.json"
+    copy = tmp_path / "alone.json"
+    copy.write_bytes(shipped.read_bytes())  # no case beside it: the shipped one is meant
+    schedule = tmp_path / "s.csv"
+    schedule.write_text("t,P_2,P_3\n0,2.03748309,0.56635889\n60,2.03748309,0.56635889\n")
+    done = run_cli(
+        "score", "--instance", "alone.json", "--schedule", "s.csv", "--regime", "TO", "--json", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["initial_violation"] == 0.0
+
+
+def test_every_command_has_help() -> None:
+    overview = run_cli("--help").stdout
+    assert len(overview.splitlines()) <= 30
+    for command in ("instances", "solve", "train-ko", "train-dpc", "score", "bench", "report"):
+        assert command in overview
+        assert run_cli(command, "--help").returncode == 0

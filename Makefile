@@ -1,6 +1,6 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick test lint clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick models ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
@@ -13,6 +13,10 @@ DED     := $(BIN)/ded-bench
 STAMP   := .venv/installed
 REGIMES := NO TO
 POLICIES := ded-dpc-paper ded-dpc
+MODELS := linear koopman-single koopman-paper
+STEPS  := steps25 steps50 steps100 steps1000
+STUDIES := study study-narrow study-wide study-near study-shallow study-no-dispatch study-no-bends \
+  study-no-prior study-raw study-constant study-batch32 study-batch512 study-fresh4000
 
 CHOICE   = --case $(CASE) --split $(SPLIT) $(if $(LIMIT),--limit $(LIMIT))
 
@@ -44,6 +48,27 @@ train-dpc: train-ko  ## train the DED-DPC policies on the training instances
 solve-dpc: train-dpc
 	$(DED) solve --method ded-dpc-paper,ded-dpc,ded-dpc-refined --regime NO,TO $(CHOICE) \
 	  --workers $(WORKERS) --out $(RESULTS)
+	for steps in $(STEPS); do $(DED) solve --method ded-dpc-refined --settings $$steps --regime NO,TO \
+	  $(CHOICE) --workers $(WORKERS) --out $(RESULTS) || exit 1; done
+
+models: solve-baselines  ## DED-KO on other Koopman models, and the errors of each model
+	$(DED) train-ko --kind koopman-paper --case $(CASE) --results $(RESULTS)
+	for model in $(MODELS); do $(DED) solve --method ded-ko,ded-ko-knots --regime NO,TO --model $$model \
+	  $(CHOICE) --workers $(WORKERS) --out $(RESULTS) || exit 1; done
+	$(DED) rollouts --case $(CASE) --results $(RESULTS)
+
+ablation: models  ## short trainings of DED-DPC in TO, each with one thing changed, and DED-DPC on other models
+	printf '%s\n' $(STUDIES) | xargs -P $(WORKERS) -I NAME \
+	  $(DED) train-dpc --settings NAME --regime TO --case $(CASE) --results $(RESULTS)
+	printf '%s\n' $(MODELS) | xargs -P $(WORKERS) -I MODEL \
+	  $(DED) train-dpc --settings study --model MODEL --regime TO --case $(CASE) --results $(RESULTS)
+	for name in $(STUDIES); do $(DED) solve --method ded-dpc --settings $$name --regime TO \
+	  $(CHOICE) --workers $(WORKERS) --out $(RESULTS) || exit 1; done
+	for model in $(MODELS); do $(DED) solve --method ded-dpc --settings study --model $$model --regime TO \
+	  $(CHOICE) --workers $(WORKERS) --out $(RESULTS) || exit 1; done
+
+certify: train-dpc  ## certify DED-DPC on 10,000 fresh instances per regime
+	$(DED) certify --case $(CASE) --results $(RESULTS) --workers $(WORKERS)
 
 bench: solve-baselines solve-dpc  ## time each method alone on the machine
 	$(DED) bench --case $(CASE) --results $(RESULTS) $(BENCH)

@@ -1,11 +1,27 @@
-"""ded-bench: a benchmark suite for the dynamics-aware economic dispatch (DED) problem."""
+"""ded-bench: a benchmark suite for the dynamics-aware economic dispatch (DED) problem.
 
-from ded_bench.problem.case import Case
-from ded_bench.problem.errors import InputError
-from ded_bench.problem.instance import Instance, load_instances
-from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.score import Score, score
-from ded_bench.truth.simulate import Trajectory, simulate
+What a notebook needs: `load_instances` → `solve` → `simulate` or `score`. A case need not be given
+where the suite ships it; every library is imported when first used.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ded_bench.methods.solution import Settings, Solution, Solver, Status
+    from ded_bench.problem.benchmark import SplitName
+    from ded_bench.problem.case import Case
+    from ded_bench.problem.errors import InputError
+    from ded_bench.problem.instance import Instance
+    from ded_bench.problem.schedule import Schedule
+    from ded_bench.truth.score import Score
+    from ded_bench.truth.simulate import SimulationError, Trajectory
 
 __all__ = [
     "Case",
@@ -13,8 +29,140 @@ __all__ = [
     "Instance",
     "Schedule",
     "Score",
+    "Settings",
+    "SimulationError",
+    "Solution",
+    "Status",
     "Trajectory",
+    "instances_frame",
     "load_instances",
     "score",
     "simulate",
+    "solve",
 ]
+
+_HOMES = {
+    "Case": "ded_bench.problem.case",
+    "InputError": "ded_bench.problem.errors",
+    "Instance": "ded_bench.problem.instance",
+    "Schedule": "ded_bench.problem.schedule",
+    "Score": "ded_bench.truth.score",
+    "Settings": "ded_bench.methods.solution",
+    "SimulationError": "ded_bench.truth.simulate",
+    "Solution": "ded_bench.methods.solution",
+    "Status": "ded_bench.methods.solution",
+    "Trajectory": "ded_bench.truth.simulate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a class when it is first asked for."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def load_instances(case: str | Path, split: SplitName = "test", limit: int | None = None) -> list[Instance]:
+    """Read the benchmark's instances of a split, in the order of their ids.
+
+    Args:
+        case: name of a shipped case, or a benchmark's folder.
+        split: `test`, `train` or `all`.
+        limit: only the first so many.
+
+    Raises:
+        InputError: there is no such case or split, or a file is missing or wrong.
+    """
+    from ded_bench.problem.benchmark import select_split
+
+    return [instance for instance, _ in select_split(case, split, limit).instances]
+
+
+def instances_frame(instances: list[Instance]) -> pd.DataFrame:
+    """One row per instance with all its parameters; see `problem.instance.instances_frame`."""
+    from ded_bench.problem import instance
+
+    return instance.instances_frame(instances)
+
+
+def solve(
+    instance: Instance,
+    method: str,
+    regime: str,
+    case: Case | None = None,
+    settings: Settings | None = None,
+) -> Solution:
+    """Solve one instance in this process; a method's model is built once and used again.
+
+    Args:
+        instance: what to solve.
+        method: one of ours, one that an installed package brings, or `module:function`.
+        regime: one of the case's, such as `NO` or `TO`.
+        case: needed if the instance's case is not a shipped one.
+        settings: a method's settings, Koopman model, policy, time limit and search folders; None:
+            the default ones. Models and policies are looked for in the default results folder,
+            then in the reference run.
+
+    Raises:
+        InputError: unknown method, regime, settings or case, or a model or policy that is missing.
+    """
+    from ded_bench.koopman.store import search_folders
+    from ded_bench.methods.solution import Settings
+
+    own = _case_of(instance, case)
+    own.check_regimes([regime])
+    instance.check_case(own)
+    return _prepared(own, method, regime, settings or Settings(search=search_folders(own)))(instance)
+
+
+def simulate(instance: Instance, schedule: Schedule, case: Case | None = None) -> Trajectory:
+    """Simulate a schedule on the true DAE; see `truth.simulate.simulate`.
+
+    Raises:
+        InputError: the schedule does not span the horizon, or the case is unknown.
+        SimulationError: the system loses synchronism under this schedule.
+    """
+    from ded_bench.truth import simulate
+
+    return simulate.simulate(_case_of(instance, case), instance, schedule)
+
+
+def score(instance: Instance, schedule: Schedule, regime: str, case: Case | None = None) -> Score:
+    """Simulate a schedule and judge it: cost and violations; see `truth.score.score`.
+
+    Raises:
+        InputError: unknown regime or case, or the schedule does not span the horizon.
+        SimulationError: the system loses synchronism under this schedule.
+    """
+    from ded_bench.truth import score
+
+    return score.score(_case_of(instance, case), instance, schedule, regime)
+
+
+def _case_of(instance: Instance, case: Case | None) -> Case:
+    from ded_bench.problem.case import SHIPPED_CASES
+    from ded_bench.problem.errors import InputError
+
+    if case is not None:
+        return case
+    if not (SHIPPED_CASES / instance.case / "case.json").is_file():
+        raise InputError(f"instance {instance.id}", "case", f"{instance.case!r} is no shipped case: give it")
+    return _shipped(instance.case)
+
+
+@functools.cache
+def _shipped(name: str) -> Case:
+    from ded_bench.problem.case import SHIPPED_CASES, Case
+
+    return Case.load(SHIPPED_CASES / name)
+
+
+@functools.lru_cache(maxsize=8)
+def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+    from ded_bench.methods import get_method
+
+    return get_method(method).prepare(case, regime, settings)

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from ded_bench.bench.results import Results
@@ -18,6 +19,7 @@ from ded_bench.cli import main
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from tests.bench.test_pool import runs, wait_until
 from tests.conftest import CASE_FILES
 
 
@@ -82,17 +84,27 @@ def test_solve_prints_one_object_per_row_and_score_agrees(
 
 
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
+    """First one of the workers is killed, then the main process, whose workers go with it."""
     out = tmp_path / "out"
     command = [sys.executable, "-m", "ded_bench", "solve", "--method", "ded", "--regime", "NO,TO"]
     command += ["--case", str(problem), "--split", "all", "--workers", "2", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while len(finished := Results(out).rows) < 2 and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.01)
+    workers: list[psutil.Process] = []
+
+    def wait_for_rows(count: int) -> None:
+        deadline = time.monotonic() + 120
+        while len(Results(out).rows) < count and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.01)
+        workers.extend(psutil.Process(process.pid).children())
+
+    wait_for_rows(1)
+    workers[0].kill()
+    wait_for_rows(2)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     finished = Results(out).rows
     assert 2 <= len(finished) < 10
+    wait_until(lambda: not any(runs(worker.pid) for worker in workers))
     rest = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert rest.returncode == 0, rest.stderr
     after = Results(out).rows
@@ -175,6 +187,8 @@ def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
     assert "magic" in refused(capsys, *SOLVE, "--settings", "magic", *chosen, *out)
     assert "nowhere.json" in refused(capsys, *SOLVE, "--instance", tmp_path / "nowhere.json", *out)
     assert "--workers" in refused(capsys, *SOLVE, "--workers", "0", *chosen, *out)
+    both = ("--workers", "1", "--scheduler", "tcp://127.0.0.1:1")
+    assert "not allowed with" in refused(capsys, *SOLVE, *both, *chosen, *out)
     assert "--time-limit" in refused(capsys, *SOLVE, "--time-limit", "nan", *chosen, *out)
     assert "'XX'" in refused(capsys, "score", *chosen, "--schedule", schedule_file, "--regime", "XX")
     assert "train-ko" in refused(capsys, "solve", "--method", "ded-ko", "--regime", "NO", *chosen, *out)
@@ -197,7 +211,8 @@ def test_errors_do_not_depend_on_the_working_directory(instance_file: Path, tmp_
 
 def test_every_command_has_help() -> None:
     overview = run_cli("--help").stdout
-    assert len(overview.splitlines()) <= 30
+    assert len(overview.splitlines()) < 24  # one screen, with the prompt
+    assert max(map(len, overview.splitlines())) <= 80
     for command in ("instances", "solve", "train-ko", "train-dpc", "score", "bench", "report"):
-        assert command in overview
+        assert f"\n    {command} " in overview
         assert run_cli(command, "--help").returncode == 0

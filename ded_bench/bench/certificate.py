@@ -13,16 +13,18 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 from scipy.stats import beta
 from tqdm import tqdm
 
-from ded_bench.bench.run import Workers
+from ded_bench.bench.environment import host, now, version
+from ded_bench.bench.pool import Workers
 from ded_bench.methods import get_method
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
@@ -30,12 +32,13 @@ from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.strict import write_atomically
+from ded_bench.problem.strict import Record, read_record, write_atomically, write_record
 from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score_many
 from ded_bench.truth.simulate import SimulationError
 
 REFERENCE = "ded-ko-knots"
 COUNT, DELTA, GAP_PERCENT = 10_000, 0.01, 1.0
+FILE = "certificate.json"
 #: Instances answered, re-simulated and saved together.
 CHUNK = 50
 COLUMNS = (
@@ -50,8 +53,7 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class Certificate:
+class Certificate(Record):
     """Lower confidence bounds on the probability of success, with all that they depend on."""
 
     case: str
@@ -70,6 +72,15 @@ class Certificate:
     delta: float
     clopper_pearson: float
     hoeffding: float
+    artifacts: str  # fingerprints of the case, the policy and the models
+    version: str
+    host: str
+    date: str
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What a results folder holds one certificate of."""
+        return self.case, self.method, self.settings, self.regime
 
     @property
     def sentence(self) -> str:
@@ -81,6 +92,30 @@ class Certificate:
             f"more than {self.reference} ({self.successes} of {self.count} did; "
             f"Hoeffding's bound: {self.hoeffding:.2%})."
         )
+
+
+class Certificates(Record):
+    """The certificates of a results folder."""
+
+    schema_: Literal["ded-bench/certificates/1"] = Field(alias="schema", default="ded-bench/certificates/1")
+    certificates: tuple[Certificate, ...] = ()
+
+
+def read_certificates(folder: Path) -> tuple[Certificate, ...]:
+    """Read the certificates of a results folder, none if it has none; InputError if the file is wrong."""
+    path = folder / FILE
+    return read_record(Certificates, path).certificates if path.is_file() else ()
+
+
+def save_certificate(folder: Path, certificate: Certificate) -> None:
+    """Add a certificate to a results folder; one for the same method, settings and regime is replaced."""
+    kept = [c for c in read_certificates(folder) if c.key != certificate.key]
+    write_record(Certificates(certificates=(*kept, certificate)), folder / FILE)
+
+
+def rows_file(folder: Path, method: str, regime: str, settings: Settings) -> Path:
+    """Where a results folder keeps the rows that a certificate counts."""
+    return folder / "certificates" / f"{method}-{settings.slug}-{regime}.csv"
 
 
 def clopper_pearson(successes: int, count: int, delta: float) -> float:
@@ -103,7 +138,7 @@ def certify(
     method: str,
     regime: str,
     settings: Settings,
-    rows_file: Path,
+    rows_path: Path,
     *,
     count: int = COUNT,
     seed: int = 0,
@@ -114,12 +149,12 @@ def certify(
     delta: float = DELTA,
     workers: int = 1,
 ) -> Certificate:
-    """Answer and re-simulate what `rows_file` lacks of the instances, and certify.
+    """Answer and re-simulate what `rows_path` lacks of the instances, and certify.
 
     Rows are saved chunk by chunk; those of another policy, model or case are made anew.
 
     Args:
-        rows_file: CSV with one row per instance (COLUMNS).
+        rows_path: CSV with one row per instance (COLUMNS).
         seed: the instances are those of master seed CERTIFICATE_SEED + seed.
 
     Raises:
@@ -127,7 +162,7 @@ def certify(
     """
     case.check_regimes([regime])
     fingerprint = _fingerprint(case, method, reference, regime, settings, seed)
-    rows = read_rows(rows_file)
+    rows = read_rows(rows_path)
     rows = rows[(rows["fingerprint"] == fingerprint) & (rows["index"] < count)]
     done = set(rows["index"])
     missing = [i for i in range(count) if i not in done]
@@ -137,7 +172,7 @@ def certify(
         for made in _judged(calls, workers):
             rows = pd.concat([rows, made.assign(fingerprint=fingerprint)], ignore_index=True)
             rows = rows.sort_values("index", ignore_index=True)
-            write_atomically(rows_file, rows.to_csv(index=False))
+            write_atomically(rows_path, rows.to_csv(index=False))
             bar.update(len(made))
     limits = meets_limits(rows, tolerance_hz, tolerance_pu)
     near = gaps(rows) <= gap_percent
@@ -159,6 +194,10 @@ def certify(
         delta=delta,
         clopper_pearson=clopper_pearson(successes, count, delta),
         hoeffding=hoeffding(successes, count, delta),
+        artifacts=fingerprint,
+        version=version(),
+        host=host(),
+        date=now(),
     )
 
 
@@ -201,11 +240,13 @@ def judge(
 ) -> pd.DataFrame:
     """Answer some instances with both methods and re-simulate; one row each, without fingerprint."""
     instances = [next(sample_instances(case, CERTIFICATE_SEED + seed, 1, i)) for i in indices]
-    plain = Settings("default", settings.model, None, settings.time_limit_s, settings.search)
-    verdicts = [
-        _scores(case, instances, _schedules(case, name, regime, chosen, instances), regime)
-        for name, chosen in ((method, settings), (reference, plain))
+    plain = _plain(settings)
+    schedules = [
+        *_schedules(case, method, regime, settings, instances),
+        *_schedules(case, reference, regime, plain, instances),
     ]
+    scores = _scores(case, [*instances, *instances], schedules, regime)
+    verdicts = scores[: len(instances)], scores[len(instances) :]
     rows = []
     for index, own, other in zip(indices, *verdicts, strict=True):
         row: dict[str, Any] = dict.fromkeys(COLUMNS[:-1], np.nan)
@@ -269,7 +310,7 @@ def _scores(
 
 
 def _fingerprint(case: Case, method: str, reference: str, regime: str, settings: Settings, seed: int) -> str:
-    plain = Settings("default", settings.model, None, settings.time_limit_s, settings.search)
+    plain = _plain(settings)
     parts = [
         case.fingerprint,
         method,
@@ -280,6 +321,11 @@ def _fingerprint(case: Case, method: str, reference: str, regime: str, settings:
         str(seed),
     ]
     return "-".join(part for part in parts if part)
+
+
+def _plain(settings: Settings) -> Settings:
+    """The reference method's settings: its own defaults, on the same Koopman model."""
+    return Settings("default", settings.model, None, settings.time_limit_s, settings.search)
 
 
 def _check_trials(successes: int, count: int, delta: float) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
@@ -31,7 +32,7 @@ from ded_bench.bench.figures import (
     plain,
     thin,
 )
-from ded_bench.bench.metrics import GROUP
+from ded_bench.bench.metrics import GROUP, title
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -42,38 +43,37 @@ from ded_bench.truth.swing import Network
 LINEAR_GAP = 0.01
 #: Smallest excess over the best that profiles tell apart, %.
 SMALLEST_EXCESS = 1e-4
+#: Terms of a loss that differ by less than this factor are drawn on a linear scale.
+LINEAR_SPREAD = 5.0
 
 
 def tradeoff_figure(points: pd.DataFrame) -> Figure:
     """Mean gap to DED against time per schedule, one panel per regime.
 
+    A method's settings share its colour and marker; a thin line joins them and a word names each but the
+    default.
+
     Args:
         points: see `metrics.tradeoff`. Hollow markers: some schedules are infeasible.
     """
+    points = points.dropna(subset=["gap_percent"])
     regimes = sorted(points["regime"].unique())
-    rows = -(-points["title"].nunique() // 3)
-    with new_figure(7.2, 3.2 + 0.2 * rows) as figure:
+    rows = -(-(points["method"].nunique() + 1) // 3)
+    with new_figure(7.2, 3.6 + 0.2 * rows) as figure:
         axes = figure.subplots(1, len(regimes), sharey=True, squeeze=False)[0]
         handles = []
         for ax, regime in zip(axes, regimes, strict=True):
-            for row in points[points["regime"] == regime].dropna(subset=["gap_percent"]).itertuples():
-                paint = colour(str(row.method))
-                style: dict[str, Any] = {
-                    "marker": marker(str(row.method), str(row.settings)),
-                    "linestyle": "none",
-                    "markersize": 7,
-                    "markeredgecolor": paint,
-                    "markerfacecolor": paint if row.correct_rate == 1 else "white",
-                    "markeredgewidth": 1.4,
-                }
-                label = plain(f"{row.title}{'' if row.alone else ' *'}")
-                ax.plot(row.seconds, row.gap_percent, **style)
-                handles.append(Line2D([], [], label=label, **(style | {"markerfacecolor": paint})))
+            for key, family in points[points["regime"] == regime].groupby("method", sort=False):
+                method = str(key)
+                style: dict[str, Any] = {"marker": marker(method), "color": colour(method)}
+                _draw_family(ax, family.sort_values(["seconds", "gap_percent"]), style)
+                label = plain(title(method) + ("" if family["alone"].all() else " *"))
+                handles.append(Line2D([], [], linestyle="none", markersize=7, label=label, **style))
             ax.set_xscale("log")
             ax.set_yscale("symlog", linthresh=LINEAR_GAP)
             ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             ax.axhline(0.0, color=GREY, linewidth=0.8)
-            ax.margins(0.12)
+            ax.margins(0.14)
             ax.set_title(regime)
             ax.set_xlabel("time per schedule (s), median")
         axes[0].set_ylabel("mean gap to DED (%)")
@@ -87,6 +87,29 @@ def tradeoff_figure(points: pd.DataFrame) -> Figure:
             handles.append(Line2D([], [], color=GREY, label="hollow: some infeasible", **hollow))
         legend_below(figure, handles, columns=3)
     return figure
+
+
+def _draw_family(ax: Axes, family: pd.DataFrame, style: Mapping[str, Any]) -> None:
+    """The points of one method, from fast to slow."""
+    if len(family) > 1:
+        ax.plot(family["seconds"], family["gap_percent"], color=style["color"], linewidth=0.7, alpha=0.6)
+    for row in family.to_dict("records"):
+        usual = row["settings"] == "default"
+        face = style["color"] if row["correct_rate"] == 1 else "white"
+        size: dict[str, Any] = {"markersize": 7 if usual else 5, "markeredgewidth": 1.4 if usual else 1.0}
+        place = float(row["seconds"]), float(row["gap_percent"])
+        ax.plot(*place, linestyle="none", markerfacecolor=face, **size, **style)
+        if not usual:
+            ax.annotate(
+                plain(f"{row['settings']}{'' if row['alone'] else ' *'}"),
+                place,
+                xytext=(2, 4),
+                textcoords="offset points",
+                rotation=35,  # words of neighbours, beside or above each other, stay apart
+                rotation_mode="anchor",
+                fontsize=6.5,
+                color=style["color"],
+            )
 
 
 def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
@@ -116,6 +139,7 @@ def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
                         where="post",
                         color=colour(method),
                         dashes=dashes(method, settings) or (None, None),
+                        linewidth=1.4 if settings == "default" else 0.9,
                         label=plain(str(curve["title"].iloc[0])),
                     )
                 ax.set_xscale("log")
@@ -164,7 +188,8 @@ def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
                 handles += right.plot(
                     minutes, positive, color=paint, dashes=dash, label=plain(str(term)), linewidth=1.1
                 )
-            right.set_yscale("log")
+            if _spread(history[terms]) > LINEAR_SPREAD:
+                right.set_yscale("log")
             right.set_title(plain(name), fontsize=8.5, loc="right")
             left.set_ylabel("loss")
             right.set_ylabel("terms, held out")
@@ -173,6 +198,13 @@ def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
             ax.set_xlabel("training time (min)")
         legend_below(figure, handles, columns=5)
     return figure
+
+
+def _spread(terms: pd.DataFrame) -> float:
+    """Largest of all positive values over the smallest; 1 if there is none."""
+    values = terms.to_numpy(dtype=float)
+    values = values[values > 0]
+    return float(values.max() / values.min()) if len(values) else 1.0
 
 
 def parameters_figure(case: Case, instances: Sequence[Instance]) -> Figure:

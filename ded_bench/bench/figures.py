@@ -6,6 +6,7 @@ print in grey. Nothing here touches pyplot's global state.
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 from collections.abc import Iterator, Sequence
@@ -20,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.bench.metrics import title
+from ded_bench.bench.metrics import REFERENCE, title
 from ded_bench.methods import METHODS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.strict import write_atomically
@@ -41,7 +42,10 @@ COLOURS = {
 }
 OTHERS = ("#332288", "#882255", "#117733", "#999933")
 BUS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILION, BLACK)
-DASHES: tuple[tuple[float, ...], ...] = ((), (5, 2), (1.5, 1.5), (6, 2, 1.5, 2), (3, 1.5), (8, 3))
+DASHES: tuple[tuple[float, ...], ...] = (
+    *((), (5, 2), (1.5, 1.5), (6, 2, 1.5, 2), (3, 1.5), (8, 3)),
+    *((6, 1.5, 1.5, 1.5, 1.5, 1.5), (10, 2, 3, 2)),
+)
 MARKERS = "osD^vP*Xph<>"
 RAD_TO_HZ = 1 / (2 * np.pi)
 DPI = 160
@@ -98,24 +102,34 @@ def plain(text: str) -> str:
 
 
 def colour(method: str) -> str:
-    """A method's colour, the same in every figure."""
+    """A method's colour, the same in every figure and for all its settings."""
     return COLOURS.get(method, OTHERS[sum(method.encode()) % len(OTHERS)])
 
 
+def marker(method: str) -> str:
+    """A method's marker in scatter plots, the same for all its settings."""
+    known = list(METHODS)
+    return MARKERS[(known.index(method) if method in known else len(known)) % len(MARKERS)]
+
+
 def dashes(method: str, settings: str = "default") -> tuple[float, ...]:
-    """A method's line style; DED is solid, other settings than the default are dashed differently."""
-    if method == "ded" and settings == "default":
+    """A line style that tells a method's settings apart, and methods in print; DED is solid."""
+    if (method, settings) == REFERENCE:
         return ()
     known = list(METHODS)
     place = known.index(method) if method in known else len(known)
-    return DASHES[1 + (place + (settings != "default") * 2) % (len(DASHES) - 1)]
+    return DASHES[1 + (place + variant(method, settings)) % (len(DASHES) - 1)]
 
 
-def marker(method: str, settings: str = "default") -> str:
-    """A method's marker in scatter plots; settings other than the default get another one."""
-    known = list(METHODS)
-    place = known.index(method) if method in known else len(known)
-    return MARKERS[(place + (0 if settings == "default" else 5 + len(settings))) % len(MARKERS)]
+@functools.cache
+def variant(method: str, settings: str) -> int:
+    """Which of a method's settings: 0 the default, others in the method's order, unknown ones after them."""
+    if settings == "default":
+        return 0
+    known = [name for name in METHODS[method].settings if name != "default"] if method in METHODS else []
+    if settings in known:
+        return 1 + known.index(settings)
+    return 1 + len(known) + sum(settings.encode()) % len(DASHES)
 
 
 def _draw(ax: Axes, shown: Shown, t: Array, values: Array) -> Line2D:

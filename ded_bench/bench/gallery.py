@@ -23,12 +23,22 @@ from ded_bench.bench.figures import (
     schedule_figure,
     worst_figure,
 )
-from ded_bench.bench.metrics import REFERENCE, performance_profile, title, tradeoff
+from ded_bench.bench.metrics import (
+    GROUP,
+    REFERENCE,
+    STUDY,
+    groups,
+    performance_profile,
+    title,
+    tradeoff,
+)
 from ded_bench.bench.page import Block, Picture, Text
 from ded_bench.bench.results import Key, Results
 from ded_bench.bench.selection import Plan, plan
+from ded_bench.bench.studies import main_rows
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.physics import linear_model
+from ded_bench.methods import METHODS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
@@ -259,11 +269,13 @@ def _draw_worst(gallery: Gallery, chosen: Plan) -> None:
 
 
 def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) -> None:
+    frame = main_rows(frame)
     points = tradeoff(frame, timing)
     if points["gap_percent"].notna().any():
         caption = (
-            "Mean gap to DED against time per schedule. Hollow: some schedules are infeasible; * timed under "
-            "parallel load, not by `ded-bench bench`. The vertical scale is linear within ±0.01 %."
+            "Mean gap to DED against time per schedule; words name settings other than the default. Hollow: "
+            "some schedules are infeasible; * timed under parallel load, not by `ded-bench bench`. The "
+            "vertical scale is linear within ±0.01 %."
         )
         gallery.save("tradeoff", "tradeoff", charts.tradeoff_figure(points), caption)
     times, objectives = (performance_profile(frame, column) for column in ("solve_s", "objective"))
@@ -271,13 +283,26 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
         caption = (
             "Dolan–Moré performance profiles: share of the instances on which a method is within a factor of "
             "the fastest (top; times from the results table, under parallel load) or within a percentage of "
-            "the cheapest schedule (bottom). Only feasible schedules count."
+            "the cheapest schedule (bottom). Only feasible schedules count"
         )
+        caption += _without_curve(frame, objectives)
         gallery.save("profile", "profile", charts.profile_figure(times, objectives), caption)
 
 
+def _without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
+    """The end of the profiles' caption: methods that never gave a feasible schedule."""
+    drawn = set(profile[GROUP].itertuples(index=False, name=None))
+    absent = [
+        f"{title(method, settings)} in {regime}"
+        for regime, method, settings, _ in groups(frame)
+        if (regime, method, settings) not in drawn
+    ]
+    return f"; {', '.join(absent)} had none and no curve." if absent else "."
+
+
 def _draw_training(gallery: Gallery) -> None:
-    histories = {}
+    """One figure per method; the short trainings of a study are left to its table."""
+    histories: dict[str, dict[str, pd.DataFrame]] = {}
     for path in sorted((gallery.results.folder / "policies").glob("*.history.csv")):
         try:
             numbers = pd.read_csv(path).select_dtypes("number")
@@ -286,10 +311,16 @@ def _draw_training(gallery: Gallery) -> None:
         except (OSError, ValueError) as error:
             gallery.notes.append(f"Left out: {path}: {str(error).splitlines()[0]}")
             continue
-        histories[path.name.removesuffix(".history.csv")] = numbers
-    if histories:
-        caption = "Loss of each policy over its training time; right: its terms on held-out instances."
-        gallery.save("training", "training", charts.history_figure(histories), caption)
+        name = path.name.removesuffix(".history.csv")
+        if f"-{STUDY}" not in name:
+            trained = [method for method in METHODS if name.startswith(f"{method}-")]
+            histories.setdefault(max(trained, key=len, default="other"), {})[name] = numbers
+    for method, curves in histories.items():
+        caption = (
+            f"Loss of each policy of {title(method)} over its training time; right: the loss's terms on "
+            "held-out instances."
+        )
+        gallery.save("training", f"training_{method}", charts.history_figure(curves), caption)
 
 
 def _draw_problem(gallery: Gallery) -> None:

@@ -7,6 +7,7 @@ counts as solved in a performance profile.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -22,6 +23,8 @@ GROUP = ["regime", "method", "settings"]
 HEAD = [*GROUP, "title"]
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
 SUCCESS = (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)
+#: Settings whose name starts so are short trainings, to be compared with each other only.
+STUDY = "study"
 #: Shift of the shifted geometric mean, s: times far below it count as equal.
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
@@ -32,11 +35,17 @@ FEASIBLE = dict(zip(VIOLATIONS, (1e-4, 1e-6, 1e-6, 1e-6), strict=True))
 def title(method: str, settings: str = "default") -> str:
     """A method's name as the tables print it; settings other than the default are named."""
     name = METHODS[method].title if method in METHODS else method
-    return name if settings == "default" else f"{name} [{settings}]"
+    return name if settings == "default" else f"{name} [{settings.removeprefix('default-')}]"
+
+
+def is_study(slug: str) -> bool:
+    """Whether settings are those of an ablation study, whose rows have a table of their own."""
+    return slug == STUDY or slug.startswith(f"{STUDY}-")
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that the tables are about: the test instances if there are any, else all rows."""
+    """The rows that the tables are about: the test instances if there are any, else all; no study."""
+    frame = frame[[not is_study(slug) for slug in frame["settings"]]]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
 
@@ -53,9 +62,10 @@ def gaps(frame: pd.DataFrame) -> pd.DataFrame:
     reference = frame.loc[is_reference].set_index(["instance", "regime"])["objective"]
     wanted = pd.MultiIndex.from_frame(frame[["instance", "regime"]])
     ours = reference.reindex(wanted).to_numpy(dtype=float) if len(frame) else np.zeros(0)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         gap = 100.0 * (frame["objective"].to_numpy(dtype=float) / ours - 1.0)
-    return frame.assign(reference=ours, gap_percent=np.where(ours > 0, gap, np.nan))
+    known = (ours > 0) & np.isfinite(gap)
+    return frame.assign(reference=ours, gap_percent=np.where(known, gap, np.nan))
 
 
 def groups(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
@@ -66,11 +76,19 @@ def groups(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
     def place(key: tuple[str, ...]) -> tuple[object, ...]:
         regime, method, settings = key
         rank = known.index(method) if method in known else len(known)
-        return regime, rank, method, settings != "default", settings
+        return regime, rank, method, settings != "default", natural(settings)
 
     for regime, method, settings in sorted(keys, key=place):
         chosen = (frame[GROUP] == [regime, method, settings]).all(axis=1)
         yield regime, method, settings, frame[chosen]
+
+
+def natural(text: str) -> tuple[tuple[str, int], ...]:
+    """Sorting key that puts steps25 before steps100."""
+    parts = re.split(r"(\d+)", text)
+    return tuple(
+        (word, int(number or 0)) for word, number in zip(parts[::2], [*parts[1::2], ""], strict=True)
+    )
 
 
 def summary(frame: pd.DataFrame) -> pd.DataFrame:

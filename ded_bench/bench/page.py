@@ -149,7 +149,7 @@ STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0; background: #fff; color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 68rem; margin: 0 auto; padding: 1.5rem 1.25rem 4rem; }
+main { max-width: 78rem; margin: 0 auto; padding: 1.5rem 1.25rem 4rem; }
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0.5rem 0 1rem; }
 h2 { font-size: 1.4rem; margin: 3rem 0 0.75rem; padding-top: 1rem; border-top: 1px solid var(--line); }
 h3 { font-size: 1.1rem; margin: 2rem 0 0.5rem; }
@@ -183,6 +183,7 @@ tbody tr:hover { background: #f6f8fa; }
   h2 { font-size: 1.25rem; margin-top: 2rem; }
   img { max-width: none; width: 40rem; min-width: 100%; }
   table { font-size: 0.8rem; }
+  .label { position: sticky; left: 0; background: #fff; white-space: normal; max-width: 8.5rem; }
 }
 @media print { main { max-width: none; } .scroll { overflow: visible; } figure { break-inside: avoid; } }
 """

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
+from ded_bench.bench.certificate import read_certificates
 from ded_bench.bench.environment import environment, now
 from ded_bench.bench.gallery import Gallery, draw
 from ded_bench.bench.layout import (
+    ABLATION,
     CERTIFICATE,
     CLAIMS,
     EXPLANATION,
     GAPS,
     LOADED_TIMES,
+    MODELS,
     RATES,
     TABLE_V,
     TABLE_VI,
@@ -28,6 +29,7 @@ from ded_bench.bench.layout import (
 from ded_bench.bench.metrics import (
     TIME_SHIFT_S,
     claims,
+    groups,
     judged_rows,
     summary,
     table_times,
@@ -46,13 +48,14 @@ from ded_bench.bench.page import (
 )
 from ded_bench.bench.paper import paper_numbers, table_v, table_vi
 from ded_bench.bench.results import Results
+from ded_bench.bench.selection import first_settings
+from ded_bench.bench.studies import ROLLOUTS, ablation_table, main_rows, model_table, training_table
 from ded_bench.bench.tables import Column, to_latex, to_markdown
 from ded_bench.bench.timing import latest_host, read_timing, timing_frame
-from ded_bench.problem.arrays import read_arrays
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import load_manifest, load_split
-from ded_bench.problem.strict import read_text, write_atomically
+from ded_bench.problem.strict import write_atomically
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5
@@ -82,13 +85,15 @@ def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
     paper = paper_numbers(case)
     gallery = draw(case, results, frame, timing, problems)
     frames = {
-        "table_v": table_v(frame, timing, paper),
-        "table_vi": table_vi(frame, paper),
+        "table_v": table_v(main_rows(frame), timing, paper),
+        "table_vi": table_vi(main_rows(frame), paper),
         "summary": summary(frame),
         "claims": claims(frame),
         "times_under_load": table_times(frame),
         "worst": worst(frame),
-        "training": training_table(folder),
+        "training": training_table(folder, [c.name for c in TRAINING[1:-1]]),
+        "models": model_table(frame),
+        "ablation": ablation_table(everything, folder),
     }
     if len(everything) > len(frame):
         frames["summary_all"] = summary(everything)
@@ -99,7 +104,7 @@ def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
         *_opening(case, frame, everything, problems, notes),
         *_results(frames, rows_from, timing, gallery),
         *_details(frames, rows_from, timing, gallery),
-        *_training(frames["training"], folder, gallery),
+        *_training(frames, folder, gallery),
         *_closing(everything, gallery),
     ]
     write_atomically(folder / "report.md", render_markdown(blocks))
@@ -180,21 +185,6 @@ def _named(version: str) -> str:
     return version or "(none given)"
 
 
-def training_table(folder: Path) -> pd.DataFrame:
-    """How each policy of the folder was trained, from the headers of their files."""
-    rows: list[dict[str, Any]] = []
-    for path in sorted((folder / "policies").glob("*.safetensors")):
-        try:
-            _, header = read_arrays(path)
-        except InputError as error:
-            rows.append({"policy": path.stem, "problem": str(error)})
-            continue
-        facts = header.get("training")
-        kept = facts if isinstance(facts, dict) else {}
-        rows.append({"policy": path.stem, "problem": ""} | {c.name: kept.get(c.name) for c in TRAINING[1:-1]})
-    return pd.DataFrame(rows, columns=[column.name for column in TRAINING])
-
-
 def _write_tables(
     folder: Path, frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame
 ) -> list[Path]:
@@ -220,6 +210,8 @@ PRINTED: dict[str, Sequence[Column]] = {
     "times_under_load": LOADED_TIMES,
     "worst": WORST,
     "training": TRAINING,
+    "models": MODELS,
+    "ablation": ABLATION,
 }
 
 
@@ -296,8 +288,9 @@ def _details(
         blocks += [Table(all_rows, GAPS, "Gap to DED, %, over all rows, training instances included")]
     blocks += [Heading("Times")]
     if len(timing):
-        named = timing.assign(
-            title=[title(m, s) for m, s in zip(timing["method"], timing["settings"], strict=True)]
+        ordered = pd.concat([rows for *_, rows in groups(timing)])
+        named = ordered.assign(
+            title=[title(m, s) for m, s in zip(ordered["method"], ordered["settings"], strict=True)]
         )
         caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
         blocks.append(Table(named, TIMING, caption))
@@ -309,39 +302,53 @@ def _details(
             LOADED_TIMES,
             "Under parallel load, from the results table: comparable by orders of magnitude only, s",
         ),
-        Text(f"The shifted geometric mean uses a shift of {TIME_SHIFT_S:g} s."),
+        Text(
+            f"The shifted geometric mean is exp(mean(log(t + {TIME_SHIFT_S:g} s))) − {TIME_SHIFT_S:g} s: it "
+            f"counts ratios of times, not seconds, and times far below {TIME_SHIFT_S:g} s as equal."
+        ),
         Heading("Gap against time"),
         *gallery.of("tradeoff", "No gap yet: it needs rows of DED and of another method."),
         *gallery.of("profile"),
         Heading("Worst instances"),
         Table(
-            frames["worst"], WORST, "The three largest gaps and the three largest violations of each method"
+            first_settings(frames["worst"]),
+            WORST,
+            "The three largest gaps and violations of each method, default settings (all: tables/worst.csv)",
         ),
         *gallery.of("worst"),
     ]
     return blocks
 
 
-def _training(table: pd.DataFrame, folder: Path, gallery: Gallery) -> list[Block]:
-    blocks: list[Block] = [Heading("Koopman models"), *_rollout_errors(folder), *gallery.of("koopman")]
+def _training(frames: dict[str, pd.DataFrame], folder: Path, gallery: Gallery) -> list[Block]:
+    blocks: list[Block] = [Heading("Koopman models"), *_rollout_errors(folder)]
+    if len(frames["models"]):
+        caption = "What the Koopman model contributes: the same method and settings on several models"
+        blocks.append(Table(frames["models"], MODELS, caption))
+    blocks += gallery.of("koopman")
     blocks.append(Heading("Training of the policies"))
-    if len(table):
-        blocks.append(Table(table, TRAINING))
+    if len(frames["training"]):
+        blocks.append(Table(frames["training"], TRAINING))
     else:
         blocks.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
+    if len(frames["ablation"]):
+        caption = "Ablation of `ded-dpc`: short trainings, each with one thing changed"
+        blocks.append(Table(frames["ablation"], ABLATION, caption))
     blocks += gallery.of("training")
     blocks.append(Heading("Certificate"))
-    path = folder / "certificate.json"
-    if not path.is_file():
-        blocks.append(Text("No certificate was made for these results."))
-        return blocks
-    try:
-        facts = json.loads(read_text(path))
-        rows = _flat(facts) if isinstance(facts, (dict, list)) else [("", facts)]
-        blocks.append(Table(pd.DataFrame(rows, columns=["fact", "value"]).astype(str), CERTIFICATE))
-    except (InputError, ValueError, RecursionError) as error:
-        blocks.append(Warnings((f"The certificate cannot be read: {str(error)[:200]}",)))
+    blocks += _certificates(folder)
     return blocks
+
+
+def _certificates(folder: Path) -> list[Block]:
+    try:
+        certificates = read_certificates(folder)
+    except InputError as error:
+        return [Warnings((f"The certificate cannot be read: {error}",))]
+    if not certificates:
+        return [Text("No certificate was made for these results; `ded-bench certify` makes one.")]
+    rows = [c.model_dump() | {"title": title(c.method, c.settings)} for c in certificates]
+    return [Items(tuple(c.sentence for c in certificates)), Table(pd.DataFrame(rows), CERTIFICATE)]
 
 
 def _rollout_errors(folder: Path) -> list[Block]:
@@ -353,18 +360,14 @@ def _rollout_errors(folder: Path) -> list[Block]:
         except (OSError, ValueError):
             continue
         columns = tuple(Column(str(name), str(name)) for name in errors.columns)
-        caption = "Rollouts over the whole horizon on simulated trajectories held out from the identification"
+        where = (
+            "under the schedules of full DED, test instances"
+            if path.name == ROLLOUTS
+            else f"on simulated trajectories held out from the identification of `{path.name.split('.')[0]}`"
+        )
+        caption = f"Errors of rollouts over the whole horizon {where}"
         blocks.append(Table(errors, columns, caption))
     return blocks
-
-
-def _flat(value: Any, path: str = "") -> list[tuple[str, Any]]:
-    """Nested JSON as (path, value) pairs."""
-    if isinstance(value, dict):
-        return [pair for key, part in value.items() for pair in _flat(part, f"{path} {key}".strip())]
-    if isinstance(value, list) and any(isinstance(part, (dict, list)) for part in value):
-        return [pair for i, part in enumerate(value) for pair in _flat(part, f"{path} {i + 1}".strip())]
-    return [(path, value)]
 
 
 def _closing(everything: pd.DataFrame, gallery: Gallery) -> list[Block]:

@@ -1,55 +1,31 @@
-"""Run instance × regime × method × settings: resume, worker processes, one row each."""
+"""Run instance × regime × method × settings: resume, workers here or on a cluster, one row each."""
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 import hashlib
-import multiprocessing
-import os
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from multiprocessing.connection import wait as wait_for
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Sequence
 
 from tqdm import tqdm
 
+from ded_bench.bench.cluster import open_workers
 from ded_bench.bench.environment import host, now, version
-from ded_bench.bench.results import Key, Results, Row
+from ded_bench.bench.pool import Workers
+from ded_bench.bench.results import LARGEST, Results, Row
+from ded_bench.bench.shipping import Files, pack
+from ded_bench.bench.tasks import Task, failed, reason_of, score_tasks, solve_task
 from ded_bench.methods import get_method
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.score import Score, score_many
-from ded_bench.truth.simulate import SimulationError
+from ded_bench.truth.score import Score
 
 #: Schedules scored side by side in one task; more gains little, fewer costs overhead.
 SCORE_BATCH = 50
-#: A task whose worker dies this often becomes a row with its error.
-ATTEMPTS = 3
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-
-
-@dataclass(frozen=True)
-class Task:
-    """One row to be made."""
-
-    instance: Instance
-    split: str
-    regime: str
-    method: str
-    settings: Settings
-    fingerprint: str
-
-    @property
-    def key(self) -> Key:
-        """The row's place in the results table."""
-        return Key(self.instance.id, self.regime, self.method, self.settings.slug)
+#: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
+#: what comes before the first solve of a process, imports and the building of the model: some seconds.
+GRACE_S = 60.0
 
 
 def make_tasks(
@@ -66,13 +42,13 @@ def make_tasks(
     """
     case.check_regimes(regimes)
     tasks = []
-    for method in methods:
+    for method in map(get_method, methods):
         for regime in regimes:
-            artifact = get_method(method).artifact(case, regime, settings)
+            artifact = method.artifact(case, regime, settings)
             for instance, split in instances:
-                parts = (case.fingerprint, instance.fingerprint, regime, method, settings.slug, artifact)
+                parts = (case.fingerprint, instance.fingerprint, regime, method.name, settings.slug, artifact)
                 fingerprint = hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-                tasks.append(Task(instance, split, regime, method, settings, fingerprint))
+                tasks.append(Task(instance, split, regime, method.name, settings, fingerprint))
     return tasks
 
 
@@ -83,14 +59,24 @@ def run(
     workers: int = 1,
     problems_version: str = "",
     on_row: Callable[[Row], None] = lambda row: None,
+    scheduler: str | None = None,
 ) -> list[Row]:
     """Solve and score what the results folder lacks; every row is saved as soon as it exists.
 
-    Finished rows are skipped, solved ones are only scored. A worker that dies costs its tasks one
-    attempt; after three a task becomes a row with its error.
+    Finished rows are skipped, solved ones are only scored. A task whose process dies three times
+    becomes a row with its error, and so does one that answers neither within its time limit nor GRACE_S
+    after it.
+
+    Args:
+        workers: processes on this machine.
+        scheduler: address of a Dask scheduler, whose workers are used instead.
 
     Returns:
         The rows of all tasks, old and new, in the order of the tasks.
+
+    Raises:
+        InputError: no scheduler answers.
+        WorkersLostError: it answers no more, or its workers cannot run this package.
     """
     todo = [task for task in tasks if not results.solved(task.key, task.fingerprint)]
     unscored = [
@@ -98,95 +84,73 @@ def run(
         for task in tasks
         if results.solved(task.key, task.fingerprint) and not results.has(task.key, task.fingerprint)
     ]
-    with Workers(workers) as pool, tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
-        for task, answer in pool.imap([(solve_task, (case, task)) for task in todo], todo):
-            solution = answer if isinstance(answer, Solution) else failed(answer)
-            if solution.schedule is not None:
-                solution.schedule.write(results.schedule_path(task.key), case.generators)
-                unscored.append(task)
-            row = _row(task, solution, workers, problems_version)
-            results.add([row])
-            if solution.schedule is None:
-                on_row(row)
-            bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
-            bar.update()
-    _score(case, unscored, results, workers, on_row)
+    with open_workers(workers, scheduler) as pool:
+        calls = [(solve_task, (case, task)) for task in (_packed(case, todo) if scheduler else todo)]
+        limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
+        with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
+            for task, answer in pool.imap(calls, todo, limits):
+                lost = failed(answer), "" if scheduler else host()
+                solution, where = answer if isinstance(answer, tuple) else lost
+                if solution.schedule is not None:
+                    solution.schedule.write(results.schedule_path(task.key), case.generators)
+                    unscored.append(task)
+                else:  # one of an earlier model or policy must not pass for this row's
+                    results.schedule_path(task.key).unlink(missing_ok=True)
+                row = _row(task, solution, pool.count, problems_version, where)
+                results.add([row])
+                if solution.schedule is None:
+                    on_row(row)
+                bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
+                bar.update()
+        _score(case, unscored, results, pool, on_row)
     return [results.rows[task.key] for task in tasks]
 
 
+def _packed(case: Case, tasks: Sequence[Task]) -> Iterator[Task]:
+    """Tasks with all that their methods may look for in a results folder."""
+
+    @functools.cache
+    def files(method: str, regime: str, settings: Settings) -> Files:
+        trained = get_method(method).artifact(case, regime, settings)
+        return pack(settings, regime) if trained else ()
+
+    for task in tasks:
+        yield dataclasses.replace(task, files=files(task.method, task.regime, task.settings))
+
+
 def _score(
-    case: Case, tasks: Sequence[Task], results: Results, workers: int, on_row: Callable[[Row], None]
+    case: Case, tasks: Sequence[Task], results: Results, pool: Workers, on_row: Callable[[Row], None]
 ) -> None:
     batches = list(_batches(tasks))
     calls = []
     for batch in batches:
         schedules = [results.schedule(task.key, case, task.instance) for task in batch]
         calls.append((score_tasks, (case, batch, schedules)))
-    with (
-        Workers(min(workers, len(batches))) as pool,
-        tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar,
-    ):
+    with tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
             rows = []
             for i, task in enumerate(batch):
-                row = results.rows[task.key]
                 verdict = answer[i] if isinstance(answer, list) else answer
-                if isinstance(verdict, Score):
-                    row = scored_row(row, verdict)
-                else:
-                    row = dataclasses.replace(row, error=f"scoring failed: {_reason(verdict)}")
-                rows.append(row)
+                rows.append(scored_row(results.rows[task.key], verdict))
             results.add(rows)
             for row in rows:
                 on_row(row)
             bar.update(len(batch))
 
 
-def solve_task(case: Case, task: Task) -> Solution:
-    """Solve one task in this process; a method that raises gives a failed Solution."""
-    try:
-        return _prepared(case, task.method, task.regime, task.settings)(task.instance)
-    except Exception as error:  # the boundary to other people's methods: a failure is a row
-        return failed(error)
-
-
-def score_tasks(
-    case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule]
-) -> list[Score | BaseException]:
-    """Score tasks of one time grid side by side; if one loses synchronism, each on its own."""
-    regimes = [task.regime for task in tasks]
-    try:
-        return list(score_many(case, [task.instance for task in tasks], schedules, regimes))
-    except SimulationError as error:
-        if len(tasks) == 1:
-            return [error]
-        middle = len(tasks) // 2
-        return score_tasks(case, tasks[:middle], schedules[:middle]) + score_tasks(
-            case, tasks[middle:], schedules[middle:]
-        )
-
-
-def failed(error: object) -> Solution:
-    """A Solution for a method that raised, or whose worker died."""
-    return Solution(Status.FAILED, error=_reason(error))
-
-
-def scored_row(row: Row, verdict: Score) -> Row:
-    """A row with the scorer's verdict filled in."""
+def scored_row(row: Row, verdict: object) -> Row:
+    """A row with the scorer's verdict filled in, or with the reason why there is none."""
+    if not isinstance(verdict, Score):
+        return dataclasses.replace(row, error=f"scoring failed: {reason_of(verdict)}")
+    numbers = dataclasses.asdict(verdict)
+    if None in map(_storable, numbers.values()):
+        return dataclasses.replace(row, error="scoring failed: cost or violations are beyond all measure")
     return dataclasses.replace(
-        row,
-        feasible=verdict.feasible,
-        feasible_strict=verdict.feasible_strict,
-        **dataclasses.asdict(verdict),
+        row, feasible=verdict.feasible, feasible_strict=verdict.feasible_strict, **numbers
     )
 
 
-@functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    return get_method(method).prepare(case, regime, settings)
-
-
-def _row(task: Task, solution: Solution, workers: int, problems_version: str) -> Row:
+def _row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
     seed = task.instance.seed
     return Row(
         instance=task.instance.id,
@@ -199,18 +163,22 @@ def _row(task: Task, solution: Solution, workers: int, problems_version: str) ->
         build_s=solution.build_s,
         setup_s=solution.setup_s,
         solve_s=solution.solve_s,
-        solver_objective=solution.solver_objective,
+        solver_objective=_storable(solution.solver_objective),
         error=solution.error,
         workers=workers,
         problems_version=problems_version,
         version=version(),
         solver_version=solution.solver_version,
-        host=host(),
+        host=where,
         date=now(),
         case=task.instance.case,
         seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
         fingerprint=task.fingerprint,
     )
+
+
+def _storable(value: float | None) -> float | None:
+    return value if value is not None and abs(value) <= LARGEST else None
 
 
 def _batches(tasks: Sequence[Task]) -> Iterator[list[Task]]:
@@ -220,106 +188,3 @@ def _batches(tasks: Sequence[Task]) -> Iterator[list[Task]]:
     for group in grids.values():
         for start in range(0, len(group), SCORE_BATCH):
             yield group[start : start + SCORE_BATCH]
-
-
-def _reason(error: object) -> str:
-    """One line that a person understands."""
-    if isinstance(error, BaseException):
-        first = str(error).strip().splitlines()[:1]
-        return f"{type(error).__name__}: {first[0] if first else 'no message'}"[:300]
-    return str(error)[:300]
-
-
-T = TypeVar("T")
-Call = tuple[Callable[..., object], tuple[object, ...]]
-
-
-class Workers:
-    """Worker processes with one thread each, restarted when one dies."""
-
-    def __init__(self, count: int) -> None:
-        self.count = max(count, 1)
-        self._pool: ProcessPoolExecutor | None = None
-        self._threads = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-
-    def __enter__(self) -> Workers:
-        os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # inherited by the workers
-        return self
-
-    def __exit__(self, kind: object, value: object, trace: object) -> None:
-        for name, before in self._threads.items():
-            if before is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = before
-        self._stop(kill=kind is not None)
-
-    def imap(self, calls: Sequence[Call], labels: Iterable[T]) -> Iterator[tuple[T, object]]:
-        """Yield (label, result or exception) of every call, in the order in which they finish."""
-        waiting = [(label, call, 1) for label, call in zip(labels, calls, strict=True)][::-1]
-        running: dict[Future[object], tuple[T, Call, int]] = {}
-        suspects = 0  # after a death, run one at a time so that only the guilty task is blamed
-        while waiting or running:
-            while waiting and len(running) < (1 if suspects else 2 * self.count):
-                label, (function, arguments), attempt = waiting.pop()
-                try:
-                    future = self._executor().submit(function, *arguments)
-                except BrokenProcessPool:  # a worker died since the last answer
-                    waiting.append((label, (function, arguments), attempt))
-                    if running:
-                        break  # they hear of it below
-                    self._stop(kill=True)
-                    continue
-                running[future] = (label, (function, arguments), attempt)
-            done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-            died = []
-            for future in done:
-                label, call, attempt = running.pop(future)
-                error = future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    died.append((label, call, attempt))
-                else:
-                    suspects = max(suspects - 1, 0)
-                    yield label, (error if error is not None else future.result())
-            if died:
-                died += running.values()
-                running.clear()
-                self._stop(kill=True)
-                alone = len(died) == 1
-                suspects = len(died)
-                for label, call, attempt in died:
-                    if alone and attempt >= ATTEMPTS:
-                        suspects = 0
-                        yield label, f"the worker process died {ATTEMPTS} times on this task"
-                    else:
-                        waiting.append((label, call, attempt + alone))
-
-    def _executor(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.count, context, initializer=_start_worker)
-        return self._pool
-
-    def _stop(self, kill: bool) -> None:
-        if self._pool is None:
-            return
-        if kill:
-            for process in list((self._pool._processes or {}).values()):
-                process.kill()
-        self._pool.shutdown(wait=not kill, cancel_futures=True)
-        self._pool = None
-
-
-def _start_worker() -> None:
-    """Leave Ctrl-C to the main process, and die with it."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def follow() -> None:
-            wait_for([parent.sentinel])
-            os._exit(1)
-
-        threading.Thread(target=follow, daemon=True).start()

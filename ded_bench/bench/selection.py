@@ -17,7 +17,10 @@ WORST = 3
 
 @dataclass(frozen=True)
 class Plan:
-    """What to draw: per regime the runs of one representative instance, per method its worst runs."""
+    """What to draw: per regime the runs of one representative instance, per method its worst runs.
+
+    Of a method with several settings, those of the default are drawn.
+    """
 
     representative: dict[str, list[Key]] = field(default_factory=dict)
     worst: dict[tuple[str, str, str], list[tuple[Key, str]]] = field(default_factory=dict)
@@ -52,7 +55,7 @@ def plan(frame: pd.DataFrame, available: Callable[[Key], bool]) -> Plan:
     chosen = Plan()
     for regime in sorted(set(scored["regime"])):
         chosen.representative[regime] = _representative(scored[scored["regime"] == regime], regime, available)
-    for regime, method, settings, group in groups(worst(scored, WORST)):
+    for regime, method, settings, group in groups(worst(first_settings(scored), WORST)):
         ranked = []
         by_gap = group[group["worst_by"] == "gap"]
         by_violation = group[group["worst_by"] == "violation"]
@@ -66,6 +69,13 @@ def plan(frame: pd.DataFrame, available: Callable[[Key], bool]) -> Plan:
         keys = [(Key(name, regime, method, settings), reason) for name, reason in ranked]
         chosen.worst[regime, method, settings] = [pair for pair in keys if available(pair[0])]
     return chosen
+
+
+def first_settings(rows: pd.DataFrame) -> pd.DataFrame:
+    """Each method's rows with its default settings, or the first by name if it has none with those."""
+    ranked = rows.assign(_name=[name if name != "default" else "" for name in rows["settings"]])
+    first = ranked.groupby("method")["_name"].transform("min")
+    return rows[ranked["_name"] == first]
 
 
 def _representative(rows: pd.DataFrame, regime: str, available: Callable[[Key], bool]) -> list[Key]:

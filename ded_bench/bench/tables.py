@@ -11,6 +11,8 @@ import pandas as pd
 
 #: Cells with more characters may be broken into lines.
 LONG, WORDS = 32, ' class="words"'
+#: The column that stays in sight when a narrow screen is scrolled sideways.
+LABEL = "title"
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,8 @@ def to_markdown(frame: pd.DataFrame, columns: Sequence[Column]) -> str:
 
 
 def to_html(frame: pd.DataFrame, columns: Sequence[Column]) -> str:
-    """An HTML table; numbers carry the class `number`, sentences `words`, a new regime's row `first`."""
-    classes = [' class="number"' if _numeric(frame, column) else "" for column in columns]
+    """An HTML table; classes: numbers `number`, methods `label`, sentences `words`, a new regime `first`."""
+    classes = [_class(frame, column) for column in columns]
     head = "".join(
         f'<th scope="col"{kind}>{html.escape(column.heading)}</th>'
         for column, kind in zip(columns, classes, strict=True)
@@ -64,13 +66,22 @@ def to_html(frame: pd.DataFrame, columns: Sequence[Column]) -> str:
     body = []
     previous = None
     for row in rows_of(frame, columns):
-        kinds = [WORDS if len(cell) > LONG else kind for cell, kind in zip(row, classes, strict=True)]
+        kinds = [
+            WORDS if len(cell) > LONG and "label" not in kind else kind
+            for cell, kind in zip(row, classes, strict=True)
+        ]
         cells = "".join(f"<td{kind}>{html.escape(cell)}</td>" for cell, kind in zip(row, kinds, strict=True))
         first = ' class="first"' if previous is not None and row[0] != previous else ""
         previous = row[0]
         body.append(f"<tr{first}>{cells}</tr>")
     rows = "\n".join(body)
     return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
+
+
+def _class(frame: pd.DataFrame, column: Column) -> str:
+    if column.name == LABEL:
+        return ' class="label"'
+    return ' class="number"' if _numeric(frame, column) else ""
 
 
 def to_latex(frame: pd.DataFrame, columns: Sequence[Column], caption: str, label: str) -> str:

@@ -10,11 +10,10 @@ import csv
 import dataclasses
 import hashlib
 import io
-import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,13 @@ import pandas as pd
 from tqdm import tqdm
 
 from ded_bench.bench.environment import host, now, version
-from ded_bench.bench.metrics import quartiles
-from ded_bench.bench.results import Key, read_table
-from ded_bench.bench.run import Workers, failed
-from ded_bench.koopman.store import TRAINED
-from ded_bench.methods import METHODS, get_method
-from ded_bench.methods.solution import DEFAULT_MODEL, Settings, Solution
+from ded_bench.bench.metrics import is_study, quartiles
+from ded_bench.bench.pool import Workers
+from ded_bench.bench.results import LARGEST, Key, read_table
+from ded_bench.bench.tasks import failed
+from ded_bench.koopman.store import MODELS
+from ded_bench.methods import Method, get_method, registered
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
@@ -40,7 +40,6 @@ SAMPLE = 10
 #: Without a number of repeats, a method is repeated until this much solve time is spent, at most so often.
 BUDGET_S, MAX_REPEATS = 2.0, 200
 PARTS = ("build_s", "setup_s", "solve_s")
-MODELS = tuple(dict.fromkeys((DEFAULT_MODEL, "linear", *TRAINED)))
 
 
 @dataclass(frozen=True)
@@ -176,22 +175,26 @@ def bench_folder(
     )
 
 
-def runs_of(keys: Iterable[Key], settings: Settings) -> list[tuple[str, list[str], Settings]]:
-    """What a results table holds, to be timed: (method, regimes, settings), in the registry's order.
+def runs_of(
+    keys: Iterable[Key], settings: Settings, methods: Mapping[str, Method] | None = None
+) -> list[tuple[str, list[str], Settings]]:
+    """What a results table holds, to be timed: (method, regimes, settings), in the methods' order.
 
-    Rows of methods that are not registered, and of models given as a file, cannot be run again from
-    their key alone and are left out.
+    Rows of studies are not timed. Rows of other methods, and of models given as a file, cannot be run
+    again from their key alone and are left out.
 
     Args:
         settings: all but the name and the model, which come from the keys.
+        methods: those to time, by the name that their rows carry; None: all that are registered.
     """
+    methods = registered() if methods is None else methods
     found: dict[tuple[str, str], set[str]] = {}
     for key in keys:
         found.setdefault((key.method, key.settings), set()).add(key.regime)
     runs = []
-    for method in METHODS:
-        for slug in sorted(slug for name, slug in found if name == method):
-            known = METHODS[method].settings
+    for method in methods:
+        for slug in sorted(slug for name, slug in found if name == method and not is_study(slug)):
+            known = methods[method].settings
             choices = [
                 dataclasses.replace(settings, name=name, model=model) for name in known for model in MODELS
             ]
@@ -339,7 +342,7 @@ def _parse(cell: str, name: str, path: Path, line: int) -> Any:
         return None
     try:
         value = int(cell) if kind == "int" else float(cell)
-        if not math.isfinite(value) or value < 0:
+        if not 0 <= value <= LARGEST:
             raise ValueError
         return value
     except ValueError:

@@ -15,8 +15,9 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.simulate import simulate_many
 
 KNOTS = 50
-#: `tracking` schedules: lag and smoothing in s, rate as a fraction of the ramp limit; uniform.
-LAG_S, SMOOTH_S, RATE = (0.1, 3.0), (0.02, 0.5), (0.4, 1.0)
+
+#: Range of a uniform draw.
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +66,23 @@ def sample_trajectories(
     return trajectories(case, instances, schedules, kinds)
 
 
-def tracking(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+def tracking(
+    case: Case,
+    instance: Instance,
+    rng: np.random.Generator,
+    lag_s: Span = (0.1, 3.0),
+    smooth_s: Span = (0.02, 0.5),
+    rate: Span = (0.4, 1.0),
+) -> Array:
     """Follow the static dispatch with a lag and limited rates, smoothed: looks like an optimum.
 
-    The rate limit is drawn below the ramp limit, since a tight frequency bound allows no more.
+    The rate is a fraction of the ramp limit, drawn below it since a tight frequency bound allows no more.
     """
     p_load = instance.p_load(case)
     target = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
-    gain = instance.dt_s / rng.uniform(*LAG_S)
-    smooth = instance.dt_s / rng.uniform(*SMOOTH_S)
-    most = rng.uniform(*RATE) * case.ramp_pu_per_s * instance.dt_s
+    gain = instance.dt_s / rng.uniform(*lag_s)
+    smooth = instance.dt_s / rng.uniform(*smooth_s)
+    most = rng.uniform(*rate) * case.ramp_pu_per_s * instance.dt_s
     p = np.empty_like(target)
     p[0] = instance.p_initial(case)
     step = np.zeros(target.shape[1])
@@ -82,6 +90,11 @@ def tracking(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
         step += smooth * (np.clip(gain * (target[k + 1] - p[k]), -most, most) - step)
         p[k + 1] = p[k] + step
     return p
+
+
+def hurried(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """`tracking` at the ramp limit with little lag: an optimum where frequency bounds do not bind."""
+    return tracking(case, instance, rng, lag_s=(0.1, 1.0), smooth_s=(0.02, 0.1), rate=(1.0, 1.0))
 
 
 def bang_bang(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
@@ -120,6 +133,7 @@ def _within(case: Case, instance: Instance, increments: Array) -> Array:
 
 KINDS: dict[str, Callable[[Case, Instance, np.random.Generator], Array]] = {
     "tracking": tracking,
+    "hurried": hurried,
     "bang-bang": bang_bang,
     "random knots": random_knots,
     "load ramps": load_ramps,

@@ -6,10 +6,10 @@ given, (P_s, N) and the generators' f determine each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import expm, logm
 
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
@@ -129,6 +129,32 @@ def linear_model(case: Case) -> Koopman:
         g=b + phi @ (form.feedthrough - b),
         lift=lift,
         training={"source": "linearisation at the nominal point"},
+    )
+
+
+def single_sample(model: Koopman, case: Case) -> Koopman:
+    """The same dynamics in the paper's form with one input sample per step (kind `<kind>-single`).
+
+    With F what answers an input at once, ζ = ψ - F P has no derivative of P in its equation, and
+    holding the newer sample over a step gives ζ⁺ = K ζ + (I - K)(B - F) P⁺. The observables are
+    (ω, P_s, ζ), and K ignores the old (ω, P_s): the new ones are ζ⁺'s plus their rows of F P⁺.
+    """
+    n, n_gen = len(model.k), len(case.generators)
+    network = Network(case)
+    mean = np.linalg.solve(logm(model.k).real, model.k - np.eye(n))  # of exp(A s) over a step
+    feedthrough = model.b + np.linalg.solve(mean, model.g - model.b)
+    k = np.zeros((n + n_gen + 1,) * 2)
+    k[:, n_gen + 1 :] = np.vstack([model.k[: n_gen + 1], model.k])
+    b = np.vstack([model.b[: n_gen + 1], model.b - feedthrough])
+    away = model.lift.copy()
+    away[:, [*network.generators, *network.loads]] -= feedthrough  # f equals P wherever P enters
+    return replace(
+        model,
+        kind=f"{model.kind}-single",
+        k=k,
+        b=b,
+        g=(np.eye(len(k)) - k) @ b,
+        lift=np.vstack([model.lift[: n_gen + 1], away]),
     )
 
 

@@ -6,12 +6,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ded_bench.koopman.model import Koopman
-from ded_bench.koopman.physics import linear_model
-from ded_bench.problem.case import Case
+from ded_bench.koopman.physics import linear_model, single_sample
+from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.errors import InputError
 
-#: Models that `ded-bench train-ko` identifies, beside `linear`, which needs no training.
+#: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")
+#: All models by name; those not trained follow from the case or from `koopman`.
+MODELS = (*TRAINED, "koopman-single", "linear")
+
+
+def default_results(case: Case) -> Path:
+    """Where results of a case lie unless told otherwise, below the working directory."""
+    return Path("results") / case.id
+
+
+def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
+    """Where trained models and policies are looked for: `first`, default results, reference run."""
+    return (*first, default_results(case), REPOSITORY / "results" / f"{case.id}-reference")
 
 
 def model_file(results: Path, kind: str) -> Path:
@@ -27,6 +39,8 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
     """
     if name == "linear":
         return linear_model(case)
+    if name == "koopman-single":
+        return single_sample(find_model(case, "koopman", search), case)
     if name in TRAINED:
         for folder in search:
             if model_file(folder, name).is_file():
@@ -34,4 +48,4 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
         raise InputError("--model", name, f"not identified yet; run `ded-bench train-ko --case {case.id}`")
     if Path(name).is_file():
         return Koopman.load(name, case)
-    raise InputError("--model", name, f"no such file and no such model (known: linear, {', '.join(TRAINED)})")
+    raise InputError("--model", name, f"no such file and no such model (known: {', '.join(MODELS)})")

@@ -1,4 +1,4 @@
-"""METHODS, the registry: a new method is one module and one line here.
+"""METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`foreign`).
 
 A method's module offers `prepare(case, regime, settings) -> (instance -> Solution)` and `SETTINGS`, a
 mapping whose keys are the slugs of its settings. If it depends on a trained model or policy, it
@@ -10,9 +10,9 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
+from ded_bench.methods import foreign
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
@@ -20,15 +20,15 @@ from ded_bench.problem.errors import InputError
 
 @dataclass(frozen=True)
 class Method:
-    """A registered method; its module is imported when first used."""
+    """A method; its module, or the `module:function` of others, is imported when first used."""
 
     name: str
     module: str
     title: str
 
     @property
-    def _loaded(self) -> ModuleType:
-        return importlib.import_module(self.module)
+    def _loaded(self) -> Any:
+        return foreign.load(self.module) if ":" in self.module else importlib.import_module(self.module)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -62,6 +62,8 @@ METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method("ded", "ded_bench.methods.ded", "DED"),
+        Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
+        Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
         Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),
         Method("ded-dpc-paper", "ded_bench.methods.dpc.policy", "DED-DPC (paper's recipe)"),
@@ -71,8 +73,31 @@ METHODS: dict[str, Method] = {
 }
 
 
+def registered() -> dict[str, Method]:
+    """Every method that has a name: ours, then those that installed packages bring, by name.
+
+    Ours keep their names whatever others call theirs.
+    """
+    others = foreign.installed()
+    names = sorted(name for name in others if name not in METHODS and foreign.SLUG.fullmatch(name))
+    return METHODS | {name: Method(name, others[name], name) for name in names}
+
+
 def get_method(name: str) -> Method:
-    """Return a registered method; InputError with the known names if there is none."""
-    if name not in METHODS:
-        raise InputError("--method", name, f"unknown method (known: {', '.join(METHODS)})")
-    return METHODS[name]
+    """Return a method by its name, as `module:function`, or as the `module.function` of its rows.
+
+    Raises:
+        InputError: there is none (names the known ones), or the function cannot be used.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    known = registered()
+    if name not in known and not (":" in name or "." in name):
+        raise InputError("--method", name, f"unknown method (known: {', '.join(known)}, or module:function)")
+    if name in known:
+        foreign.load(known[name].module)  # says at once what is wrong with it
+        return known[name]
+    target = name if ":" in name else ":".join(name.rsplit(".", 1))
+    foreign.load(target)
+    slug = foreign.slug_of(target)
+    return Method(slug, target, slug)

@@ -2,49 +2,98 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyomo.dae as dae
 import pyomo.environ as pyo
 
-from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solvers import Compiled, compile_model
+from ded_bench.methods.ded_sequential import SequentialDed
+from ded_bench.methods.ded_start import STARTS
+from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.methods.solvers import Compiled, Outcome, compile_model
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.simulate import simulate
 from ded_bench.truth.swing import Network
 
-#: Solver by settings slug; both start cold and use IPOPT's default tolerances.
-SETTINGS = {"default": "ipopt", "executable": "ipopt-executable"}
+
+@dataclass(frozen=True)
+class Choice:
+    """How the discretised problem is solved: a solver of `solvers`, or a sequence of linear programs."""
+
+    solver: str = "ipopt"
+    start: str = ""  # one of STARTS; the state at t = 0, if empty
+
+
+#: By settings slug. IPOPT has its default tolerances in all of them.
+SETTINGS = {
+    "default": Choice(),
+    "executable": Choice("ipopt-executable"),
+    "accelerated": Choice("sequential"),
+    **{f"start-{start}": Choice(start=start) for start in STARTS},
+}
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
     case.check_regimes([regime])
+    choice = SETTINGS[settings.name]
+    if choice.solver == "sequential":
+        return functools.partial(_solve_sequentially, case, regime, settings)
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         model = _built(case, instance.steps, instance.dt_s)
         set_instance(model, case, instance, regime)
+        if choice.start:
+            start_from(model, case, instance, STARTS[choice.start](case, instance, regime))
         build_s = time.perf_counter() - started
-        compiled = _compiled(case, instance.steps, instance.dt_s, settings.name)
+        compiled = _compiled(case, instance.steps, instance.dt_s, choice.solver)
         outcome = compiled.solve(settings.time_limit_s)
-        return Solution(
-            status=outcome.status,
-            schedule=schedule_of(model, case, instance) if outcome.has_values else None,
-            iterations=outcome.iterations,
-            build_s=build_s,
-            setup_s=outcome.setup_s,
-            solve_s=outcome.solve_s,
-            solver_objective=outcome.objective,
-            solver_version=outcome.version,
-            error="" if outcome.has_values else outcome.message,
-        )
+        return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
     return solve
+
+
+def _solve_sequentially(case: Case, regime: str, settings: Settings, instance: Instance) -> Solution:
+    """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
+    started = time.perf_counter()
+    programs = _programs(case, regime, instance.steps, instance.dt_s)
+    build_s = time.perf_counter() - started
+    outcome, schedule = programs.solve(instance, settings.time_limit_s)
+    if outcome.status != Status.FAILED:
+        return answer(outcome, build_s, lambda: schedule)
+    limit = settings.time_limit_s
+    rest = None if limit is None else max(limit - outcome.solve_s, 1e-3)
+    verdict = prepare(case, regime, Settings(time_limit_s=rest))(instance)
+    return dataclasses.replace(
+        verdict,
+        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
+        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
+        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
+    )
+
+
+def answer(outcome: Outcome, build_s: float, schedule: Callable[[], Schedule | None]) -> Solution:
+    """A solver's outcome as the method's answer; the schedule is read only if there is one."""
+    return Solution(
+        status=outcome.status,
+        schedule=schedule() if outcome.has_values else None,
+        iterations=outcome.iterations,
+        build_s=build_s,
+        setup_s=outcome.setup_s,
+        solve_s=outcome.solve_s,
+        solver_objective=outcome.objective,
+        solver_version=outcome.version,
+        error="" if outcome.has_values else outcome.message,
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -53,8 +102,13 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled(case: Case, steps: int, dt: float, slug: str) -> Compiled:
-    return compile_model(_built(case, steps, dt), SETTINGS[slug])
+def _compiled(case: Case, steps: int, dt: float, solver: str) -> Compiled:
+    return compile_model(_built(case, steps, dt), solver)
+
+
+@functools.lru_cache(maxsize=2)
+def _programs(case: Case, regime: str, steps: int, dt: float) -> SequentialDed:
+    return SequentialDed(case, regime, steps, dt)
 
 
 def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
@@ -81,7 +135,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m.dtheta = dae.DerivativeVar(m.theta, wrt=m.t, initialize=0.0)
     m.domega = dae.DerivativeVar(m.omega, wrt=m.t, initialize=0.0)
     m.angle = pyo.Var(m.algebraic, m.t, initialize=0.0)
-    m.p_gen = pyo.Var(m.gen, m.t, initialize=0.0)
+    m.p_gen = pyo.Var(m.gen, m.t, bounds=power_limits(case))
     m.p_slack_up = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     m.p_slack_down = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     pyo.TransformationFactory("dae.finite_difference").apply_to(m, nfe=steps, wrt=m.t, scheme="BACKWARD")
@@ -89,16 +143,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m.step = pyo.RangeSet(1, steps)
 
     # Constraints.
-    neighbours: dict[str, list[tuple[str, float]]] = {bus.id: [] for bus in case.buses}
-    for line, coupling in zip(case.lines, network.coupling.tolist(), strict=True):
-        neighbours[line.from_bus].append((line.to_bus, coupling))
-        neighbours[line.to_bus].append((line.from_bus, coupling))
-
-    def angle(bus: str, t: float) -> Any:
-        return 0.0 if bus == case.slack else m.theta[bus, t] if bus in m.gen else m.angle[bus, t]
-
-    def injection(bus: str, t: float) -> Any:
-        return sum(b * pyo.sin(angle(bus, t) - angle(other, t)) for other, b in neighbours[bus])
+    injection = injections(m, case, network)
 
     @m.Constraint(m.gen, m.t)
     def eq_swing(m: Any, g: str, t: float) -> Any:
@@ -132,6 +177,27 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     return m
 
 
+def power_limits(case: Case) -> Callable[[Any, str, float], tuple[float, float]]:
+    """Bounds of a generator's power at any time, pu."""
+    return lambda m, g, t: (case.machines[g].p_min, case.machines[g].p_max)
+
+
+def injections(m: pyo.ConcreteModel, case: Case, network: Network) -> Callable[[str, float], Any]:
+    """f_i(θ(t)) of the paper as a function of bus and time, over a model's `theta` and `angle`, pu."""
+    neighbours: dict[str, list[tuple[str, float]]] = {bus.id: [] for bus in case.buses}
+    for line, coupling in zip(case.lines, network.coupling.tolist(), strict=True):
+        neighbours[line.from_bus].append((line.to_bus, coupling))
+        neighbours[line.to_bus].append((line.from_bus, coupling))
+
+    def angle(bus: str, t: float) -> Any:
+        return 0.0 if bus == case.slack else m.theta[bus, t] if bus in m.gen else m.angle[bus, t]
+
+    def injection(bus: str, t: float) -> Any:
+        return sum(b * pyo.sin(angle(bus, t) - angle(other, t)) for other, b in neighbours[bus])
+
+    return injection
+
+
 def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: str) -> None:
     """Fix a built model's data to one instance and reset its initial point (cold start).
 
@@ -139,41 +205,74 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     """
     network = Network(case)
     angles = network.initial_angles(instance)
-    p_initial = instance.p_initial(case)
-    omega_initial = instance.omega_initial(case)
-    p_slack = float(network.injections(angles)[network.slack])
-    bound = case.omega_bound(regime)
-    times = list(m.t)
+    p_initial, omega_initial = instance.p_initial(case), instance.omega_initial(case)
+    bound, times = case.omega_bound(regime), list(m.t)
     for g in case.generators:
-        _fix(m.cost[g], instance.cost[g])
-    _fix(m.cost_slack, instance.cost_slack(case))
+        fix(m.cost[g], instance.cost[g])
+    fix(m.cost_slack, instance.cost_slack(case))
     for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
         for t, value in zip(times, column, strict=True):
-            _fix(m.p_load[bus, t], value)
+            fix(m.p_load[bus, t], value)
+    for g in case.generators:
+        for t in times:
+            m.omega[g, t].setlb(-bound)
+            m.omega[g, t].setub(bound)
+    points = (len(times), 1)
+    still = np.zeros((len(times), len(case.generators)))
+    slack = np.tile(network.injections(angles)[network.slack], len(times))
+    _start(m, case, np.tile(angles, points), still, still, np.tile(p_initial, points), slack)
     for j, g in enumerate(case.generators):
-        machine, theta = case.machines[g], float(angles[network.generators[j]])
-        for t in times:
-            _reset(m.p_gen[g, t], float(p_initial[j]), machine.p_min, machine.p_max)
-            _reset(m.omega[g, t], 0.0, -bound, bound)
-            _reset(m.theta[g, t], theta)
-            m.dtheta[g, t].set_value(0.0)
-            m.domega[g, t].set_value(0.0)
-        _fix(m.p_gen[g, 0], float(p_initial[j]))
-        _fix(m.omega[g, 0], float(omega_initial[j]))
-        _fix(m.theta[g, 0], theta)
-    for i in network.algebraic:
-        for t in times:
-            m.angle[case.buses[i].id, t].set_value(float(angles[i]))
-    for t in times:
-        m.p_slack_up[t].set_value(max(p_slack, 0.0))
-        m.p_slack_down[t].set_value(max(-p_slack, 0.0))
+        fix(m.p_gen[g, 0], float(p_initial[j]))
+        fix(m.omega[g, 0], float(omega_initial[j]))
+        fix(m.theta[g, 0], float(angles[network.generators[j]]))
 
 
-def _fix(variable: pyo.Var, value: float) -> None:
-    _reset(variable, value, value, value)
+def start_from(m: pyo.ConcreteModel, case: Case, instance: Instance, schedule: Schedule) -> None:
+    """Make the initial point of a model that is set to an instance what a schedule does on the true DAE.
+
+    Raises:
+        SimulationError: the system loses synchronism under this schedule.
+    """
+    truth = simulate(case, instance, schedule)
+    acceleration = np.gradient(truth.omega, instance.dt_s, axis=0)
+    _start(m, case, truth.theta, truth.omega, acceleration, truth.p_gen, truth.p_slack)
 
 
-def _reset(variable: pyo.Var, value: float, lower: float | None = None, upper: float | None = None) -> None:
+def _start(
+    m: pyo.ConcreteModel,
+    case: Case,
+    theta: Array,
+    omega: Array,
+    acceleration: Array,
+    p_gen: Array,
+    p_slack: Array,
+) -> None:
+    """Set the values of all variables but the data; rows are points, columns buses or generators."""
+    network = Network(case)
+    slack = np.column_stack([np.maximum(p_slack, 0.0), np.maximum(-p_slack, 0.0)])
+    wanted = [
+        *((m.theta, g, column) for g, column in zip(m.gen, theta[:, network.generators].T, strict=True)),
+        *((m.omega, g, column) for g, column in zip(m.gen, omega.T, strict=True)),
+        *((m.dtheta, g, column) for g, column in zip(m.gen, omega.T, strict=True)),
+        *((m.domega, g, column) for g, column in zip(m.gen, acceleration.T, strict=True)),
+        *((m.p_gen, g, column) for g, column in zip(m.gen, p_gen.T, strict=True)),
+        *((m.angle, i, column) for i, column in zip(m.algebraic, theta[:, network.algebraic].T, strict=True)),
+        (m.p_slack_up, None, slack[:, 0]),
+        (m.p_slack_down, None, slack[:, 1]),
+    ]
+    times = list(m.t)
+    for variable, bus, column in wanted:
+        for t, value in zip(times, column.tolist(), strict=True):
+            variable[t if bus is None else (bus, t)].set_value(value, skip_validation=True)
+
+
+def fix(variable: pyo.Var, value: float) -> None:
+    """Make a variable data: fixed by equal bounds."""
+    reset(variable, value, value, value)
+
+
+def reset(variable: pyo.Var, value: float, lower: float | None = None, upper: float | None = None) -> None:
+    """Set a variable's value and bounds."""
     variable.setlb(lower)
     variable.setub(upper)
     variable.set_value(value, skip_validation=True)

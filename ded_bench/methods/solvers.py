@@ -12,6 +12,8 @@ import dataclasses
 import importlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import highspy
@@ -20,13 +22,22 @@ import pyomo.environ as pyo
 import scipy.sparse as sp
 
 from ded_bench.methods.ipopt import LINEAR_OPTIONS, CasadiIpopt, IpoptExecutable
-from ded_bench.methods.linear import Numbers, assign, read_linear
+from ded_bench.methods.linear import FreeForm, assign, read_linear
 from ded_bench.methods.outcome import Compiled, Options, Outcome
 from ded_bench.methods.solution import Status
 from ded_bench.problem.case import Array
 from ded_bench.problem.errors import InputError
 
-__all__ = ["SOLVERS", "CasadiIpopt", "Compiled", "GrowingProgram", "Outcome", "compile_model"]
+__all__ = [
+    "SOLVERS",
+    "Answer",
+    "CasadiIpopt",
+    "Compiled",
+    "GrowingProgram",
+    "Outcome",
+    "compile_model",
+    "solve_form",
+]
 
 #: On the 9-bus case PIQP takes 17 to 42 iterations.
 _PIQP_OPTIONS: dict[str, Any] = {"max_iter": 100}
@@ -56,10 +67,7 @@ class Piqp:
 
     def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
         started = time.perf_counter()
-        try:
-            self._piqp = importlib.import_module("piqp")
-        except ImportError:
-            raise InputError("piqp", "", "not installed; `pip install piqp` or use other settings") from None
+        self._piqp = _piqp()
         self._options = _PIQP_OPTIONS | dict(options or {})
         self._program = read_linear(model)
         self._judge: CasadiIpopt | None = None
@@ -69,7 +77,7 @@ class Piqp:
         """See `Compiled`."""
         started = time.perf_counter()
         numbers = self._program.numbers()
-        solver = self._loaded(numbers)
+        solver = _piqp_loaded(self._program.free_form(numbers), self._options)
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
         started = time.perf_counter()
@@ -101,24 +109,53 @@ class Piqp:
             message=f"{found.name}, {verdict.message}",
         )
 
-    def _loaded(self, numbers: Numbers) -> Any:
-        solver = self._piqp.SparseSolver()
-        for name, value in self._options.items():
-            setattr(solver.settings, name, value)
-        form = self._program.free_form(numbers)
-        n = len(form.cost)
-        solver.setup(
-            sp.csc_matrix((n, n)),
-            form.cost,
-            form.equal,
-            form.right,
-            form.between,
-            form.low,
-            form.high,
-            form.lower,
-            form.upper,
-        )
-        return solver
+
+def _piqp() -> ModuleType:
+    try:
+        return importlib.import_module("piqp")
+    except ImportError:
+        raise InputError("piqp", "", "not installed; `pip install piqp` or use other settings") from None
+
+
+def _piqp_loaded(form: FreeForm, options: Options) -> Any:
+    solver = _piqp().SparseSolver()
+    for name, value in options.items():
+        setattr(solver.settings, name, value)
+    n = len(form.cost)
+    solver.setup(
+        sp.csc_matrix((n, n)),
+        form.cost,
+        form.equal,
+        form.right,
+        form.between,
+        form.low,
+        form.high,
+        form.lower,
+        form.upper,
+    )
+    return solver
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What PIQP says to one linear program given by its arrays; no x if it did not solve it."""
+
+    x: Array | None
+    iterations: int
+    version: str
+    message: str
+
+
+def solve_form(form: FreeForm) -> Answer:
+    """Solve a linear program by PIQP.
+
+    Raises:
+        InputError: the package `piqp` is not installed.
+    """
+    piqp, solver = _piqp(), _piqp_loaded(form, _PIQP_OPTIONS)
+    found = solver.solve()
+    x = np.array(solver.result.x) if found == piqp.PIQP_SOLVED else None
+    return Answer(x, int(solver.result.info.iter), f"piqp {piqp.__version__}", found.name)
 
 
 def _highs(options: Options) -> Any:

@@ -13,6 +13,9 @@ import safetensors.numpy
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.strict import write_atomically
 
+#: What the readers of safetensors and JSON raise on a damaged file, beside their own errors.
+_UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError, MemoryError)
+
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]) -> None:
     """Write arrays and a header; floats in the header keep their digits."""
@@ -33,9 +36,13 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None
-    except (safetensors.SafetensorError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(path, "", f"is not a model or policy file ({str(error)[:100]})") from None
+    except (safetensors.SafetensorError, *_UNREADABLE) as error:
+        raise InputError(path, "", f"is not a model or policy file ({_one_line(error)})") from None
     for name, array in arrays.items():
         if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
             raise InputError(path, name, "must hold finite numbers")
     return arrays, header
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:100]

@@ -16,11 +16,15 @@ from ded_bench.problem.errors import InputError
 from ded_bench.problem.strict import Record, read_record
 
 Array = NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+#: Numbers beyond these are typing errors or in other units; within them no product overflows.
+SMALLEST, LARGEST = 1e-9, 1e9
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-Range = tuple[float, float]
+Range = tuple[Number, Number]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 #: Cases that come with the suite: beside a checkout, or inside an installed package.
@@ -35,8 +39,8 @@ class Bus(Record):
 
     id: Name
     kind: Literal["slack", "generator", "load", "junction"]
-    v: Positive
-    p_nominal: float | None = None  # loads only: nominal injection in pu, negative
+    v: Magnitude
+    p_nominal: Number | None = None  # loads only: nominal injection in pu, negative
 
 
 class Line(Record):
@@ -45,17 +49,17 @@ class Line(Record):
     from_bus: Name = Field(alias="from")
     to_bus: Name = Field(alias="to")
     r: NonNegative
-    x: Positive
+    x: Magnitude
 
 
 class Machine(Record):
     """Inertia m (s² pu/rad), damping d (s pu/rad) and power limits in pu of one generator."""
 
-    m: Positive
+    m: Magnitude
     d: NonNegative
-    p_nominal: float
-    p_min: float
-    p_max: float
+    p_nominal: Number
+    p_min: Number
+    p_max: Number
 
     @model_validator(mode="after")
     def _ordered(self) -> Machine:
@@ -67,7 +71,7 @@ class Machine(Record):
 class Limits(Record):
     """One operating regime: |omega| at every generator stays within `omega_hz`."""
 
-    omega_hz: Positive
+    omega_hz: Magnitude
 
 
 class Sampling(Record):
@@ -99,11 +103,11 @@ class Case(Record):
 
     schema_: Literal["ded-bench/case/1"] = Field(alias="schema")
     id: Name
-    f0_hz: Positive
+    f0_hz: Magnitude
     buses: tuple[Bus, ...]
     lines: tuple[Line, ...]
     machines: dict[Name, Machine]
-    ramp_pu_per_s: Positive
+    ramp_pu_per_s: Magnitude
     regimes: dict[Name, Limits]
     sampling: Sampling
 

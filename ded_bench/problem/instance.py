@@ -6,14 +6,17 @@ import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from ded_bench.problem.case import Array, Case, Name, NonNegative, Positive
+from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.strict import Record, read_record
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MAX_STEPS = 1_000_000
 
@@ -21,10 +24,10 @@ MAX_STEPS = 1_000_000
 class LoadRamp(Record):
     """A load that ramps once: `initial + rate * clip(t - start, 0, duration)`, an injection in pu."""
 
-    initial: float
+    initial: Number
     start: NonNegative
     duration: NonNegative
-    rate: float
+    rate: Number
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
@@ -34,8 +37,8 @@ class LoadRamp(Record):
 class Initial(Record):
     """State at t = 0: generator power in pu and frequency deviation in rad/s, by bus."""
 
-    power: dict[Name, float]
-    omega: dict[Name, float]
+    power: dict[Name, Number]
+    omega: dict[Name, Number]
 
 
 class Instance(Record):
@@ -167,3 +170,26 @@ def load_instances(paths: Sequence[str | Path], case: Case | None = None) -> tup
     if case is None:
         raise InputError("instances", "", "no instance was given")
     return list(instances.values()), case
+
+
+def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
+    """One row per instance with everything that its file says.
+
+    Columns: `id, case, seed, horizon_s, dt_s` (the seed's parts joined by spaces), then by bus
+    `cost_<bus>`, `load_<bus>_initial` (pu), `_start` (s), `_duration` (s), `_rate` (pu/s), `P0_<bus>`
+    (initial power, pu) and `omega0_<bus>` (initial frequency deviation, rad/s).
+    """
+    import pandas as pd  # here only: loading instances does without it
+
+    rows = []
+    for instance in instances:
+        seed = instance.seed if isinstance(instance.seed, tuple) else (instance.seed,)
+        row: dict[str, Any] = {"id": instance.id, "case": instance.case, "seed": " ".join(map(str, seed))}
+        row |= {"horizon_s": instance.horizon_s, "dt_s": instance.dt_s}
+        row |= {f"cost_{bus}": value for bus, value in instance.cost.items()}
+        for bus, ramp in instance.load.items():
+            row |= {f"load_{bus}_{name}": value for name, value in ramp}
+        row |= {f"P0_{bus}": value for bus, value in instance.initial.power.items()}
+        row |= {f"omega0_{bus}": value for bus, value in instance.initial.omega.items()}
+        rows.append(row)
+    return pd.DataFrame(rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.integrate import RK45
@@ -12,6 +13,9 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.swing import Network, PowerFlowError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Local error control of the integrator; steps of one grid interval are well inside it.
 RTOL, ATOL = 1e-9, 1e-10
@@ -31,6 +35,25 @@ class Trajectory:
     p_gen: Array  # (n, n_gen), pu
     p_load: Array  # (n, n_load), pu
     p_slack: Array  # (n,), pu
+    case: Case
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row per grid point, columns named by bus in the case's order.
+
+        `t` (s); `P_<bus>` of the generators, then of the slack (pu); `L_<bus>` of the loads (injections,
+        pu); `omega_<bus>` of the generators (rad/s, deviation from nominal); `theta_<bus>` (rad,
+        relative to the slack).
+        """
+        import pandas as pd  # here only: the scorer does without it
+
+        case = self.case
+        columns = {"t": self.t}
+        columns |= {f"P_{bus}": values for bus, values in zip(case.generators, self.p_gen.T, strict=True)}
+        columns[f"P_{case.slack}"] = self.p_slack
+        columns |= {f"L_{bus}": values for bus, values in zip(case.loads, self.p_load.T, strict=True)}
+        columns |= {f"omega_{bus}": values for bus, values in zip(case.generators, self.omega.T, strict=True)}
+        columns |= {f"theta_{bus.id}": values for bus, values in zip(case.buses, self.theta.T, strict=True)}
+        return pd.DataFrame(columns)
 
 
 def simulate(case: Case, instance: Instance, schedule: Schedule) -> Trajectory:
@@ -95,6 +118,6 @@ def simulate_many(
         raise SimulationError(f"the system cannot follow this schedule: {error}") from None
     p_slack = network.injections(theta)[:, :, network.slack]
     return [
-        Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b])
+        Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b], case)
         for b in range(batch)
     ]

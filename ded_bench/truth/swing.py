@@ -170,7 +170,8 @@ def check_servable(case: Case, instance: Instance, source: str) -> None:
     try:
         network.initial_angles(instance)
     except PowerFlowError as error:
-        raise InputError(source, "load", f"initial loads and power cannot be served: {error}") from None
+        problem = f"initial loads and power cannot be served: {error}"
+        raise InputError(source, "load, initial.power", problem) from None
     kinks = {0.0, instance.horizon_s}
     for ramp in instance.load.values():
         kinks |= {ramp.start, ramp.start + ramp.duration}

@@ -28,7 +28,7 @@ from ded_bench.bench.figures import (
     worst_figure,
 )
 from ded_bench.bench.gallery import rollout
-from ded_bench.bench.metrics import GROUP
+from ded_bench.bench.metrics import GROUP, is_study, title
 from ded_bench.koopman.physics import linear_model
 from ded_bench.methods import METHODS
 from ded_bench.problem.case import Case
@@ -165,6 +165,9 @@ def test_methods_differ_in_colour_and_marker() -> None:
     assert len({marker(name) for name in names}) == len(names)
     assert dashes("ded") == ()
     assert dashes("ded", "other") != ()
+    for name in names:
+        settings = [slug for slug in METHODS[name].settings if not is_study(slug)]
+        assert len({dashes(name, slug) for slug in settings}) == min(len(settings), 7)
     assert colour("stranger") == colour("stranger")
 
 
@@ -185,7 +188,32 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
     assert markers[5.0].get_markerfacecolor() == colour("ded")
     assert [float(line.get_ydata()[0]) for line in right.get_lines() if line.get_marker() != "None"] == [3.0]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["DED", "ED [1s] *", "mine", "hollow: some infeasible"]
+    assert labels == ["DED", "ED *", "mine", "hollow: some infeasible"]
+    assert [text.get_text() for text in left.texts] == ["1s *"]
+    check_layout(figure, tmp_path)
+
+
+def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
+    """Every method with every setting it has: one entry each in the legend, which covers nothing."""
+    keys = [(name, settings) for name, method in METHODS.items() for settings in method.settings]
+    keys = [key for key in keys if not is_study(key[1])]
+    points = pd.DataFrame(
+        [
+            (regime, *key, title(*key), 100, 1.0, 0.01 * i, 10.0 ** (-i / 4), True)
+            for regime in ("NO", "TO")
+            for i, key in enumerate(keys)
+        ],
+        columns=[*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"],
+    )
+    figure = charts.tradeoff_figure(points)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [title(name) for name in METHODS]
+    assert len(figure.axes[0].texts) == len([key for key in keys if key[1] != "default"])
+    check_layout(figure, tmp_path)
+    profile = points.assign(ratio=1.0 + points["seconds"], fraction=1.0)
+    figure = charts.profile_figure(profile, profile)
+    assert len(figure.legends[0].get_texts()) == len(keys)
+    styles = {(line.get_color(), str(line._dash_pattern)) for line in figure.axes[0].get_lines()}  # type: ignore[attr-defined]
+    assert len(styles) == len(keys)
     check_layout(figure, tmp_path)
 
 

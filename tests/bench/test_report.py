@@ -19,6 +19,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ded_bench.bench import gallery
+from ded_bench.bench.certificate import Certificate, save_certificate
 from ded_bench.bench.layout import GAPS, TABLE_V, TABLE_VI
 from ded_bench.bench.page import Heading, Items, Picture, Table, Text, Warnings, render_html, render_markdown
 from ded_bench.bench.report import write_report
@@ -407,16 +408,37 @@ def test_broken_pieces_are_named_and_left_out(
 
 @pytest.mark.usefixtures("sketched")
 def test_certificate_is_shown(ninebus: Case, problems: Path, tmp_path: Path) -> None:
-    facts = {"m": 10000, "regimes": {"TO": {"clopper_pearson": 0.9912}}, "seeds": [2000000, 2000001]}
-    (tmp_path / "certificate.json").write_text(json.dumps(facts))
+    facts = {
+        "case": "9bus",
+        "method": "ded-dpc",
+        "reference": "ded-ko-knots",
+        "regime": "TO",
+        "settings": "default",
+        "seed": 2_000_000,
+        "count": 10_000,
+        "successes": 9_950,
+        "meets_limits": 9_960,
+        "near_reference": 9_970,
+        "tolerance_hz": 1e-6,
+        "tolerance_pu": 1e-8,
+        "gap_percent": 1.0,
+        "delta": 0.01,
+        "clopper_pearson": 0.9931,
+        "hoeffding": 0.9798,
+        "artifacts": "abc",
+        "version": "0",
+        "host": "here",
+        "date": "2026-01-01T00:00:00Z",
+    }
+    save_certificate(tmp_path, Certificate(**facts))
+    save_certificate(tmp_path, Certificate(**facts | {"regime": "NO"}))
+    save_certificate(tmp_path, Certificate(**facts | {"successes": 9_951}))
     write_report(ninebus, tmp_path, problems)
     text = (tmp_path / "report.md").read_text()
-    for line in (
-        "| m | 10000 |",
-        "| regimes TO clopper_pearson | 0.9912 |",
-        "| seeds | [2000000, 2000001] |",
-    ):
-        assert line in text
+    assert "at least 99.31% of fresh TO instances meet every limit" in text
+    assert "| TO | DED-DPC | 10000 | 9951 | 9960 | 9970 | 99.31 % | 97.98 % |" in text
+    assert "9950 of 10000" in text  # NO
+    assert text.count("of 10000 did") == 2  # the third replaced the first
 
 
 @pytest.mark.usefixtures("sketched")

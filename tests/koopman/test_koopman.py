@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.koopman.data import KINDS, sample_trajectories
+from ded_bench.koopman.data import KINDS, load_ramps, random_knots, sample_trajectories, trajectories
 from ded_bench.koopman.fit import (
     held_out,
     identify,
@@ -20,11 +20,19 @@ from ded_bench.koopman.fit import (
     unpack,
 )
 from ded_bench.koopman.model import Koopman, hat_functions
-from ded_bench.koopman.physics import EPSILON, energy_form, injection_lift, linear_model, steady_state
+from ded_bench.koopman.physics import (
+    EPSILON,
+    energy_form,
+    injection_lift,
+    linear_model,
+    single_sample,
+    steady_state,
+)
 from ded_bench.koopman.store import find_model, model_file
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.swing import Network
 
 KNOTS = 7
@@ -75,9 +83,6 @@ def test_energy_form_starts_at_the_linearisation(case: Case) -> None:
 
 def test_linear_model_is_exact_to_second_order(case: Case, quiet_instance, alter) -> None:
     """Small load ramps from the nominal point: halving them quarters the model's error."""
-    from ded_bench.koopman.data import load_ramps, trajectories
-    from ded_bench.problem.schedule import Schedule
-
     errors = []
     for size in (0.02, 0.01):
         ramps = {
@@ -90,6 +95,51 @@ def test_linear_model_is_exact_to_second_order(case: Case, quiet_instance, alter
         errors.append(np.abs(predict(linear_model(case), Network(case), data) - data.outputs).max())
     assert errors[0] < 1e-3
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
+    """Whole blocks of steps, a part of one, a single step; one ψ_0 for all and one for each."""
+    model = linear_model(case)
+    rng = np.random.default_rng(1)
+    n, n_in = model.b.shape
+    for n_points, batch, own in (
+        (1, (), True),
+        (2, (3,), True),
+        (77, (3,), False),
+        (201, (2, 3), True),
+    ):
+        psi = rng.normal(size=(*(batch if own else ()), n))
+        inputs = rng.normal(size=(n_points, *batch, n_in))
+        states = model.rollout(psi, inputs)
+        expected = np.broadcast_to(psi, states.shape[1:])
+        for i in range(n_points):
+            np.testing.assert_allclose(states[i], expected, atol=1e-10)
+            if i + 1 < n_points:
+                away = (expected - inputs[i] @ model.b.T) @ model.k.T
+                expected = away + inputs[i] @ model.b.T + (inputs[i + 1] - inputs[i]) @ model.g.T
+
+
+def test_single_sample_form_is_the_paper_s_and_agrees_to_half_a_step(case: Case) -> None:
+    """Same modes, equilibria and start as the first-order hold; one sample of the input, half a step off."""
+    hold, network = linear_model(case), Network(case)
+    single = single_sample(hold, case)
+    np.testing.assert_allclose(single.g, (np.eye(len(single.k)) - single.k) @ single.b, atol=1e-15)
+    n_gen = len(case.generators)
+    assert not single.k[:, : n_gen + 1].any()  # P_s of a load change does not depend on the old P_s
+    modes = np.sort_complex(np.linalg.eigvals(single.k))[n_gen + 1 :]
+    np.testing.assert_allclose(modes, np.sort_complex(np.linalg.eigvals(hold.k)), atol=1e-9)
+    errors = []
+    for part in (1.0, 0.5):
+        steps = case.sampling.model_copy(update={"dt_s": part * case.sampling.dt_s})
+        finer = case.model_copy(update={"sampling": steps})
+        hold = linear_model(finer)
+        instance = sample_instance(finer, KOOPMAN_SEED, 0).model_copy(update={"horizon_s": 8.0})
+        rng = np.random.default_rng(0)
+        schedule = Schedule(instance.grid, random_knots(finer, instance, rng))
+        data = trajectories(finer, [instance], [schedule], ["random knots"])
+        difference = predict(single_sample(hold, finer), network, data) - predict(hold, network, data)
+        errors.append(np.abs(difference).max())
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)  # first order in the step
 
 
 def test_condensed_rollout_equals_the_sequential_one(case: Case) -> None:

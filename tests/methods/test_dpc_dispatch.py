@@ -11,10 +11,10 @@ import torch
 
 from ded_bench.koopman.physics import linear_model
 from ded_bench.methods.dpc import ded_dpc_train
-from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, DispatchPolicy, prepare
+from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, SETTINGS, DispatchPolicy, prepare
 from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
 from ded_bench.methods.dpc.follower import Clip, Follow, follow
-from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
+from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.network import NumpyNetwork, ResidualNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
@@ -274,6 +274,45 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
     assert resumed.training["steps"] == whole.training["steps"]
 
 
+def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path) -> None:
+    """What was trained is what the file answers with, without the prior and blind to the dispatch."""
+    path = tmp_path / "v.safetensors"
+    options = {"width": 8, "dilations": (1, 2), "batch": 16, "rate": "constant", "epochs": 2}
+    policy = short_training(threebus, path, prior=False, blind=("dispatch",), **options)
+    assert policy.training["variant"] == {
+        "width": 8,
+        "dilations": (1, 2),
+        "batch": 16,
+        "rate": "constant",
+        "prior": False,
+        "blind": ("dispatch",),
+    }
+    loaded = DispatchPolicy.load(path, threebus, policy.scope.regime)
+    inputs = Inputs.of(threebus, some_instances(threebus, 4))
+    np.testing.assert_array_equal(loaded.powers(inputs), policy.powers(inputs))
+    channels = Channels.of(threebus, inputs, policy.knots)
+    sequence = torch.as_tensor(channels.sequence, dtype=torch.float32)
+    other = sequence.clone()
+    other[..., sequence_groups(threebus)["dispatch"]] += 0.3
+    constants = torch.as_tensor(channels.constants, dtype=torch.float32)
+    with torch.no_grad():
+        seen, unseen = policy.network(sequence, constants), policy.network(other, constants)
+    torch.testing.assert_close(seen, unseen)
+    correction = 0.5 * (threebus.p_max - threebus.p_min) * seen.double().numpy()[:, 1:]
+    targets = 0.5 * (threebus.p_min + threebus.p_max) + correction
+    expected = follow(np.clip(targets, threebus.p_min, threebus.p_max), inputs.p_initial, policy.step)
+    np.testing.assert_allclose(policy.powers(inputs), expected, atol=1e-5)  # NumPy twin in float32
+    with pytest.raises(TypeError, match="colour"):
+        short_training(threebus, path, colour="red")
+
+
+def test_every_setting_is_one_that_train_knows() -> None:
+    for slug, options in SETTINGS.items():
+        variant = {k: v for k, v in options.items() if k not in ("epochs", "fresh")}
+        changed = ded_dpc_train.Variant(**variant)
+        assert (changed == ded_dpc_train.Variant()) == (not variant), slug
+
+
 def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path) -> None:
     policy = short_training(threebus, tmp_path / "a.safetensors", epochs=10_000, seconds=0.5)
     assert 0.5 <= policy.training["seconds"] < 5.0
@@ -333,5 +372,5 @@ def test_policy_refuses_what_it_was_not_trained_for(
         DispatchPolicy.load(path, threebus, regime)
     broken.network.dilations = (1, 2)
     broken.save(path)
-    with pytest.raises(InputError, match=r"embed|spread|mix"):
+    with pytest.raises(InputError, match="width or depth"):
         DispatchPolicy.load(path, threebus, regime)

@@ -35,6 +35,7 @@ def still(case, instance) -> Trajectory:
         p_gen=np.tile(case.p_nominal, (N, 1)),
         p_load=np.tile(case.load_nominal, (N, 1)),
         p_slack=np.full(N, 0.4),
+        case=case,
     )
 
 

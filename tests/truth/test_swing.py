@@ -303,7 +303,7 @@ def _ramp(case, **changes):
 def test_check_servable_names_source_and_field(case, quiet_instance):
     """Too much load at the start, at the end of a ramp, or at the horizon; what lies beyond is no matter."""
     too_much = quiet_instance(case, load=_ramp(case, initial=-40.0))
-    with pytest.raises(InputError, match=r"my\.json: load: initial loads and power cannot be served"):
+    with pytest.raises(InputError, match=r"my\.json: load, initial\.power: initial loads and power cannot"):
         check_servable(case, too_much, "my.json")
     ramps_up = quiet_instance(case, load=_ramp(case, rate=-20.0))
     with pytest.raises(InputError, match=r"my\.json: load: loads at t = 3 s cannot be served"):

@@ -38,9 +38,27 @@ N_KNOTS = 50
 MAX_WIDTH = 4096
 #: Instances worked on at once: what is computed on the way stays in a core's cache.
 CHUNK = 32
-#: What the policy was trained on: fresh instances, or the benchmark's 400 training instances alone.
-#: Values are options of `ded_dpc_train.train`; both take about the same number of steps.
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "train400": {"fresh": 0, "epochs": 8000}}
+#: Short trainings, for comparison with each other only: each `study-…` changes one thing of `study`.
+STUDY: dict[str, Any] = {"epochs": 6}
+#: What the policy was trained on and how, by slug; values are options of `ded_dpc_train.train`.
+#: `train400` sees nothing but the benchmark's training instances, in about as many steps.
+SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "train400": {"fresh": 0, "epochs": 6000},
+    "study": STUDY,
+    "study-narrow": STUDY | {"width": 16},
+    "study-wide": STUDY | {"width": 64},
+    "study-near": STUDY | {"dilations": (1, 1, 1, 1, 1, 1)},
+    "study-shallow": STUDY | {"dilations": (2, 8)},
+    "study-no-dispatch": STUDY | {"blind": ("dispatch",)},
+    "study-no-bends": STUDY | {"blind": ("bends",)},
+    "study-no-prior": STUDY | {"prior": False},
+    "study-raw": STUDY | {"normalise": False},
+    "study-constant": STUDY | {"rate": "constant"},
+    "study-batch32": STUDY | {"batch": 32},
+    "study-batch512": STUDY | {"batch": 512},
+    "study-fresh4000": {"epochs": 96, "fresh": 4000},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +105,7 @@ class DispatchPolicy:
     def _targets(self, inputs: Inputs) -> Array:
         """Corrected dispatch at all knots but the first, within bounds."""
         case = self.scope.case
-        channels = Channels.of(case, inputs, self.knots)
+        channels = Channels.of(case, inputs, self.knots).with_prior(case, self.training.get("prior", True))
         half = 0.5 * (case.p_max - case.p_min)
         targets = channels.prior[:, 1:] + half * self._numpy(channels)[:, 1:]
         return np.minimum(np.maximum(targets, case.p_min), case.p_max)
@@ -122,6 +140,11 @@ class DispatchPolicy:
             raise InputError(path, "training", "lacks the network's width and dilations")
         if not all(isinstance(d, int) and 0 < d < N_KNOTS for d in dilations):
             raise InputError(path, "training", "has dilations that are no numbers of knots")
+        layers = sum(name.startswith("mix.") and name.endswith(".bias") for name in arrays)
+        if len(dilations) != layers or arrays.get("first.bias", np.zeros(0)).shape != (width,):
+            raise InputError(path, "training", "has another width or depth than the weights")
+        if not isinstance(training.get("prior", True), bool):
+            raise InputError(path, "training", "has a prior that is neither true nor false")
         network = ResidualNetwork.make(case, width, tuple(dilations))
         load_weights(network, arrays, path)
         return DispatchPolicy(scope, network.eval(), training)

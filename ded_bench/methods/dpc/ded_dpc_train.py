@@ -7,7 +7,7 @@ import io
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from ded_bench.methods.dpc.ded_dpc import METHOD, N_KNOTS, DispatchPolicy
 from ded_bench.methods.dpc.follower import Clip, Follow
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import ResidualNetwork
+from ded_bench.methods.dpc.network import DILATIONS, WIDTH, ResidualNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.store import Scope
+from ded_bench.methods.dpc.store import Scope, reading_checkpoint
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
@@ -32,8 +32,8 @@ from ded_bench.problem.strict import write_atomically
 from ded_bench.truth.swing import Network
 
 #: Fresh instances, epochs over them, batch size.
-FRESH, EPOCHS, BATCH = 64_000, 40, 64
-LEARNING_RATE, WEIGHT_DECAY, CLIP_NORM = 2e-3, 1e-4, 1.0
+FRESH, EPOCHS, BATCH = 64_000, 32, 128
+LEARNING_RATE, WEIGHT_DECAY, CLIP_NORM = 6e-3, 1e-4, 1.0
 #: Fractions of the training: warm-up of the learning rate, then a cosine down to `LAST` of it.
 WARM_UP, LAST = 0.02, 1e-3
 AVERAGE = 0.998  # of the weights, exponentially
@@ -43,7 +43,7 @@ MARGIN = 0.02
 #: exact penalty, above nearly all of the optimum's multipliers. It grows from the first to the second.
 PRICE = (0.01, 0.04)
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
-DOUBLING = 0.03
+DOUBLING = 0.02
 #: The part of the instances with the largest excess is seen this many times more in the next epoch.
 HARD, REPEATS = 0.02, 5
 #: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per point.
@@ -54,6 +54,19 @@ HELD_OUT = 0.2
 FRESH_PER_SECOND = 200
 REPORTS = 40
 PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history", "penalty")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What the ablation study changes of network and training, one at a time."""
+
+    width: int = WIDTH
+    dilations: tuple[int, ...] = DILATIONS
+    batch: int = BATCH
+    rate: str = "cosine"  # or "constant": of the learning rate, after its warm-up
+    prior: bool = True  # corrections of the static dispatch, or powers from the middle of their range
+    blind: tuple[str, ...] = ()  # groups of channels that the network does not see
+    normalise: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +146,7 @@ def train(
     device: str = "cpu",
     resume: bool = False,
     fresh: int = FRESH,
+    **variant: Any,
 ) -> DispatchPolicy:
     """Train a policy.
 
@@ -145,7 +159,9 @@ def train(
         seconds: training time after which to end, with the schedule of the learning rate fitted to it.
         resume: go on from the checkpoint if there is one.
         fresh: how many instances to draw; 0 trains on four fifths of those given.
+        variant: fields of `Variant`.
     """
+    chosen = Variant(**variant)
     first = instances[0]
     scope = Scope(case, regime, first.horizon_s)
     knots = knot_times(first.horizon_s, N_KNOTS)
@@ -161,7 +177,7 @@ def train(
         held_out = [instances[i] for i in order[:n_held]]
         drawn = [instances[i] for i in order[n_held:]] or held_out
     inputs = [Inputs.of(case, part) for part in (drawn, held_out)]
-    channels = [Channels.of(case, part, knots) for part in inputs]
+    channels = [Channels.of(case, part, knots).with_prior(case, chosen.prior) for part in inputs]
     free = [coarse_free_response(Network(case), model, part, first.grid, stride) for part in inputs]
     data, check = (
         Pool.of(case, c, i, f, len(first.grid)).to(device)
@@ -177,10 +193,12 @@ def train(
     )
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        network = ResidualNetwork.make(case)
-    network.normalise(channels[0])
+        network = ResidualNetwork.make(case, chosen.width, chosen.dilations)
+    if chosen.normalise:
+        network.normalise(channels[0])
+    network.hide(case, chosen.blind)
     network.to(device)
-    run = _Run(network, loss, generator, out.with_suffix(".checkpoint.pt"), len(data))
+    run = _Run(network, loss, generator, chosen, out.with_suffix(".checkpoint.pt"), len(data))
     if resume:
         run.load(device)
     run.go(data, check, epochs, seconds, f"{METHOD} {regime}")
@@ -196,6 +214,8 @@ def train(
         "held_out": len(check),
         "held_out_loss": run.best,
         "parameters": sum(p.numel() for p in network.parameters()),
+        "prior": chosen.prior,
+        "variant": {k: v for k, v in asdict(chosen).items() if v != getattr(Variant(), k)},
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
         "torch": torch.__version__,
@@ -215,13 +235,15 @@ class _Run:
         network: ResidualNetwork,
         loss: Loss,
         generator: torch.Generator,
+        variant: Variant,
         checkpoint: Path,
         n_data: int,
     ) -> None:
         self.network, self.loss, self.generator, self.checkpoint = network, loss, generator, checkpoint
+        self.variant = variant
         self.average = copy.deepcopy(network)
         self.optimiser = torch.optim.AdamW(
-            network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99)
+            network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99), fused=True
         )
         self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
         self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
@@ -234,7 +256,7 @@ class _Run:
         progress = self.epoch / epochs
         with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
             while progress < 1.0:
-                batches = torch.split(self._order(), BATCH)
+                batches = torch.split(self._order(), self.variant.batch)
                 for i, rows in enumerate(batches, start=1):
                     self._update(data, rows, progress)
                     self.spent, self.busy = time.perf_counter() - started, time.process_time() - busy
@@ -256,7 +278,8 @@ class _Run:
         return rows[torch.randperm(len(rows), generator=self.generator)]
 
     def _update(self, data: Pool, rows: Tensor, progress: float) -> None:
-        rate = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
+        falling = 0.5 * (1.0 + math.cos(math.pi * progress)) if self.variant.rate == "cosine" else 1.0
+        rate = LAST + (1.0 - LAST) * falling
         for group in self.optimiser.param_groups:
             group["lr"] = LEARNING_RATE * rate * min(1.0, 0.05 + progress / WARM_UP)
         batch = data[rows.to(data.prior.device)]
@@ -267,13 +290,12 @@ class _Run:
         self.penalty[rows] = penalty.detach().cpu()
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM, foreach=True)
         self.optimiser.step()
         self.step += 1
         keep = min(AVERAGE, 1.0 - 1.0 / (1.0 + self.step / 10.0))
         with torch.no_grad():
-            for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(now, 1.0 - keep)
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - keep)
 
     def _validate(self, check: Pool) -> dict[str, float]:
         with torch.no_grad():
@@ -307,13 +329,14 @@ class _Run:
         """Go on from the checkpoint, if there is one."""
         if not self.checkpoint.is_file():
             return
-        state = torch.load(self.checkpoint, weights_only=True, map_location=device)
-        for name in ("network", "average", "optimiser"):
-            getattr(self, name).load_state_dict(state[name])
-        for name in PROGRESS:
-            setattr(self, name, state[name])
-        self.penalty = self.penalty.cpu()
-        self.generator.set_state(state["generator"].cpu())
+        with reading_checkpoint(self.checkpoint):
+            state = torch.load(self.checkpoint, weights_only=True, map_location=device)
+            for name in ("network", "average", "optimiser"):
+                getattr(self, name).load_state_dict(state[name])
+            for name in PROGRESS:
+                setattr(self, name, state[name])
+            self.penalty = self.penalty.cpu()
+            self.generator.set_state(state["generator"].cpu())
 
 
 def _penalty(excess: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ class Channels:
 
     sequence: Array  # (batch, n_knots, n_sequence)
     constants: Array  # (batch, n_constants)
-    prior: Array  # static dispatch of the loads at each knot, (batch, n_knots, n_gen), pu
+    prior: Array  # static dispatch of the loads at each knot, (batch, n_knots, n_gen), pu; is corrected
 
     @staticmethod
     def of(case: Case, inputs: Inputs, knots: Array) -> Channels:
@@ -81,10 +81,16 @@ class Channels:
         sequence = np.concatenate([p_load, bend, prior, p_slack[:, :, None]], axis=-1)
         return Channels(sequence, np.concatenate(constants, axis=1), prior)
 
+    def with_prior(self, case: Case, dispatch: bool) -> Channels:
+        """The same channels, with the static dispatch or the middle of the range as what is corrected."""
+        middle = np.broadcast_to(0.5 * (case.p_min + case.p_max), self.prior.shape)
+        return self if dispatch else Channels(self.sequence, self.constants, middle)
+
     def static_cost(self, inputs: Inputs) -> Array:
         """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""
         p_slack = self.sequence[:, :, -1]
-        cost = self.prior @ inputs.cost[:, 1:, None]
+        n_gen = inputs.cost.shape[1] - 1
+        cost = self.sequence[:, :, -1 - n_gen : -1] @ inputs.cost[:, 1:, None]
         return np.asarray((cost[:, :, 0] + inputs.cost[:, :1] * np.abs(p_slack)).mean(axis=1))
 
 
@@ -92,6 +98,16 @@ def n_channels(case: Case) -> tuple[int, int]:
     """Number of sequence channels and of constants."""
     n_gen, n_load = len(case.generators), len(case.loads)
     return 2 * n_load + n_gen + 1, (1 + n_gen) + n_gen + n_gen * (n_gen - 1) // 2 + 2 * n_gen
+
+
+def sequence_groups(case: Case) -> dict[str, slice]:
+    """Where in the sequence which channels stand."""
+    n_gen, n_load = len(case.generators), len(case.loads)
+    return {
+        "loads": slice(0, n_load),
+        "bends": slice(n_load, 2 * n_load),
+        "dispatch": slice(2 * n_load, 2 * n_load + n_gen + 1),
+    }
 
 
 def _loads_and_bends(inputs: Inputs, knots: Array) -> tuple[Array, Array]:

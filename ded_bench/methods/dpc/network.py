@@ -7,19 +7,23 @@ in a tenth of a millisecond, where torch's overhead per layer would dominate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ded_bench.methods.dpc.inputs import Channels, n_channels
+from ded_bench.methods.dpc.inputs import Channels, n_channels, sequence_groups
 from ded_bench.problem.case import Array, Case
 
 Array32 = NDArray[np.float32]
 #: With windows of three these dilations reach 31 knots to either side.
 DILATIONS = (1, 2, 4, 8, 16, 1)
 WIDTH, EMBEDDING = 32, 64
+#: Channels divided by this are no input any more.
+HIDDEN_SCALE = 1e30
 
 
 class ResidualNetwork(nn.Module):
@@ -66,6 +70,11 @@ class ResidualNetwork(nn.Module):
             values = getattr(channels, name).reshape(-1, getattr(channels, name).shape[-1])
             getattr(self, f"{name}_mean").copy_(torch.as_tensor(values.mean(axis=0)))
             getattr(self, f"{name}_scale").copy_(torch.as_tensor(values.std(axis=0)).clamp_min(1e-6))
+
+    def hide(self, case: Case, groups: Sequence[str]) -> None:
+        """Scale groups of sequence channels to nothing (see `inputs.sequence_groups`)."""
+        for name in groups:
+            self.sequence_scale[sequence_groups(case)[name]] = HIDDEN_SCALE
 
     def forward(self, sequence: Tensor, constants: Tensor) -> Tensor:
         """Corrections, shape (batch, n_knots, n_gen), from `Channels` in float32."""

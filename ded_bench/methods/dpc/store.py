@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,9 +77,10 @@ def read_policy(
     }
     for name, value in wanted.items():
         if header.get(name) != value:
-            raise InputError(path, name, f"is {header.get(name)!r}, but {value!r} is needed")
+            raise InputError(path, name, f"is {str(header.get(name))[:60]!r}, but {value!r} is needed")
     horizon, training = header.get("horizon_s"), header.get("training")
-    if not isinstance(horizon, (int, float)) or not horizon > 0 or not isinstance(training, dict):
+    finite = isinstance(horizon, (int, float)) and 0 < horizon < float("inf")
+    if horizon is None or not finite or not isinstance(training, dict):
         raise InputError(path, "horizon_s, training", "missing or mistyped")
     return arrays, Scope(case, regime, float(horizon)), training
 
@@ -90,6 +92,20 @@ def load_weights(network: nn.Module, arrays: dict[str, np.ndarray], path: str | 
         if name not in arrays or arrays[name].shape != expected.get(name):
             raise InputError(path, name, "is missing, unknown or has the wrong shape")
     network.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
+
+
+@contextlib.contextmanager
+def reading_checkpoint(path: Path) -> Iterator[None]:
+    """Whatever fails inside, from opening the file to filling the networks, is the checkpoint's fault.
+
+    Raises:
+        InputError: it is no checkpoint, or one of another training.
+    """
+    try:
+        yield
+    except Exception:  # of pickle, zipfile and torch alike
+        problem = "is no checkpoint of this training; remove it, or train without --resume"
+        raise InputError(path, "", problem) from None
 
 
 def weights_fingerprint(network: nn.Module) -> str:

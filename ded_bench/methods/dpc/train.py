@@ -20,6 +20,7 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.features import Features
 from ded_bench.methods.dpc.loss import Condensed, knot_times, loss_terms
 from ded_bench.methods.dpc.policy import METHOD, N_KNOTS, PaperNetwork, Policy, n_channels
+from ded_bench.methods.dpc.store import reading_checkpoint
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.strict import write_atomically
@@ -131,13 +132,14 @@ def train(
     epoch, spent = 0, 0.0
     checkpoint = out.with_suffix(".checkpoint.pt")
     if resume and checkpoint.is_file():
-        state = torch.load(checkpoint, weights_only=True, map_location=device)
-        network.load_state_dict(state["network"])
-        averaged.load_state_dict(state["averaged"])
-        optimiser.load_state_dict(state["optimiser"])
-        generator.set_state(state["generator"].cpu())
-        best, best_weights = state["best"], state["best_weights"]
-        epoch, spent, history = state["epoch"], state["spent"], state["history"]
+        with reading_checkpoint(checkpoint):
+            state = torch.load(checkpoint, weights_only=True, map_location=device)
+            network.load_state_dict(state["network"])
+            averaged.load_state_dict(state["averaged"])
+            optimiser.load_state_dict(state["optimiser"])
+            generator.set_state(state["generator"].cpu())
+            best, best_weights = state["best"], state["best_weights"]
+            epoch, spent, history = state["epoch"], state["spent"], state["history"]
 
     started = time.perf_counter() - spent
     with tqdm(total=epochs, initial=epoch, unit="epoch", disable=None, desc=f"{METHOD} {regime}") as bar:

@@ -1,0 +1,174 @@
+"""Full DED as a short sequence of linear programs: the same discretised problem as `ded`, solved faster.
+
+Given the generators' angles, the loads fix all others, so that the paper's eq. (DED_OG) under backward
+Euler has one nonlinear part: f at the generators and the slack bus. It is linearised along the last
+trajectory, exactly in the loads, and a linear program without the other angles is solved; where
+f is met to `TOLERANCE` the trajectory meets the optimality conditions of the nonlinear program, since then
+both programs have the same derivatives there. Newton's convergence makes that two to four programs.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from ded_bench.methods.linear import FreeForm
+from ded_bench.methods.outcome import Outcome
+from ded_bench.methods.solution import Status
+from ded_bench.methods.solvers import solve_form
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.swing import Network, PowerFlowError
+
+#: Mismatch of the nonlinear equations that ends the sequence, pu: IPOPT's tolerance for the same ones.
+TOLERANCE = 1e-8
+#: A sequence that is longer does not converge.
+MAX_PROGRAMS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Injections:
+    """f at generators and slack along a trajectory, with derivatives for the generators' angles."""
+
+    f: Array  # (n, n_gen + 1), pu; the slack last
+    slope: Array  # (n, n_gen + 1, n_gen), pu/rad
+
+
+def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injections:
+    """f and its total derivative, angles of the other buses eliminated by the loads (index 1).
+
+    Args:
+        network: the network.
+        theta_gen: angles of the generators, shape (n, n_gen), rad.
+        p_load: load injections, shape (n, n_load), pu.
+
+    Raises:
+        PowerFlowError: the loads cannot be served at these angles.
+    """
+    gen, alg = network.generators, network.algebraic
+    theta = np.zeros((len(theta_gen), network.n_bus))
+    theta[:, gen] = theta_gen
+    theta = network.solve_loads(theta, network.load_injections(p_load))
+    weights = network.coupling * np.cos(theta @ network.incidence.T)
+    full = np.einsum("li,nl,lj->nij", network.incidence, weights, network.incidence, optimize=True)
+    rows = np.append(gen, network.slack)
+    moved = np.linalg.solve(full[:, alg[:, None], alg], full[:, alg[:, None], gen])
+    slope = full[:, rows[:, None], gen] - full[:, rows[:, None], alg] @ moved
+    return Injections(network.injections(theta)[:, rows], slope)
+
+
+class SequentialDed:
+    """The linear programs of one case, regime and grid: a fixed pattern of rows and columns.
+
+    Columns at every t_k, k > 0: θ, ω and power of the generators, P_s up and down. Equations at every t_k:
+
+        (θ_k - θ_{k-1}) / dt - ω_k = 0
+        M (ω_k - ω_{k-1}) / dt + D ω_k - P_k + f(θ_k) = 0
+        P_s,up - P_s,down - f_s(θ_k) = 0
+    """
+
+    def __init__(self, case: Case, regime: str, steps: int, dt: float) -> None:
+        self._case, self._network, self._steps, self._dt = case, Network(case), steps, dt
+        n_gen = len(case.generators)
+        column = np.arange(steps * (3 * n_gen + 2)).reshape(steps, -1)
+        theta, omega, p_gen = (column[:, i * n_gen : (i + 1) * n_gen] for i in range(3))
+        row = np.arange(steps * (2 * n_gen + 1)).reshape(steps, -1)
+        eq_angle, eq_swing, served = row[:, :n_gen], row[:, n_gen:-1], row[:, n_gen:]
+        one, m_dt = np.ones((steps, n_gen)), self._network.m / dt
+        constant = [
+            (eq_angle, theta, one / dt),
+            (eq_angle[1:], theta[:-1], -one[1:] / dt),
+            (eq_angle, omega, -one),
+            (eq_swing, omega, one * (m_dt + self._network.d)),
+            (eq_swing[1:], omega[:-1], -one[1:] * m_dt),
+            (eq_swing, p_gen, -one),
+            (row[:, -1], column[:, -2], one[:, 0]),
+            (row[:, -1], column[:, -1], -one[:, 0]),
+        ]
+        # Every program has new slopes of f for the angle of every generator.
+        shape = (steps, n_gen + 1, n_gen)
+        slopes = (np.broadcast_to(served[:, :, None], shape), np.broadcast_to(theta[:, None], shape))
+        self._rows, self._columns = (
+            np.concatenate([*(part[i].ravel() for part in constant), slopes[i].ravel()]) for i in (0, 1)
+        )
+        self._constant = np.concatenate([part[2].ravel() for part in constant])
+        self._sign = np.append(np.ones(n_gen), -1.0)
+        self._theta, self._p_gen, self._row, self._shape = theta, p_gen, row, (row.size, column.size)
+        difference = sp.eye(steps, format="csr") - sp.eye(steps, k=-1, format="csr")
+        pick = sp.csr_matrix((one.ravel(), (np.arange(one.size), p_gen.ravel())), (one.size, column.size))
+        self._ramps = sp.csc_matrix(sp.kron(difference / dt, sp.eye(n_gen)) @ pick)
+        endless, limit = np.full(n_gen, np.inf), np.full(n_gen, case.omega_bound(regime))
+        self._lower = np.tile(np.concatenate([-endless, -limit, case.p_min, np.zeros(2)]), steps)
+        self._upper = np.tile(np.concatenate([endless, limit, case.p_max, np.full(2, np.inf)]), steps)
+
+    def solve(self, instance: Instance, time_limit_s: float | None = None) -> tuple[Outcome, Schedule | None]:
+        """Solve one instance from the state at t = 0 held for the whole horizon.
+
+        Returns:
+            `Optimal` with a schedule, `TimeLimit`, or `Failed` if a program has no solution or the sequence
+            does not converge, which says nothing about the instance.
+        """
+        started = time.perf_counter()
+        case, network = self._case, self._network
+        load = instance.p_load(case)
+        initial = network.initial_angles(instance)[network.generators]
+        theta, iterations, message = np.tile(initial, (len(load), 1)), 0, "no convergence"
+        status, schedule, objective = Status.FAILED, None, None
+        version = ""
+        try:
+            along = injections_along(network, theta, load)
+            for _ in range(MAX_PROGRAMS):
+                if time_limit_s is not None and time.perf_counter() - started > time_limit_s:
+                    status, message = Status.TIME_LIMIT, "the time limit passed between two programs"
+                    break
+                answer = solve_form(self._program(instance, theta, along))
+                iterations, version, message = iterations + answer.iterations, answer.version, answer.message
+                if answer.x is None:
+                    break
+                moved = np.vstack([initial, answer.x[self._theta]])
+                predicted = along.f + np.einsum("nij,nj->ni", along.slope, moved - theta)
+                theta, along = moved, injections_along(network, moved, load)
+                if np.abs(along.f - predicted).max() < TOLERANCE:
+                    power = np.vstack([instance.p_initial(case), answer.x[self._p_gen]])
+                    status, schedule = Status.OPTIMAL, Schedule(t=instance.grid, p=power)
+                    cost = power @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(
+                        along.f[:, -1]
+                    )
+                    objective = float(cost.sum())
+                    break
+                message = "no convergence"
+        except PowerFlowError as error:
+            message = str(error)
+        elapsed = time.perf_counter() - started
+        has_values = schedule is not None
+        outcome = Outcome(status, has_values, iterations, 0.0, elapsed, objective, version, message)
+        return outcome, schedule
+
+    def _program(self, instance: Instance, theta: Array, along: Injections) -> FreeForm:
+        """The linear program around a trajectory of angles, shape (n, n_gen)."""
+        case, dt, n_gen = self._case, self._dt, len(self._case.generators)
+        values = np.concatenate([self._constant, (along.slope[1:] * self._sign[:, None]).ravel()])
+        equal = sp.csc_matrix((values, (self._rows, self._columns)), shape=self._shape)
+        offset = np.einsum("nij,nj->ni", along.slope[1:], theta[1:]) - along.f[1:]
+        right = np.zeros(self._row.shape)
+        right[:, n_gen:] = offset * self._sign
+        right[0, :n_gen] += theta[0] / dt
+        right[0, n_gen:-1] += self._network.m / dt * instance.omega_initial(case)
+        limit = np.full((self._steps, n_gen), case.ramp_pu_per_s)
+        start = np.zeros_like(limit)
+        start[0] = instance.p_initial(case) / dt
+        prices = [np.zeros(2 * n_gen), instance.cost_gen(case), np.full(2, instance.cost_slack(case))]
+        return FreeForm(
+            cost=np.tile(np.concatenate(prices), self._steps),
+            equal=equal,
+            right=right.ravel(),
+            between=self._ramps,
+            low=(start - limit).ravel(),
+            high=(start + limit).ravel(),
+            lower=self._lower,
+            upper=self._upper,
+        )

@@ -1,0 +1,74 @@
+"""Traditional dispatch: static economic dispatch at intervals, followed at the ramp limit.
+
+What operators do without DED: every interval the generators get the merit order's set-points for
+the interval's mean forecast load and move to them as fast as they may. The swing bus takes what
+is missing. Frequency limits play no role in it.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+
+#: Seconds from one dispatch to the next by settings slug; by default one serves a whole minute.
+SETTINGS = {"default": 60.0, "10s": 10.0, "1s": 1.0}
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return a dispatcher of single instances; both regimes get the same schedules."""
+    case.check_regimes([regime])
+    interval_s = SETTINGS[settings.name]
+
+    def solve(instance: Instance) -> Solution:
+        started = time.perf_counter()
+        schedule = dispatch(case, instance, interval_s)
+        return Solution(Status.FEASIBLE, schedule, solve_s=time.perf_counter() - started)
+
+    return solve
+
+
+def dispatch(case: Case, instance: Instance, interval_s: float) -> Schedule:
+    """Static dispatch (the paper's P_opt) of the mean load of every interval, reached from P_0.
+
+    Args:
+        interval_s: time between dispatches, s; the last interval ends with the horizon.
+
+    Returns:
+        A schedule on the instance's grid. It starts at P_0 and moves by at most the ramp limit;
+        it is within the generator bounds if P_0 is.
+    """
+    starts, ends = _intervals(instance, interval_s)
+    load = instance.p_load(case)
+    # Loads are linear between grid points, so that the trapezoidal rule gives their exact mean.
+    mean = [np.trapezoid(load[a : b + 1], axis=0) / (b - a) for a, b in zip(starts, ends, strict=True)]
+    prices = instance.cost_gen(case), instance.cost_slack(case)
+    return follow(case, instance, merit_order(case, *prices, np.stack(mean)), interval_s)
+
+
+def follow(case: Case, instance: Instance, targets: Array, interval_s: float) -> Schedule:
+    """Move from P_0 to one set-point after another, as fast as the ramp limit lets.
+
+    Args:
+        targets: set-points of the intervals, shape (n_intervals, n_gen), pu.
+        interval_s: time between set-points, s.
+    """
+    grid = instance.grid
+    power = np.empty((len(grid), len(case.generators)))
+    power[0] = instance.p_initial(case)
+    for target, a, b in zip(targets, *_intervals(instance, interval_s), strict=True):
+        reach = case.ramp_pu_per_s * (grid[a + 1 : b + 1, None] - grid[a])
+        power[a + 1 : b + 1] = power[a] + np.clip(target - power[a], -reach, reach)
+    return Schedule(t=grid, p=power)
+
+
+def _intervals(instance: Instance, interval_s: float) -> tuple[list[int], list[int]]:
+    """Grid indices at which intervals start and end; none is shorter than a step of the grid."""
+    starts = list(range(0, instance.steps, max(round(interval_s / instance.dt_s), 1)))
+    return starts, [*starts[1:], instance.steps]

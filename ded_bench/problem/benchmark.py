@@ -1,0 +1,76 @@
+"""Selection: which instances of a benchmark are meant, by split or by file, and of which version they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.instance import Instance, load_instances
+from ded_bench.problem.sampling import load_manifest, load_split
+
+SplitName = Literal["test", "train", "all"]
+#: What `--split` may say.
+SPLITS: tuple[str, ...] = get_args(SplitName)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Instances of one case, each with its split (`train`, `test` or `none`)."""
+
+    case: Case
+    instances: tuple[tuple[Instance, str], ...]
+    version: str  # of the problem files, from their manifest; empty without one
+
+
+def problem_folder(name: str | Path, case: Case) -> Path:
+    """The folder that holds a case's instances: the one given, or that of the shipped case."""
+    path = Path(name)
+    if path.is_dir():
+        return path
+    return path.parent if path.is_file() else SHIPPED_CASES / case.id
+
+
+def select_split(name: str | Path, split: str = "test", limit: int | None = None) -> Selection:
+    """Choose the first `limit` instances of a split, in the order of their ids.
+
+    Args:
+        name: a shipped case, a benchmark's folder, or its case.json.
+        split: `test`, `train` or `all`.
+
+    Raises:
+        InputError: there is no such case or split, or a file is missing or wrong.
+    """
+    case = Case.load(name)
+    folder = problem_folder(name, case)
+    known = load_split(folder)
+    named = {"train": known.train, "test": known.test, "all": known.train + known.test}
+    if split not in named:
+        raise InputError("split", split, f"is not one of {', '.join(SPLITS)}")
+    ids = sorted(named[split])[:limit]
+    instances, case = load_instances([folder / "instances" / f"{i}.json" for i in ids], case)
+    return _selection(case, instances, folder)
+
+
+def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selection:
+    """Choose the instances of these files; the split is that of the benchmark around the first one.
+
+    Raises:
+        InputError: a file is missing or wrong, or the instances do not share one case.
+    """
+    instances, case = load_instances(paths, case)
+    return _selection(case, instances, Path(paths[0]).resolve().parent.parent)
+
+
+def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selection:
+    train: Sequence[str] = ()
+    test: Sequence[str] = ()
+    if (folder / "split.json").is_file():
+        split = load_split(folder)
+        train, test = split.train, split.test
+    manifest = load_manifest(folder)
+    named = [(i, "train" if i.id in train else "test" if i.id in test else "none") for i in instances]
+    return Selection(case, tuple(named), manifest.version if manifest else "")

@@ -1,0 +1,195 @@
+"""DED by collocation: points and weights, kinks, order of accuracy, limits on the true system."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyomo.environ as pyo
+import pytest
+
+from ded_bench.methods import get_method
+from ded_bench.methods.ded_radau import (
+    BETWEEN,
+    POINTS,
+    WEIGHTS,
+    build_ded_radau,
+    collocation_points,
+    element_count,
+    element_ends,
+    lagrange,
+    point_times,
+    prepare,
+    schedule_of,
+    set_instance,
+)
+from ded_bench.methods.solution import Settings, Status
+from ded_bench.methods.solvers import CasadiIpopt
+from ded_bench.problem.case import Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.score import score
+from ded_bench.truth.simulate import simulate
+
+HORIZON = 2.0
+
+
+def short(case: Case, index: int, **changes) -> Instance:
+    return sample_instance(case, 77, index).model_copy(update={"horizon_s": HORIZON, **changes})
+
+
+def ramping(case: Case, quiet_instance, start: float = 0.5, duration: float = 0.8, **changes) -> Instance:
+    """Every load rises by 0.05 pu/s for a while, inside of `HORIZON`."""
+    load = {
+        bus: {"initial": nominal, "start": start, "duration": duration, "rate": -0.05}
+        for bus, nominal in zip(case.loads, case.load_nominal.tolist(), strict=True)
+    }
+    return quiet_instance(case, **{"horizon_s": HORIZON, "load": load} | changes)
+
+
+def with_inputs(case: Case, instance: Instance, elements: int, schedule: Schedule) -> pyo.ConcreteModel:
+    """The model solved with its generator powers fixed and its frequencies free."""
+    model = build_ded_radau(case, elements)
+    set_instance(model, case, instance, "NO")
+    times = instance.grid[element_ends(case, instance, elements)]
+    for j, g in enumerate(case.generators):
+        for end, value in zip(model.end, schedule.at(times)[:, j].tolist(), strict=True):
+            model.p_gen[g, end].setlb(value)
+            model.p_gen[g, end].setub(value)
+            model.p_gen[g, end].set_value(value)
+        for tau in list(model.tau)[1:]:
+            model.omega[g, tau].setlb(None)
+            model.omega[g, tau].setub(None)
+    assert CasadiIpopt(model).solve().status == Status.OPTIMAL
+    return model
+
+
+def test_points_and_weights_are_radaus(threebus: Case) -> None:
+    """They are Pyomo's, and integrate polynomials up to degree 4 exactly."""
+    model = build_ded_radau(threebus, 2)
+    info = model.tau.get_discretization_info()
+    np.testing.assert_allclose(info["tau_points"], [0.0, *POINTS], atol=1e-12)
+    for degree in range(5):
+        assert np.dot(WEIGHTS, np.power(POINTS, degree)) == pytest.approx(1 / (degree + 1), abs=1e-15)
+    assert np.dot(WEIGHTS, np.power(POINTS, 5)) != pytest.approx(1 / 6, abs=1e-4)
+    for tau, (e, c) in collocation_points(model).items():
+        assert tau == pytest.approx(e - 1 + c, abs=1e-6)
+
+
+def test_elements_end_where_loads_kink(ninebus: Case) -> None:
+    for index in range(20):
+        instance = sample_instance(ninebus, 77, index)
+        count = element_count(ninebus, instance, 0.25)
+        assert count == 240
+        ends = element_ends(ninebus, instance, count)
+        assert ends.shape == (count + 1,)
+        assert (ends[0], ends[-1]) == (0, 6000)
+        assert (np.diff(ends) >= 1).all()
+        for ramp in instance.load.values():
+            for kink in (ramp.start, ramp.start + ramp.duration):
+                if ramp.rate and kink < 60.0:
+                    assert np.abs(ends * 0.01 - kink).min() <= 0.005 + 1e-9
+        assert np.diff(ends).max() <= 27  # 25 on average; an element less in each of seven pieces
+
+
+def test_elements_are_never_finer_than_the_grid_nor_fewer_than_the_kinks(
+    threebus: Case, quiet_instance
+) -> None:
+    instance = ramping(threebus, quiet_instance)
+    assert element_count(threebus, instance, 1e-3) == instance.steps
+    assert element_ends(threebus, instance, instance.steps).tolist() == list(range(instance.steps + 1))
+    assert element_count(threebus, instance, 100.0) == 3
+    assert element_ends(threebus, instance, 3).tolist() == [0, 50, 130, 200]
+    still = quiet_instance(threebus, horizon_s=HORIZON)
+    assert element_ends(threebus, still, 4).tolist() == [0, 50, 100, 150, 200]
+
+
+def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> None:
+    """Inputs and loads are linear in every element, kinks lie at ends: order 4 or more, Euler's is 1."""
+    instance = ramping(case, quiet_instance)
+    bend = np.array([0.0, 0.5, 1.3, HORIZON])
+    power = case.p_nominal + np.outer([0.0, 0.02, -0.01, 0.02], np.ones(len(case.generators)))
+    schedule = Schedule(t=bend, p=power)
+    truth = simulate(case, instance, schedule)
+    errors, gaps = [], []
+    for elements in (3, 6, 12):
+        model = with_inputs(case, instance, elements, schedule)
+        ends = element_ends(case, instance, elements)
+        omega = np.array([[model.omega[g, end].value for g in case.generators] for end in model.end])
+        errors.append(np.abs(omega - truth.omega[ends]).max())
+        cost = truth.p_gen @ instance.cost_gen(case)
+        cost = cost + instance.cost_slack(case) * np.abs(truth.p_slack)
+        gaps.append(abs(pyo.value(model.cost_total) / cost.sum() - 1))
+        assert point_times(model)[3::3] == pytest.approx(instance.grid[ends][1:], abs=1e-12)
+    assert errors[0] < 1e-4
+    assert errors[0] / errors[1] > 2**4
+    assert errors[2] < 1e-7
+    # The sum over the grid is not quite the integral: dt²/12 of the slope's change, and no more.
+    assert gaps[-1] < 1e-6
+
+
+def test_limits_hold_on_the_true_system(case: Case) -> None:
+    for regime, index in (("NO", 3), ("TO", 0)):
+        instance = short(case, index)
+        solution = prepare(case, regime, Settings())(instance)
+        assert solution.status == Status.OPTIMAL
+        verdict = score(case, instance, solution.schedule, regime)
+        assert verdict.freq_violation_hz < 1e-6
+        # Per step of the grid: IPOPT's 1e-8 pu/s and rounding.
+        assert verdict.ramp_violation < 2e-10
+        assert verdict.bound_violation == 0.0
+        assert verdict.feasible_strict
+        assert verdict.objective == pytest.approx(solution.solver_objective, rel=1e-5)
+
+
+def test_where_nothing_may_move_the_optimum_is_the_static_one(case: Case, quiet_instance, alter) -> None:
+    """Constant loads, started at their static dispatch, with a frequency bound near zero."""
+    case = alter(case, regimes={"NO": {"omega_hz": 1e-7}})
+    buses = (case.slack, *case.generators)
+    cost = dict(zip(buses, np.linspace(0.9, 0.2, len(buses)).tolist(), strict=True))
+    prices = np.array([cost[g] for g in case.generators])
+    p_opt = merit_order(case, prices, cost[case.slack], case.load_nominal)
+    initial = {
+        "power": dict(zip(case.generators, p_opt.tolist(), strict=True)),
+        "omega": dict.fromkeys(case.generators, 0.0),
+    }
+    instance = quiet_instance(case, horizon_s=HORIZON, cost=cost, initial=initial)
+    solution = prepare(case, "NO", Settings())(instance)
+    p_slack = -p_opt.sum() - case.load_nominal.sum()
+    static = prices @ p_opt + cost[case.slack] * abs(p_slack)
+    assert solution.solver_objective == pytest.approx(static * (instance.steps + 1), rel=1e-4)
+
+
+def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, quiet_instance) -> None:
+    """Other data, and other element lengths."""
+    instances = [short(case, 0), ramping(case, quiet_instance, start=0.31, duration=1.07)]
+    solve = prepare(case, "TO", Settings())
+    solve(instances[1])
+    for instance in instances:
+        again = solve(instance)
+        elements = element_count(case, instance, get_method("ded-radau").settings["default"])
+        model = build_ded_radau(case, elements)
+        set_instance(model, case, instance, "TO")
+        fresh = CasadiIpopt(model).solve()
+        assert again.status == fresh.status == Status.OPTIMAL
+        assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
+        np.testing.assert_allclose(again.schedule.p, schedule_of(model, case, instance).p, atol=1e-9)
+
+
+def test_frequencies_between_the_points_are_those_of_the_cubic() -> None:
+    """Lagrange's weights reproduce cubics, anywhere in an element."""
+    nodes = np.array([0.0, *POINTS])
+    for c in (*BETWEEN, 0.1, 1.0):
+        for degree in range(4):
+            assert np.dot(lagrange(c), nodes**degree) == pytest.approx(c**degree, abs=1e-14)
+
+
+def test_impossible_instances_and_time_limits_are_reported_as_such(threebus: Case) -> None:
+    instance = short(threebus, 0)
+    initial = instance.initial.model_copy(update={"power": {"plant": 0.95}})  # p_max is 0.9
+    solution = prepare(threebus, "NO", Settings())(instance.model_copy(update={"initial": initial}))
+    assert solution.status == Status.INFEASIBLE
+    assert solution.schedule is None
+    assert solution.error
+    solution = prepare(threebus, "TO", Settings(time_limit_s=1e-4))(instance)
+    assert solution.status == Status.TIME_LIMIT

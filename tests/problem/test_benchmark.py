@@ -1,0 +1,54 @@
+"""Which instances a split or a list of files means."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ded_bench.problem.benchmark import select_files, select_split
+from ded_bench.problem.case import Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.sampling import load_split, write_benchmark
+
+
+@pytest.fixture(scope="module")
+def folder(threebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("problems") / "threebus"
+    write_benchmark(threebus, 5, 7, folder)
+    return folder
+
+
+def test_splits_are_parts_of_the_whole_in_order(folder: Path, threebus: Case) -> None:
+    parts = {name: select_split(folder, name) for name in ("test", "train", "all")}
+    ids = {name: [i.id for i, _ in part.instances] for name, part in parts.items()}
+    assert ids["all"] == [f"threebus-{k:04d}" for k in range(5)]
+    assert ids["test"] == list(load_split(folder).test)
+    assert sorted(ids["test"] + ids["train"]) == ids["all"]
+    for name, part in parts.items():
+        assert part.case == threebus
+        assert part.version.startswith("1-")
+        assert all(split == ("test" if i.id in ids["test"] else "train") for i, split in part.instances), name
+    assert [i.id for i, _ in select_split(folder, "all", 2).instances] == ids["all"][:2]
+    assert select_split(folder / "case.json", "test") == parts["test"]
+
+
+def test_files_know_their_split_and_version(folder: Path, tmp_path: Path, threebus: Case) -> None:
+    files = sorted((folder / "instances").glob("*.json"))
+    assert select_files(files) == select_split(folder, "all")
+    stranger = tmp_path / "elsewhere" / "mine.json"
+    stranger.parent.mkdir()
+    stranger.write_text(json.dumps(json.loads(files[0].read_text()) | {"id": "mine"}))
+    chosen = select_files([stranger], threebus)
+    assert [split for _, split in chosen.instances] == ["none"]
+    assert chosen.version == ""
+
+
+def test_wrong_choices_are_told(folder: Path) -> None:
+    with pytest.raises(InputError, match="split: holdout: is not one of test, train, all"):
+        select_split(folder, "holdout")
+    with pytest.raises(InputError, match="no such case"):
+        select_split("atlantis")
+    with pytest.raises(InputError, match="no instance"):
+        select_files([])

@@ -1,0 +1,129 @@
+"""The package's door: what a notebook calls, and what it does not make anyone import."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ded_bench
+from ded_bench.methods.solution import Settings, Status
+from ded_bench.problem.case import Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.sampling import write_benchmark
+from ded_bench.truth import score, simulate
+
+HEAVY = ("casadi", "matplotlib", "pandas", "pyomo", "scipy", "torch")
+
+
+def loaded_after(code: str) -> list[str]:
+    """Heavy libraries that a fresh interpreter holds after this code."""
+    command = f"{code}\nimport json, sys; print(json.dumps(sorted(set({HEAVY}) & set(sys.modules))))"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_a_light_door() -> None:
+    """Whoever reads instances waits for no solver, no torch and no simulator."""
+    assert (
+        loaded_after("from ded_bench import Case, Instance, Schedule, Settings, load_instances, solve") == []
+    )
+
+
+def test_the_scorer_needs_no_method() -> None:
+    code = "from ded_bench import Schedule, load_instances, score\nimport numpy as np\n"
+    code += "from ded_bench.problem.instance import Instance\n"
+    code += "[i] = load_instances('9bus', limit=1)\n"
+    code += "i = i.model_copy(update={'horizon_s': 0.05})\n"
+    code += "p = list(i.initial.power.values())\n"
+    code += "score(i, Schedule(np.array([0.0, 0.05]), np.array([p, p])), 'TO')"
+    assert loaded_after(code) == ["scipy"]
+
+
+def test_everything_promised_is_there() -> None:
+    for name in ded_bench.__all__:
+        assert getattr(ded_bench, name).__name__ == name
+        assert name in dir(ded_bench)
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        _ = ded_bench.magic
+
+
+def test_instances_by_split(tmp_path, threebus: Case) -> None:
+    shipped = ded_bench.load_instances("9bus", limit=2)
+    assert [i.case for i in shipped] == ["9bus", "9bus"]
+    write_benchmark(threebus, 5, 7, tmp_path / "threebus")
+    assert len(ded_bench.load_instances(tmp_path / "threebus", split="train")) == 4
+    with pytest.raises(InputError, match="holdout"):
+        ded_bench.load_instances("9bus", split="holdout")
+
+
+def test_functions_are_those_of_the_floors(ninebus: Case, quiet_instance, constant) -> None:
+    instance = quiet_instance(ninebus, horizon_s=0.1)
+    schedule = constant(instance, ninebus.p_nominal)
+    assert ded_bench.score(instance, schedule, "TO") == score.score(ninebus, instance, schedule, "TO")
+    ours, theirs = ded_bench.simulate(instance, schedule), simulate.simulate(ninebus, instance, schedule)
+    assert np.array_equal(ours.omega, theirs.omega)
+
+
+def test_solve_answers_like_the_method(threebus: Case, quiet_instance) -> None:
+    instance = quiet_instance(threebus, horizon_s=0.5)
+    solution = ded_bench.solve(instance, "ded", "NO", case=threebus)
+    assert solution.status is Status.OPTIMAL
+    verdict = ded_bench.score(instance, solution.schedule, "NO", case=threebus)
+    assert verdict.feasible
+    # The model's backward Euler steps differ a little from the simulation.
+    assert solution.solver_objective == pytest.approx(verdict.objective, rel=1e-3)
+    with pytest.raises(InputError, match="unknown method"):
+        ded_bench.solve(instance, "magic", "NO", case=threebus)
+    with pytest.raises(InputError, match="unknown regime"):
+        ded_bench.solve(instance, "ded", "XX", case=threebus)
+    with pytest.raises(InputError, match="magic: unknown to method ded"):
+        ded_bench.solve(instance, "ded", "NO", case=threebus, settings=Settings("magic"))
+
+
+def test_a_case_that_is_not_shipped_must_be_given(
+    threebus: Case, ninebus: Case, quiet_instance, constant
+) -> None:
+    instance = quiet_instance(threebus, horizon_s=0.1)
+    schedule = constant(instance, threebus.p_nominal)
+    with pytest.raises(InputError, match="case: 'threebus' is no shipped case: give it"):
+        ded_bench.score(instance, schedule, "NO")
+    with pytest.raises(InputError, match="is for case 'threebus', not '9bus'"):
+        ded_bench.solve(instance, "ded", "NO", case=ninebus)
+    assert ded_bench.score(instance, schedule, "NO", case=threebus).feasible
+
+
+def test_a_trajectory_is_a_frame_by_bus(case: Case, quiet_instance, constant) -> None:
+    instance = quiet_instance(case, horizon_s=0.1)
+    trajectory = simulate.simulate(case, instance, constant(instance, case.p_nominal))
+    frame = trajectory.to_frame()
+    assert len(frame) == 11
+    assert len(frame.columns) == 2 + 2 * len(case.generators) + len(case.loads) + len(case.buses)
+    assert frame["t"].to_list() == instance.grid.tolist()
+    for g, bus in enumerate(case.generators):
+        assert np.array_equal(frame[f"P_{bus}"], trajectory.p_gen[:, g])
+        assert np.array_equal(frame[f"omega_{bus}"], trajectory.omega[:, g])
+    for i, bus in enumerate(case.buses):
+        assert np.array_equal(frame[f"theta_{bus.id}"], trajectory.theta[:, i])
+    injections = frame[[c for c in frame.columns if c.startswith(("P_", "L_"))]]
+    # At rest generation and load balance in a lossless network; the power flow solves to 1e-12 pu.
+    assert injections.sum(axis=1).to_numpy() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_instances_are_a_frame(case: Case, quiet_instance) -> None:
+    ramp = {bus: {"initial": -1.0, "start": 0.5, "duration": 2.0, "rate": -0.01} for bus in case.loads}
+    frame = ded_bench.instances_frame(
+        [quiet_instance(case), quiet_instance(case, id="other", load=ramp, seed=[1, 2])]
+    )
+    assert frame["id"].to_list() == [f"{case.id}-quiet", "other"]
+    assert frame["seed"].to_list() == ["0", "1 2"]
+    assert len(frame.columns) == 5 + 1 + 3 * len(case.generators) + 4 * len(case.loads)
+    first = case.loads[0]
+    assert frame.loc[
+        1, [f"load_{first}_{n}" for n in ("initial", "start", "duration", "rate")]
+    ].to_list() == [*(-1.0, 0.5, 2.0, -0.01)]
+    assert frame[f"P0_{case.generators[0]}"].to_list() == [case.p_nominal[0]] * 2
+    assert len(ded_bench.instances_frame([])) == 0

@@ -1,0 +1,221 @@
+"""Ways into the benchmark from outside: a package of somebody's, a function, a folder of schedules."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ded_bench.bench.paper import table_v, table_vi
+from ded_bench.bench.results import Results
+from ded_bench.bench.timing import read_timing, timing_frame
+from ded_bench.cli import main
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import write_benchmark
+
+PYPROJECT = """\
+[project]
+name = "dispatch-flat"
+version = "1.0"
+
+[project.entry-points."ded_bench.methods"]
+flat = "dispatch_flat:solve"
+"""
+MODULE = """\
+import numpy as np
+from ded_bench import Schedule
+
+
+def solve(instance, regime, case):
+    power = instance.p_initial(case)
+    return Schedule(t=np.array([0.0, instance.horizon_s]), p=np.array([power, power]))
+"""
+
+
+@pytest.fixture(scope="module")
+def problem(threebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small benchmark folder; two of its ten instances are for testing."""
+    folder = tmp_path_factory.mktemp("problems") / "threebus"
+    write_benchmark(threebus, 10, 7, folder)
+    return folder
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """A folder with the package, as an installer leaves it."""
+    facts = tomllib.loads(PYPROJECT)["project"]
+    site = tmp_path / "site"
+    about = site / f"{facts['name'].replace('-', '_')}-{facts['version']}.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {facts['name']}\nVersion: {facts['version']}\n"
+    )
+    lines = [
+        f"[{group}]\n{name} = {value}"
+        for group, p in facts["entry-points"].items()
+        for name, value in p.items()
+    ]
+    (about / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    (site / "dispatch_flat.py").write_text(MODULE)
+    return site
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run a command in this process: exit code, standard output, standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        try:
+            code = main([str(a) for a in arguments])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return (code, *capsys.readouterr())
+
+    return run
+
+
+def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, command, monkeypatch) -> None:
+    assert len((PYPROJECT + MODULE).splitlines()) <= 20
+    out = tmp_path / "out"
+    solve = [
+        "solve",
+        "--method",
+        "flat",
+        "--regime",
+        "NO,TO",
+        "--case",
+        problem,
+        "--workers",
+        2,
+        "--out",
+        out,
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "ded_bench", *map(str, solve)],
+        env=os.environ | {"PYTHONPATH": str(site)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    results = Results(out)
+    assert len(results.rows) == 4
+    for row in results.rows.values():
+        assert (row.method, row.status, row.workers) == ("flat", "Feasible", 2)
+        assert row.objective > 0
+        assert 0 < row.solve_s < 5
+        cheaper = {"method": "ded", "objective": row.objective / 1.02}
+        results.add([type(row)(**(vars(row) | cheaper))])
+    monkeypatch.syspath_prepend(site)
+    bench = (
+        "bench",
+        "--case",
+        problem,
+        "--method",
+        "flat",
+        "--instances",
+        1,
+        "--repeats",
+        1,
+        "--results",
+        out,
+    )
+    assert command(*bench)[0] == 0
+    frame, timing = Results(out).frame(), timing_frame(read_timing(out / "timing.csv"))
+    five = table_v(frame, timing, {}).set_index(["regime", "title"])
+    six = table_vi(frame, {}).set_index(["regime", "title"])
+    for regime in ("NO", "TO"):
+        assert five.loc[(regime, "flat"), "increase_percent"] == pytest.approx(2.0)
+        assert five.loc[(regime, "flat"), "n"] == 2
+        assert 0 < five.loc[(regime, "flat"), "solve_s"] < 5
+        assert six.loc[(regime, "flat"), "n"] == 2
+        assert six.loc[(regime, "flat"), "ramp_violation"] == 0.0
+
+
+def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
+    problem, tmp_path, command, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = MODULE.replace("    power", "    if regime == 'TO':\n        return None\n    power", 1)
+    Path("my_dispatch.py").write_text(source)
+    chosen = ("--regime", "NO,TO", "--instance", problem / "instances" / "threebus-0000.json", "--out", "out")
+    code, out, _ = command("solve", "--method", "my_dispatch:solve", *chosen)
+    assert code == 1
+    rows = {row["regime"]: row for row in map(json.loads, out.splitlines())}
+    assert {row["method"] for row in rows.values()} == {"my_dispatch.solve"}
+    assert rows["NO"]["status"] == "Feasible"
+    assert Path(rows["NO"]["schedule"]).is_file()
+    assert (rows["TO"]["status"], rows["TO"]["error"]) == (
+        "Failed",
+        "returned nothing, not a Schedule or a Solution",
+    )
+    for wrong in ("my_dispatch:absent", "absent_module:solve", "my_dispatch:", "/etc:solve"):
+        code, out, err = command("solve", "--method", wrong, *chosen)
+        assert (code, out, err.count("\n")) == (2, "", 1), err
+    # Names in a results table start nobody's code: `bench` times what is registered or asked for.
+    code, _, err = command("bench", "--case", problem, "--results", "out")
+    assert code == 2
+    assert "my_dispatch.solve: not timed, since no method has this name\n" in err
+    bench = ("bench", "--case", problem, "--results", "out", "--instances", "1", "--repeats", "1")
+    assert command(*bench, "--method", "my_dispatch:solve")[0] == 1  # its TO has nothing to time
+    times = {row.regime: row for row in read_timing(Path("out/timing.csv"))}
+    assert times["NO"].solve_s > 0
+    assert "returned nothing" in times["TO"].error
+
+
+def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
+    tests = [p.stem for p in sorted((problem / "instances").iterdir())]
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name in tests:
+        (folder / f"{name}.csv").write_text("t,P_plant\n0,0.6\n6,0.6\n")
+    out = tmp_path / "out"
+    score = ("score", "--case", problem, "--regime", "NO,TO", "--out", out, "--schedules", folder)
+    code, text, err = command(*score, "--name", "mine", "--json")
+    assert code == 0
+    assert len(text.splitlines()) == 4
+    assert "ded-bench: 8 files of other instances: " in err
+    one = json.loads(text.splitlines()[0])
+    single = command(
+        *("score", "--instance", problem / "instances" / f"{one['instance']}.json", "--json"),
+        *("--schedule", folder / f"{one['instance']}.csv", "--regime", one["regime"]),
+    )
+    verdict = json.loads(single[1])
+    assert {name: one[name] for name in verdict} == pytest.approx(verdict)
+    (folder / f"{one['instance']}.csv").write_text("t,P_plant\n0,0.6\n5,0.6\n")
+    code, _, err = command(*score, "--name", "mine")
+    assert code == 1
+    assert (
+        f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
+    )
+    assert "mine" in set(table_v(Results(out).frame(), timing_frame([]), {})["title"])
+    for wrong in (
+        score,  # no name
+        (*score, "--name", "ded"),
+        (*score[:-1], tmp_path, "--name", "mine"),
+        (*score, "--schedule", folder / "a.csv", "--name", "mine"),
+        ("score", "--schedule", folder / "a.csv", "--regime", "NO", "--case", problem),
+    ):
+        code, text, err = command(*wrong)
+        assert (code, text, err.count("\n")) == (2, "", 1), err
+    copy = tmp_path / "copy"
+    shutil.copytree(out, copy)
+    assert command("compare", out, copy)[0] == 0
+    results = Results(copy)
+    row = next(row for row in results.rows.values() if row.objective)
+    results.add([type(row)(**(vars(row) | {"objective": row.objective * 1.001}))])
+    code, text, _ = command("compare", out, copy)
+    assert code == 1
+    assert "objective: 1 of 4 common rows" in text
+    assert command("compare", out, copy, "--tolerance", 0.01)[0] == 0
+    assert json.loads(command("compare", out, copy, "--json")[1])["same"] is False
+    code, text, err = command("compare", out, tmp_path)
+    assert (code, text, err.count("\n")) == (2, "", 1)

@@ -1,0 +1,296 @@
+"""Damaged files: a reader takes a file or refuses it in one line that names it, and nothing else happens.
+
+Every kind of file that a user may hand over is damaged a few hundred times, always in the same ways,
+and given to the command line. Allowed ends are exit code 0, 1 (the simulation says why) and 2 (one line
+with the file's name, and the field's where a field was damaged).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import gzip
+import io
+import pickle
+import random
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ded_bench import cli
+from ded_bench.bench import run as runner
+from ded_bench.bench.metrics import claims, summary, table_times, worst
+from ded_bench.bench.results import Results, Row, format_rows, read_rows
+from ded_bench.bench.timing import TimingRow, format_timing, read_timing
+from ded_bench.koopman.physics import linear_model
+from ded_bench.methods.dpc import ded_dpc, policy
+from ded_bench.methods.dpc.network import ResidualNetwork
+from ded_bench.methods.dpc.store import Scope
+from ded_bench.problem.case import Case
+from ded_bench.problem.errors import InputError
+from ded_bench.problem.sampling import Manifest, Split
+from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.strict import write_record
+from ded_bench.truth import score as scorer
+from tests.damage import (
+    Mutant,
+    Payload,
+    damaged_arrays,
+    damaged_bytes,
+    damaged_json,
+    damaged_table,
+)
+
+#: Damaged files of each kind; together they are the 2000 and more that this module promises.
+COUNTS = {
+    "instance": 500,
+    "case": 400,
+    "schedule": 250,
+    "compressed schedule": 150,
+    "split": 100,
+    "manifest": 100,
+    "results": 200,
+    "timing": 100,
+    "model": 200,
+    "paper policy": 120,
+    "policy": 160,
+}
+#: Longer valid instances are read, but not simulated.
+FEW_STEPS = 20
+PARSER = functools.cache(cli.parser)  # making one takes longer than most of these commands
+
+Damaged = Sequence[Callable[[random.Random], Mutant]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_instance: Any) -> Path:
+    """A benchmark with one instance of five steps, a schedule, a results folder, models and policies."""
+    folder = tmp_path_factory.mktemp("fuzz") / "threebus"
+    case, instance = threebus, quiet_instance(threebus, horizon_s=0.05, seed=[2022, 7])
+    write_record(case, folder / "case.json")
+    write_record(instance, folder / "instances" / f"{instance.id}.json")
+    write_record(instance, folder / "instance.json")
+    write_record(Split(seed=1, train=(instance.id,), test=(instance.id,)), folder / "split.json")
+    write_record(Manifest(version="1-abc", files={"case.json": "00"}), folder / "MANIFEST.json")
+    t = np.linspace(0.0, 0.05, 6)
+    schedule = Schedule(t, 0.6 + 0.001 * t[:, None])
+    schedule.write(folder / "schedule.csv", case.generators)
+    schedule.write(folder / "schedule.csv.gz", case.generators)
+    claimed = {("NO", "ded"): "Optimal", ("TO", "ded"): "Optimal", ("TO", "ded-dpc"): "Policy"}
+    rows = [scored(Row(instance.id, "test", *key, "default", status)) for key, status in claimed.items()]
+    (folder / "results.csv").write_text(format_rows(rows))
+    timing = [TimingRow(r, "ded", "default", 1, 2, 0, solve_s=0.1, host="here") for r in case.regimes]
+    (folder / "timing.csv").write_text(format_timing(timing))
+    rng = np.random.default_rng(0)
+    mlp = tuple((0.1 * rng.normal(size=(n, m)), rng.normal(size=n)) for n, m in ((4, 3), (3, 4)))
+    model = linear_model(case)
+    wide = dict(k=0.9 * np.eye(5), b=np.zeros((5, 2)), g=np.zeros((5, 2)), lift=rng.normal(size=(5, 9)))
+    dataclasses.replace(model, mlp=mlp, **wide).save(folder / "model.safetensors")
+    scope = Scope(case, "TO", instance.horizon_s)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        plain = policy.PaperNetwork(policy.n_channels(case), case.p_min, case.p_max)
+        network = ResidualNetwork.make(case, 4, (1, 2))
+    policy.Policy(case, "TO", 0.05, plain, {"seed": 0}).save(folder / "paper.safetensors")
+    ded_dpc.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
+    return folder
+
+
+def scored(row: Row) -> Row:
+    """A row with times and a verdict."""
+    verdict = scorer.Score(2.0, 0.0, 1e-9, 0.0, 0.0)
+    facts = {"solve_s": 0.1, "iterations": 3, "fingerprint": "00", "case": "threebus"}
+    return runner.scored_row(dataclasses.replace(row, **facts), verdict)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading is real; solving is left out, and so is the simulation of anything long."""
+    real = scorer.score
+    nothing = scorer.Score(1.0, 0.0, 0.0, 0.0, 0.0)
+
+    def short(case: Case, instance: Any, schedule: Schedule, regime: str) -> scorer.Score:
+        return real(case, instance, schedule, regime) if instance.steps <= FEW_STEPS else nothing
+
+    monkeypatch.setattr(cli, "parser", PARSER)
+    monkeypatch.setattr(scorer, "score", short)
+    monkeypatch.setattr(runner, "run", lambda *_: [])
+
+
+def end_of(arguments: Sequence[object]) -> tuple[int, str]:
+    """Exit code and standard error of a command."""
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        code = cli.main([str(argument) for argument in arguments])
+    return code, errors.getvalue()
+
+
+def ending(arguments: Sequence[object], path: Path, mutant: Mutant) -> tuple[int | None, str]:
+    """Give a command a damaged file at `path`: its exit code, and what is wrong with how it ended."""
+    path.write_bytes(mutant.data)
+    try:
+        code, errors = end_of(arguments)
+    except BaseException as error:
+        return None, f"{type(error).__name__}: {error}"
+    if code == 0:
+        return code, ""
+    ours = str(path) in errors
+    given = any(str(a) in errors for a in (*arguments, "case threebus: regime"))
+    rules = {
+        "exit code": code in (1, 2),
+        "one line": errors.count("\n") == 1 and errors[:-1].isprintable() and len(errors) < 600,
+        "a file": ours or given,  # right by itself, it may no longer fit another file, which is named then
+        "the field": code == 1
+        or not ours
+        or not mutant.names
+        or any(name in errors for name in mutant.names),
+    }
+    broken = [rule for rule, kept in rules.items() if not kept]
+    return code, f"{broken} {mutant.names}: {errors}" if broken else ""
+
+
+def mutants(kind: str, make: Sequence[Callable[[random.Random], Mutant]]) -> Iterator[Mutant]:
+    """As many as COUNTS says, the same every time, from several ways of damaging in turn."""
+    rng = random.Random(f"ded-bench {kind}")
+    for i in range(COUNTS[kind]):
+        yield make[i % len(make)](rng)
+
+
+def test_there_are_enough() -> None:
+    assert sum(COUNTS.values()) >= 2000
+
+
+FILES = {
+    "instance": "instance.json",
+    "case": "case.json",
+    "schedule": "schedule.csv",
+    "compressed schedule": "schedule.csv.gz",
+    "split": "split.json",
+    "manifest": "MANIFEST.json",
+    "results": "results.csv",
+    "model": "model.safetensors",
+    "paper policy": "paper.safetensors",
+    "policy": "policy.safetensors",
+}
+
+
+def command(folder: Path, kind: str) -> list[object]:
+    """A command that reads the file of a kind."""
+    path = folder / FILES[kind]
+    if kind in ("instance", "case", "schedule", "compressed schedule"):
+        schedule = path if "schedule" in kind else folder / "schedule.csv"
+        given = ["--instance", folder / "instance.json", "--case", folder / "case.json"]
+        return ["score", *given, "--schedule", schedule, "--regime", "TO", "--json"]
+    method = {"model": "ded-ko-knots", "paper policy": "ded-dpc-paper", "policy": "ded-dpc"}.get(kind, "ded")
+    option = {"model": ["--model", path], "paper policy": ["--policy", path], "policy": ["--policy", path]}
+    given = ["--method", method, "--regime", "TO", "--case", folder, "--out", folder]
+    return ["solve", *given, *option.get(kind, [])]
+
+
+def damage_to(path: Path) -> Damaged:
+    """Ways to damage a file, by what is in it."""
+    whole = path.read_bytes()
+    if path.suffix == ".safetensors":
+        return [*[lambda r: damaged_arrays(whole, r)] * 3, lambda r: damaged_bytes(whole, r)]
+    if path.suffix == ".json":
+        return [*[lambda r: damaged_json(whole.decode(), r)] * 3, lambda r: damaged_bytes(whole, r)]
+    if path.suffix == ".csv":
+        return [lambda r: damaged_table(whole.decode(), r), lambda r: damaged_bytes(whole, r)]
+    text = gzip.decompress(whole)
+    return [
+        lambda r: damaged_bytes(whole, r),
+        lambda r: Mutant(gzip.compress(damaged_table(text.decode(), r).data, mtime=0)),
+        lambda r: Mutant(gzip.compress(damaged_bytes(text, r).data, mtime=0)),
+    ]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_commands_survive(folder: Path, kind: str) -> None:
+    """Most damaged files are refused, some are as right as before; no row of the results changes."""
+    path, arguments = folder / FILES[kind], command(folder, kind)
+    whole, before = path.read_bytes(), (folder / "results.csv").read_bytes()
+    codes, problems = [], []
+    for mutant in mutants(kind, damage_to(path)):
+        code, problem = ending(arguments, path, mutant)
+        codes.append(code)
+        problems += [f"{problem[:600]} <- {mutant.data[:1500]!r}"] if problem else []
+    path.write_bytes(whole)
+    assert not problems, "\n".join(problems[:20])
+    assert end_of(arguments)[0] == 0  # what was damaged was right
+    assert 0.3 * len(codes) < codes.count(2) < len(codes) == COUNTS[kind], codes.count(2)
+    assert (folder / "results.csv").read_bytes() == before
+
+
+def test_timing_survives(folder: Path) -> None:
+    """`bench` and `report` read it; here its reader alone, since they have longer work to do."""
+    path = folder / "timing.csv"
+    whole = path.read_bytes()
+    refused: list[tuple[InputError, Mutant]] = []
+    for mutant in mutants("timing", damage_to(path)):
+        path.write_bytes(mutant.data)
+        try:
+            read_timing(path)
+        except InputError as error:
+            refused.append((error, mutant))
+    path.write_bytes(whole)
+    assert 0.3 * COUNTS["timing"] < len(refused) < COUNTS["timing"]
+    for error, mutant in refused:
+        assert error.source == str(path)
+        assert str(error).isprintable()
+        assert not mutant.names or any(name in str(error) for name in mutant.names)
+
+
+def test_summaries_survive_what_results_may_hold(folder: Path) -> None:
+    """Numbers that nobody would expect are still numbers: every table is made, without a warning."""
+    whole = (folder / "results.csv").read_text()
+    path, made = folder / "odd.csv", 0
+    for mutant in mutants("results", [lambda r: damaged_table(whole, r)]):
+        path.write_bytes(mutant.data)
+        try:
+            rows = {row.key: row for row in read_rows(path)}
+        except InputError:
+            continue
+        results = Results(folder)
+        results.rows = rows
+        frame = results.frame()
+        for table in (summary, table_times, claims, worst):
+            table(frame)
+        made += 1
+    assert made > 30
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FILES if kind != "manifest"])
+def test_pickles_are_not_opened(folder: Path, tmp_path: Path, kind: str) -> None:
+    """What would run code if it were unpickled, however it is packed, is only a damaged file."""
+    path, trace, zipped = folder / FILES[kind], tmp_path / "trace", io.BytesIO()
+    torch.save(Payload(trace), zipped)
+    plain = pickle.dumps(Payload(trace))
+    whole = path.read_bytes()
+    for data in (plain, zipped.getvalue(), gzip.compress(plain)):
+        assert ending(command(folder, kind), path, Mutant(data)) == (2, "")
+    path.write_bytes(whole)
+    assert not trace.exists()
+    pickle.loads(plain)
+    assert trace.exists()  # it would have
+
+
+@pytest.mark.parametrize("method", ["ded-dpc-paper", "ded-dpc"])
+def test_a_checkpoint_is_not_unpickled_either(folder: Path, tmp_path: Path, method: str) -> None:
+    """Resuming from a file that is no checkpoint of this training is refused; nothing runs."""
+    out, trace = tmp_path / "p.safetensors", tmp_path / "trace"
+    path = out.with_suffix(".checkpoint.pt")
+    arguments = ["train-dpc", "--method", method, "--regime", "TO", "--case", folder, "--model", "linear"]
+    arguments += ["--resume", "--out", out, "--epochs", "1", "--limit", "1"]
+    arguments += ["--settings", "train400"] if method == "ded-dpc" else []  # draws no instances first
+    for content in (Payload(trace), {"network": {}}, [1, 2]):
+        torch.save(content, path)
+        assert ending(arguments, path, Mutant(path.read_bytes())) == (2, "")
+    for data in (b"", b"text", pickle.dumps(Payload(trace))):
+        assert ending(arguments, path, Mutant(data)) == (2, "")
+    assert not trace.exists()
+    assert not out.exists()

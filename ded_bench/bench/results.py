@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import fcntl
+import functools
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -89,11 +90,15 @@ class Results:
         self.folder = Path(folder)
         self.path = self.folder / "results.csv"
         self.rows: dict[Key, Row] = {}
+        self._seen: tuple[int, int] | None = None  # the file that `rows` came from or went to
         self.reload()
 
     def reload(self) -> None:
         """Read the table as it is on disk now; InputError if a row is wrong."""
-        self.rows = {row.key: row for row in read_rows(self.path)} if self.path.exists() else {}
+        seen = self._file()
+        if seen != self._seen or seen is None:
+            self.rows = {row.key: row for row in read_rows(self.path)} if seen else {}
+            self._seen = seen
 
     def add(self, rows: Iterable[Row]) -> None:
         """Save rows at once, replacing those with the same key; other writers' rows are kept."""
@@ -101,6 +106,7 @@ class Results:
             self.reload()
             self.rows |= {row.key: row for row in rows}
             write_atomically(self.path, format_rows(self.rows.values()))
+            self._seen = self._file()
 
     def has(self, key: Key, fingerprint: str) -> bool:
         """Whether a row is finished: same fingerprint, schedule on disk, scored."""
@@ -128,6 +134,14 @@ class Results:
                 frame[name] = frame[name].astype("float64")
         return frame
 
+    def _file(self) -> tuple[int, int] | None:
+        """What changes whenever the file is replaced, which is how every writer changes it."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns
+
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -138,11 +152,18 @@ class Results:
 
 def format_rows(rows: Iterable[Row]) -> str:
     """Rows as CSV text; floats keep every digit, missing values are empty."""
+    return _line(COLUMNS) + "".join(map(_row_line, rows))
+
+
+@functools.lru_cache(maxsize=1 << 16)
+def _row_line(row: Row) -> str:
+    """A row's line, kept: the whole table is written whenever a row is added."""
+    return _line([_format(getattr(row, name)) for name in COLUMNS])
+
+
+def _line(cells: Sequence[str]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows:
-        writer.writerow([_format(value) for value in dataclasses.astuple(row)])
+    csv.writer(text, lineterminator="\n").writerow(cells)
     return text.getvalue()
 
 

@@ -1,6 +1,6 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick models ablation certify test clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick radau models ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
@@ -36,9 +36,16 @@ instances: $(STAMP)  ## draw the 500 instances and their split (the same files e
 train-ko: $(STAMP)  ## identify the Koopman model from simulated trajectories
 	$(DED) train-ko --case $(CASE) --results $(RESULTS)
 
-solve-baselines: train-ko  ## solve and score DED and DED-KO in both regimes (SPLIT=all: all 500)
-	$(DED) solve --method ded,ded-ko,ded-ko-knots --regime NO,TO $(CHOICE) \
+solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in both regimes (SPLIT=all: all 500)
+	$(DED) solve --method ded,ed,ded-ko,ded-ko-knots --regime NO,TO $(CHOICE) \
 	  --workers $(WORKERS) --out $(RESULTS)
+	$(DED) solve --method ded --settings accelerated --regime NO,TO $(CHOICE) \
+	  --workers $(WORKERS) --out $(RESULTS)
+	for every in 10s 1s; do $(DED) solve --method ed --settings $$every --regime NO,TO $(CHOICE) \
+	  --workers $(WORKERS) --out $(RESULTS) || exit 1; done
+
+radau: train-ko  ## full DED by Radau collocation: the accurate reference, slower than DED
+	$(DED) solve --method ded-radau --regime NO,TO $(CHOICE) --workers $(WORKERS) --out $(RESULTS)
 
 train-dpc: train-ko  ## train the DED-DPC policies on the training instances
 	@for method in $(POLICIES); do printf '%s\n' $(REGIMES) | xargs -P $(WORKERS) -I REGIME \

@@ -135,7 +135,7 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
         {"epoch": [1, 2], "seconds": [1.0, 2.0], "training": [3.0, 2.0], "held out": [3.0, 2.5]}
     )
     (finished / "policies").mkdir()
-    history.assign(objective=[2.0, 1.0]).to_csv(finished / "policies" / "p.history.csv", index=False)
+    history.assign(objective=[2.0, 1.0]).to_csv(finished / "policies" / "ded-dpc-TO.history.csv", index=False)
     write_arrays(
         finished / "policies" / "p.safetensors",
         {"w": np.zeros(2)},
@@ -208,7 +208,7 @@ def test_every_file_is_written(report: list[Path], finished: Path) -> None:
         "koopman_TO",
         "tradeoff",
         "profile",
-        "training",
+        "training_ded-dpc",
     )
     figures += ("parameters", "forecasts", "koopman_error", "koopman_eigenvalues")
     assert {f"figures/{name}.{form}" for name in figures for form in ("png", "pdf")} <= names

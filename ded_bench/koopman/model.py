@@ -209,16 +209,17 @@ def _recurrence(k: Array, start: Array, push: Array) -> Array:
         for j in range(i, length):
             inside[i, :, j] = powers[j - i]
     blocks = -(-n_steps // length)
-    u = np.zeros((blocks * length, *start.shape))
-    u[:n_steps] = push
-    u = np.moveaxis(u.reshape(blocks, length, -1, n), 1, 2).reshape(blocks, -1, length * n)
-    x = (u @ inside.reshape(length * n, -1)).reshape(blocks, -1, length, n)
-    carry = np.concatenate(powers[1:], axis=1)
     before = start.reshape(-1, n)
+    batch = len(before)
+    u = np.zeros((blocks * length, batch, n))
+    u[:n_steps] = push.reshape(n_steps, batch, n)
+    u = np.moveaxis(u.reshape(blocks, length, batch, n), 1, 2).reshape(blocks, batch, length * n)
+    x = (u @ inside.reshape(length * n, length * n)).reshape(blocks, batch, length, n)
+    carry = np.concatenate(powers[1:], axis=1)
     for block in x:
-        block += (before @ carry).reshape(-1, length, n)
+        block += (before @ carry).reshape(batch, length, n)
         before = block[:, -1]
-    x = np.moveaxis(x, 2, 1).reshape(-1, *start.shape)
+    x = np.moveaxis(x, 2, 1).reshape(blocks * length, *start.shape)
     return np.concatenate([start[None], x[:n_steps]])
 
 

@@ -174,9 +174,9 @@ def test_training_schedules_obey_the_limits(case: Case) -> None:
     p_gen = data.inputs[..., :n_gen]
     most = case.ramp_pu_per_s * case.sampling.dt_s
     assert np.abs(np.diff(p_gen, axis=0)).max() <= most + 1e-12
-    # the smoothed kinds coast past a bound by less than one step at the ramp limit
-    assert (p_gen >= case.p_min - most).all()
-    assert (p_gen <= case.p_max + most).all()
+    coast = 0.5 * case.ramp_pu_per_s  # the longest smoothing at the ramp limit: a smoothed kind may overshoot
+    assert (p_gen >= case.p_min - coast).all()
+    assert (p_gen <= case.p_max + coast).all()
     assert set(data.kinds) == set(KINDS)
 
 

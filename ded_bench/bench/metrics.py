@@ -45,7 +45,7 @@ def is_study(slug: str) -> bool:
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """The rows that the tables are about: the test instances if there are any, else all; no study."""
-    frame = frame[[not is_study(slug) for slug in frame["settings"]]]
+    frame = frame[~frame["settings"].map(is_study).astype(bool)]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
 

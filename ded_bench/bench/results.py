@@ -104,7 +104,7 @@ class Results:
         """Save rows at once, replacing those with the same key; other writers' rows are kept."""
         with self._locked():
             self.reload()
-            self.rows |= {row.key: row for row in rows}
+            self.rows = self.rows | {row.key: row for row in rows}
             write_atomically(self.path, format_rows(self.rows.values()))
             self._seen = self._file()
 

@@ -62,9 +62,9 @@ def model_table(frame: pd.DataFrame) -> pd.DataFrame:
 def ablation_table(frame: pd.DataFrame, folder: Path) -> pd.DataFrame:
     """The short trainings of a study side by side: what differs, gaps, violations, cost of the training."""
     reference = (frame["method"] == REFERENCE[0]) & (frame["settings"] == REFERENCE[1])
-    study = np.array([is_study(slug) for slug in frame["settings"]], dtype=bool)
+    study = frame["settings"].map(is_study).astype(bool)
     table = summary(frame[study | reference])
-    table = table[[is_study(slug) for slug in table["settings"]]]
+    table = table[table["settings"].map(is_study).astype(bool)]
     rows = []
     for row in table.to_dict("records"):
         name, model = split_slug(str(row["settings"]))

@@ -224,7 +224,7 @@ def serve(file_descriptor: int) -> None:
         try:
             request = requests.get()
             try:
-                function, arguments = pickle.loads(request)
+                function, arguments = pickle.loads(request)  # from our own parent alone
             finally:
                 connection.send_bytes(b"")
             answer = function(*arguments)
@@ -244,7 +244,7 @@ def _read(answer: Answer) -> object:
     if not isinstance(answer, bytes):
         return answer
     try:
-        result: object = pickle.loads(answer)
+        result: object = pickle.loads(answer)  # from our own child, or a worker of our own cluster
     except Exception as error:  # an exception class may want more than its message
         return RuntimeError(f"the answer cannot be read: {error}")
     return result

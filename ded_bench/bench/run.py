@@ -96,7 +96,7 @@ def run(
                     unscored.append(task)
                 else:  # one of an earlier model or policy must not pass for this row's
                     results.schedule_path(task.key).unlink(missing_ok=True)
-                row = _row(task, solution, pool.count, problems_version, where)
+                row = unscored_row(task, solution, pool.count, problems_version, where)
                 results.add([row])
                 if solution.schedule is None:
                     on_row(row)
@@ -150,7 +150,8 @@ def scored_row(row: Row, verdict: object) -> Row:
     )
 
 
-def _row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
+def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
+    """The row of a task with what the solver claims; `where` is the host that solved it."""
     seed = task.instance.seed
     return Row(
         instance=task.instance.id,

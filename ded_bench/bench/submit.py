@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ded_bench.bench.environment import host, now, version
+from ded_bench.bench.environment import host
 from ded_bench.bench.results import Results, Row
-from ded_bench.bench.run import run
+from ded_bench.bench.run import run, unscored_row
 from ded_bench.bench.tasks import Task
 from ded_bench.methods import registered
 from ded_bench.methods.foreign import SLUG
-from ded_bench.methods.solution import Settings, Status
+from ded_bench.methods.solution import Settings, Solution, Status
 from ded_bench.problem.benchmark import Selection
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
@@ -118,21 +118,4 @@ def _read(
 
 
 def _row(task: Task, status: Status, error: str, workers: int, problems_version: str) -> Row:
-    seed = task.instance.seed
-    return Row(
-        instance=task.instance.id,
-        split=task.split,
-        regime=task.regime,
-        method=task.method,
-        settings=task.settings.slug,
-        status=str(status),
-        error=error[:300],
-        workers=workers,
-        problems_version=problems_version,
-        version=version(),
-        host=host(),
-        date=now(),
-        case=task.instance.case,
-        seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
-        fingerprint=task.fingerprint,
-    )
+    return unscored_row(task, Solution(status, error=error[:300]), workers, problems_version, host())

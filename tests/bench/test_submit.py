@@ -97,7 +97,7 @@ def test_only_what_changed_is_scored_again(chosen, results, tmp_path, monkeypatc
     folder = put(tmp_path / "mine", a=text(0.6), b=text(0.6))
     first = submit(chosen, folder, "mine", ["NO"], results).rows
     before = results.path.read_bytes()
-    monkeypatch.setattr("ded_bench.bench.submit.now", lambda: "later")
+    monkeypatch.setattr("ded_bench.bench.run.now", lambda: "later")
     assert submit(chosen, folder, "mine", ["NO"], results).rows == first
     assert results.path.read_bytes() == before
     put(folder, b=text(0.61))

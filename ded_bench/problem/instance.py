@@ -31,7 +31,8 @@ class LoadRamp(Record):
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
-        return np.asarray(self.initial + self.rate * np.clip(t - self.start, 0.0, self.duration))
+        into = np.minimum(np.maximum(t - self.start, 0.0), self.duration)  # np.clip takes twice as long
+        return np.asarray(self.initial + self.rate * into)
 
 
 class Initial(Record):

@@ -59,6 +59,20 @@ def test_architecture_is_the_papers(ninebus: Case) -> None:
     assert (extreme <= network.p_max.T + 1e-6).all()
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_policy_is_its_torch_network(case: Case, count: int) -> None:
+    network, instances = fresh_network(case), some_instances(case, count)
+    channels = Features.of(Network(case), instances, knot_times(HORIZON, N_KNOTS)).channels()
+    network.mean.normal_()
+    network.scale.uniform_(0.5, 2.0)
+    with torch.inference_mode():
+        expected = network(torch.as_tensor(channels, dtype=torch.float32)).double().numpy()
+    schedules = Policy(case, "NO", HORIZON, network, {})(instances)
+    # two orders of adding up a few hundred float32 products of order one
+    np.testing.assert_allclose([s.p for s in schedules], expected, atol=2e-6)
+    assert (np.ptp(expected, axis=1) > 1e-3).all()
+
+
 def test_features_are_what_the_paper_lists(case: Case) -> None:
     network, instances = Network(case), some_instances(case, 3)
     knots = knot_times(HORIZON, N_KNOTS)

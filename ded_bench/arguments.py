@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -109,6 +110,7 @@ def parser() -> argparse.ArgumentParser:
 
     p = _command(commands, "report", "write tables V and VI, figures, report.md and report.html")
     p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--workers", type=_positive, default=min(os.cpu_count() or 1, 4), help="that draw figures")
     p.add_argument("--results", type=Path, help="results folder")
 
     p = _command(commands, "score", "simulate schedule CSVs on the true system and judge them")

@@ -223,7 +223,7 @@ def _report(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.results or default_results(case)
-    written = write_report(case, folder, problem_folder(a.case, case))
+    written = write_report(case, folder, problem_folder(a.case, case), a.workers)
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0
 

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 from pydantic import Field
-from scipy.stats import beta
+from scipy.special import betaincinv
 from tqdm import tqdm
 
 from ded_bench.bench.environment import host, now, version
@@ -124,7 +124,7 @@ def clopper_pearson(successes: int, count: int, delta: float) -> float:
     Clopper and Pearson 1934, one-sided: exact for independent trials.
     """
     _check_trials(successes, count, delta)
-    return float(beta.ppf(delta, successes, count - successes + 1)) if successes else 0.0
+    return float(betaincinv(successes, count - successes + 1, delta)) if successes else 0.0
 
 
 def hoeffding(successes: int, count: int, delta: float) -> float:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,6 +35,7 @@ from ded_bench.bench.metrics import (
     tradeoff,
 )
 from ded_bench.bench.page import Block, Picture, Text
+from ded_bench.bench.pool import Call, Workers
 from ded_bench.bench.results import Key, Results
 from ded_bench.bench.selection import Plan, plan
 from ded_bench.bench.studies import main_rows
@@ -63,15 +66,23 @@ class Gallery:
     pictures: dict[str, list[Picture]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    pending: list[Call] = field(default_factory=list)
 
-    def save(self, topic: str, name: str, figure: Figure, caption: str) -> None:
-        """Write a figure into the folder and hang it under a topic."""
+    def add(
+        self, topic: str, name: str, caption: str, figure: Callable[..., Figure], *arguments: Any
+    ) -> None:
+        """Hang a picture under a topic; `paint` makes the figure by this call and writes it."""
         formats, dpi = (("png",), WORST_DPI) if topic == "worst" else (("png", "pdf"), DPI)
         name = re.sub(r"[^A-Za-z0-9_.-]+", "-", name)
         stem = self.results.folder / "figures" / name
-        save_figure(figure, stem, formats, dpi)
+        self.pending.append((paint, (stem, formats, dpi, figure, arguments)))
         self.files += [stem.parent / f"{name}.{form}" for form in formats]
         self.pictures.setdefault(topic, []).append(Picture(f"figures/{name}.png", caption))
+
+    def take_pending(self) -> list[Call]:
+        """The calls that draw what was added since this was last asked."""
+        pending, self.pending = self.pending, []
+        return pending
 
     def of(self, topic: str, otherwise: str = "") -> list[Block]:
         """The pictures of a topic, or a sentence if there are none."""
@@ -86,28 +97,44 @@ class Gallery:
         return [self.instances[key.instance] for key in keys]
 
 
-def draw(case: Case, results: Results, frame: pd.DataFrame, timing: pd.DataFrame, problems: Path) -> Gallery:
+def paint(
+    stem: Path, formats: tuple[str, ...], dpi: int, figure: Callable[..., Figure], arguments: tuple[Any, ...]
+) -> None:
+    """Make a figure and write it; in whatever process this is called."""
+    save_figure(figure(*arguments), stem, formats, dpi)
+
+
+def draw(
+    case: Case, results: Results, frame: pd.DataFrame, timing: pd.DataFrame, problems: Path, workers: int = 1
+) -> Gallery:
     """Draw every figure that the folder has data for into `<results>/figures`.
 
     Args:
         frame: the rows that the report is about.
         timing: the timing rows of one host.
         problems: folder of the benchmark's instances.
+        workers: processes that draw; with one, this one does.
     """
     gallery = Gallery(case, results)
     frame = frame[frame["regime"].isin(list(case.regimes))]
     _read_instances(gallery, problems)
     chosen = plan(frame, gallery.has)
     _read_schedules(gallery, chosen)
-    _simulate(gallery, chosen)
     models = _models(gallery)
-    _draw_schedules(gallery, chosen)
-    _draw_tight(gallery, chosen, models)
     _draw_tradeoff(gallery, frame, timing)
-    _draw_worst(gallery, chosen)
-    _draw_models(gallery, models)
     _draw_training(gallery)
     _draw_problem(gallery)
+    _draw_eigenvalues(gallery, models)
+    with Workers(workers) if workers > 1 else nullcontext() as pool:
+        simulations = _simulations(gallery, chosen)
+        calls: list[Call] = [(simulate_many, arguments) for arguments in simulations.values()]
+        for keys, runs in _answers(pool, [*calls, *gallery.take_pending()], [*simulations]):
+            _keep(gallery, keys, runs)
+        _draw_schedules(gallery, chosen)
+        _draw_tight(gallery, chosen, models)
+        _draw_worst(gallery, chosen)
+        _draw_models(gallery, models)
+        list(_answers(pool, gallery.take_pending(), []))
     if not any(chosen.representative.values()):
         gallery.notes.append("No schedule of a scored row is in the folder, so no trajectory is drawn.")
     return gallery
@@ -133,18 +160,44 @@ def _read_schedules(gallery: Gallery, chosen: Plan) -> None:
             gallery.notes.append(f"Not drawn: {error}")
 
 
-def _simulate(gallery: Gallery, chosen: Plan) -> None:
-    """Simulate all schedules of one time grid side by side, which costs little more than one."""
+def _answers(
+    pool: Workers | None, calls: list[Call], labels: list[tuple[Key, ...]]
+) -> Iterator[tuple[tuple[Key, ...], object]]:
+    """Answers, or SimulationErrors, of the first calls, which have labels; any other error is raised."""
+    names: list[tuple[Key, ...]] = [*labels, *[()] * (len(calls) - len(labels))]
+    found = zip(names, map(_called, calls), strict=True) if pool is None else pool.imap(calls, names)
+    for name, answer in found:
+        if isinstance(answer, Exception) and not isinstance(answer, SimulationError):
+            raise answer
+        if name:
+            yield name, answer
+
+
+def _called(call: Call) -> object:
+    function, arguments = call
+    try:
+        return function(*arguments)
+    except SimulationError as error:
+        return error
+
+
+def _simulations(gallery: Gallery, chosen: Plan) -> dict[tuple[Key, ...], tuple[Any, ...]]:
+    """Arguments of `simulate_many` by what it simulates: side by side, which costs little more than one."""
     grids: dict[tuple[int, float], list[Key]] = {}
     for key in filter(gallery.schedules.__contains__, chosen.shown):
         instance = gallery.instances[key.instance]
         grids.setdefault((instance.steps, instance.dt_s), []).append(key)
-    for keys in grids.values():
-        try:
-            runs = simulate_many(gallery.case, gallery.posed(keys), [gallery.schedules[key] for key in keys])
-            gallery.trajectories |= dict(zip(keys, runs, strict=True))
-        except SimulationError as error:
-            gallery.notes.append(f"Not drawn, since the simulation failed: {error}")
+    return {
+        tuple(keys): (gallery.case, gallery.posed(keys), [gallery.schedules[key] for key in keys])
+        for keys in grids.values()
+    }
+
+
+def _keep(gallery: Gallery, keys: tuple[Key, ...], runs: object) -> None:
+    if isinstance(runs, list):
+        gallery.trajectories |= dict(zip(keys, runs, strict=True))
+    else:
+        gallery.notes.append(f"Not drawn, since the simulation failed: {runs}")
 
 
 def _models(gallery: Gallery) -> list[Koopman]:
@@ -178,12 +231,12 @@ def _names(shown: list[Shown]) -> str:
 def _draw_schedules(gallery: Gallery, chosen: Plan) -> None:
     for regime, keys in chosen.representative.items():
         if shown := _shown(gallery, keys):
-            figure = schedule_figure(gallery.case, f"{keys[0].instance}, {regime}", shown)
             caption = (
                 f"{_names(shown)} on {keys[0].instance}, regime {regime} (the instance with the median gap): "
                 "generator powers with their bounds, loads, slack power."
             )
-            gallery.save("paper", f"schedule_{regime}", figure, caption)
+            heading = f"{keys[0].instance}, {regime}"
+            gallery.add("paper", f"schedule_{regime}", caption, schedule_figure, gallery.case, heading, shown)
 
 
 def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> None:
@@ -197,20 +250,19 @@ def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> None:
     key = chosen.representative[regime][-1]
     shown = _shown(gallery, chosen.representative[regime])
     heading = f"{key.instance}, {regime}"
-    figure = frequency_figure(case, regime, heading, shown)
     caption = f"Generator frequencies under {_names(shown)} on {heading}; dotted: the bounds of the regime."
-    gallery.save("paper", f"frequencies_{regime}", figure, caption)
+    gallery.add("paper", f"frequencies_{regime}", caption, frequency_figure, case, regime, heading, shown)
     fitting = _fitting(gallery, models, key)
     if key in gallery.trajectories and fitting:
         model = next((m for m in fitting if m.kind == "koopman"), fitting[-1])
         run = gallery.trajectories[key]
         outputs = rollout(case, model, [gallery.instances[key.instance]], [run])[:, 0]
-        figure = koopman_figure(case, regime, heading, run, outputs, model.kind)
         caption = (
             f"Koopman model ({model.kind}) against the swing equations under the schedule of "
             f"{title(key.method, key.settings)} on {heading}."
         )
-        gallery.save("paper", f"koopman_{regime}", figure, caption)
+        drawn = (case, regime, heading, run, outputs, model.kind)
+        gallery.add("paper", f"koopman_{regime}", caption, koopman_figure, *drawn)
 
 
 def _fitting(gallery: Gallery, models: list[Koopman], key: Key) -> list[Koopman]:
@@ -225,10 +277,13 @@ def rollout(case: Case, model: Koopman, instances: list[Instance], runs: list[Tr
     return np.asarray(psi[..., : len(case.generators) + 1])
 
 
+def _draw_eigenvalues(gallery: Gallery, models: list[Koopman]) -> None:
+    caption = "Eigenvalues of K against the physical modes at the nominal point (crosses)."
+    gallery.add("koopman", "koopman_eigenvalues", caption, charts.eigenvalue_figure, gallery.case, models)
+
+
 def _draw_models(gallery: Gallery, models: list[Koopman]) -> None:
     case = gallery.case
-    caption = "Eigenvalues of K against the physical modes at the nominal point (crosses)."
-    gallery.save("koopman", "koopman_eigenvalues", charts.eigenvalue_figure(case, models), caption)
     if not gallery.trajectories:
         return
     first = next(iter(gallery.trajectories))
@@ -243,7 +298,7 @@ def _draw_models(gallery: Gallery, models: list[Koopman]) -> None:
             f"Error of Koopman rollouts against the swing equations over time, under {len(keys)} schedules: "
             "those of the paper's figures and the worst of each method."
         )
-        gallery.save("koopman", "koopman_error", charts.rollout_figure(case, t, errors), caption)
+        gallery.add("koopman", "koopman_error", caption, charts.rollout_figure, case, t, errors)
 
 
 def _draw_worst(gallery: Gallery, chosen: Plan) -> None:
@@ -264,8 +319,8 @@ def _draw_worst(gallery: Gallery, chosen: Plan) -> None:
                 f"{title(method, settings)}, {regime}: the instances with the largest {what}; "
                 f"{dashed}dotted: bounds."
             )
-            figure = worst_figure(gallery.case, regime, heading, columns)
-            gallery.save("worst", f"worst_{method}_{settings}_{regime}", figure, caption)
+            name = f"worst_{method}_{settings}_{regime}"
+            gallery.add("worst", name, caption, worst_figure, gallery.case, regime, heading, columns)
 
 
 def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) -> None:
@@ -277,7 +332,7 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
             "some schedules are infeasible; * timed under parallel load, not by `ded-bench bench`. The "
             "vertical scale is linear within ±0.01 %."
         )
-        gallery.save("tradeoff", "tradeoff", charts.tradeoff_figure(points), caption)
+        gallery.add("tradeoff", "tradeoff", caption, charts.tradeoff_figure, points)
     times, objectives = (performance_profile(frame, column) for column in ("solve_s", "objective"))
     if len(times) or len(objectives):
         caption = (
@@ -286,7 +341,7 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
             "the cheapest schedule (bottom). Only feasible schedules count"
         )
         caption += _without_curve(frame, objectives)
-        gallery.save("profile", "profile", charts.profile_figure(times, objectives), caption)
+        gallery.add("profile", "profile", caption, charts.profile_figure, times, objectives)
 
 
 def _without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
@@ -320,7 +375,7 @@ def _draw_training(gallery: Gallery) -> None:
             f"Loss of each policy of {title(method)} over its training time; right: the loss's terms on "
             "held-out instances."
         )
-        gallery.save("training", f"training_{method}", charts.history_figure(curves), caption)
+        gallery.add("training", f"training_{method}", caption, charts.history_figure, curves)
 
 
 def _draw_problem(gallery: Gallery) -> None:
@@ -329,6 +384,6 @@ def _draw_problem(gallery: Gallery) -> None:
         return
     ranges = "the ranges of the sampler (dotted; the paper's Table III)"
     caption = f"Sampled parameters of the {len(instances)} instances against {ranges}."
-    gallery.save("problem", "parameters", charts.parameters_figure(gallery.case, instances), caption)
+    gallery.add("problem", "parameters", caption, charts.parameters_figure, gallery.case, instances)
     caption = "Load forecasts of a sample of test instances."
-    gallery.save("problem", "forecasts", charts.forecasts_figure(gallery.case, instances), caption)
+    gallery.add("problem", "forecasts", caption, charts.forecasts_figure, gallery.case, instances)

@@ -71,16 +71,15 @@ def gaps(frame: pd.DataFrame) -> pd.DataFrame:
 def groups(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
     """(regime, method, settings, rows) in the order of the tables: as registered, others after."""
     known = list(METHODS)
-    keys = {tuple(key) for key in frame[GROUP].itertuples(index=False)}
+    parts = {(str(r), str(m), str(s)): rows for (r, m, s), rows in frame.groupby(GROUP, sort=False)}
 
     def place(key: tuple[str, ...]) -> tuple[object, ...]:
         regime, method, settings = key
         rank = known.index(method) if method in known else len(known)
         return regime, rank, method, settings != "default", natural(settings)
 
-    for regime, method, settings in sorted(keys, key=place):
-        chosen = (frame[GROUP] == [regime, method, settings]).all(axis=1)
-        yield regime, method, settings, frame[chosen]
+    for regime, method, settings in sorted(parts, key=place):
+        yield regime, method, settings, parts[regime, method, settings]
 
 
 def natural(text: str) -> tuple[tuple[str, int], ...]:

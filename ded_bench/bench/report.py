@@ -61,7 +61,7 @@ from ded_bench.problem.strict import write_atomically
 BUSY = 1.5
 
 
-def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
+def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> list[Path]:
     """Write tables, figures and the report of a results folder into it.
 
     Whatever is missing (times, policies, a method, all rows) is said in the report.
@@ -69,6 +69,7 @@ def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
     Args:
         folder: the results folder.
         problems: folder of the case's instances, split and manifest.
+        workers: processes that draw figures.
 
     Returns:
         The files written.
@@ -83,7 +84,7 @@ def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:
     timings = timing_frame(read_timing(folder / "timing.csv"))
     timing = latest_host(timings[timings["case"] == case.id])
     paper = paper_numbers(case)
-    gallery = draw(case, results, frame, timing, problems)
+    gallery = draw(case, results, frame, timing, problems, workers)
     frames = {
         "table_v": table_v(main_rows(frame), timing, paper),
         "table_vi": table_vi(main_rows(frame), paper),

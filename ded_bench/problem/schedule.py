@@ -60,13 +60,7 @@ class Schedule:
                 raise InputError(path, name, "column required once")
         if unknown := [name for name in header if name not in wanted]:
             raise InputError(path, unknown[0][:40], f"unknown column (expected {','.join(wanted)})")
-        values = np.empty((len(rows), len(header)))
-        for index, (number, row) in enumerate(rows):
-            if len(row) != len(header):
-                raise InputError(path, f"line {number}", f"{len(row)} values for {len(header)} columns")
-            for column, cell in enumerate(row):
-                values[index, column] = _number(cell, path, f"line {number}, {header[column]}")
-        values = values[:, [header.index(name) for name in wanted]]
+        values = _numbers(rows, header, path)[:, [header.index(name) for name in wanted]]
         schedule = Schedule(t=values[:, 0].copy(), p=values[:, 1:].copy())
         schedule.check(horizon_s, path)
         return schedule
@@ -109,11 +103,26 @@ def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]
     return [name.strip() for name in rows[0][1]], rows[1:]
 
 
-def _number(cell: str, path: str | Path, field: str) -> float:
+def _numbers(rows: list[tuple[int, list[str]]], header: list[str], path: str | Path) -> Array:
+    """The numbers of a table, shape (n_rows, n_columns); InputError names the first cell that is none."""
+    shape = len(rows), len(header)
+    try:
+        values = np.array([[float(cell) for cell in row] for _, row in rows]).reshape(shape)
+    except ValueError:  # some cell is no number, or some row too short or too long
+        values = np.full(shape, np.nan)
+    if not np.isfinite(values).all() or any("_" in cell for _, row in rows for cell in row):
+        for number, row in rows:
+            if len(row) != len(header):
+                raise InputError(path, f"line {number}", f"{len(row)} values for {len(header)} columns")
+            for column, cell in zip(header, row, strict=True):
+                _check_number(cell, path, f"line {number}, {column}")
+    return values
+
+
+def _check_number(cell: str, path: str | Path, field: str) -> None:
     try:
         value = float(cell)
     except ValueError:
         value = np.nan
     if not np.isfinite(value) or "_" in cell:
         raise InputError(path, field, f"{cell[:20]!r} is not a finite number")
-    return value

@@ -92,8 +92,11 @@ def simulate_many(
         theta[0] = np.stack([network.initial_angles(i) for i in instances])
         omega[0] = np.stack([i.omega_initial(case) for i in instances])
         angles = theta[0].copy()
+        slope: Array | None = None  # at the end of the last step, hence at the start of the next
 
         def rhs(t: float, y: Array) -> Array:
+            if slope is not None and t == grid[step]:
+                return slope
             angle, speed = y.reshape(2, batch, n_gen)
             inside = (t - grid[step]) / dt
             angles[:, network.generators] = angle
@@ -111,9 +114,9 @@ def simulate_many(
                 solver.step()
             if solver.status == "failed":
                 raise SimulationError("the integrator's step size vanished")
-            angle, omega[step + 1] = solver.y.reshape(2, batch, n_gen)
-            angles[:, network.generators] = angle
-            theta[step + 1] = angles[:] = network.solve_loads(angles, injection[step + 1])
+            # The last evaluation of a step is at its end, where the next one starts.
+            theta[step + 1], omega[step + 1] = angles, solver.y.reshape(2, batch, n_gen)[1]
+            slope = solver.f
     except PowerFlowError as error:
         raise SimulationError(f"the system cannot follow this schedule: {error}") from None
     p_slack = network.injections(theta)[:, :, network.slack]

@@ -141,7 +141,7 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
         {"w": np.zeros(2)},
         {"training": {"seconds": 123.5, "epochs": 7, "seed": 42, "model": "koopman"}},
     )
-    return write_report(ninebus, finished, problems)
+    return write_report(ninebus, finished, problems, workers=2)
 
 
 @pytest.fixture

@@ -7,17 +7,18 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from ded_bench.methods.solution import DEFAULT_MODEL, Settings
 from ded_bench.problem.arrays import read_arrays, write_arrays
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
+
+if TYPE_CHECKING:
+    from torch import nn
 
 SCHEMA = "ded-bench/policy/1"
 
@@ -91,6 +92,8 @@ def load_weights(network: nn.Module, arrays: dict[str, np.ndarray], path: str | 
     for name in expected.keys() | arrays.keys():
         if name not in arrays or arrays[name].shape != expected.get(name):
             raise InputError(path, name, "is missing, unknown or has the wrong shape")
+    import torch  # here only: who asks for a policy's name or header does without it
+
     network.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
 
 

@@ -125,22 +125,22 @@ class NumpyNetwork:
         padded = np.zeros((batch, n + 2 * margin, width), dtype=np.float32)
         columns = np.empty((batch * n, 3 * width), dtype=np.float32)
         inner, change = np.empty((2, batch, n, width), dtype=np.float32)
-        flat = batch * n, width
+        windows = columns.reshape(batch, n, 3, width)
+        inner_rows, change_rows = inner.reshape(-1, width), change.reshape(-1, width)
         h = padded[:, margin : margin + n]
         h += _neighbours(_padded(sequence), n, 1).reshape(batch, n, -1) @ self._first
         h += bias[:, 0]
         for i, (dilation, spread, mix, offset) in enumerate(self._blocks):
-            np.copyto(columns.reshape(batch, n, 3, width), _neighbours(padded, n, dilation))
-            np.matmul(columns, spread, out=inner.reshape(flat))
+            np.copyto(windows, _neighbours(padded, n, dilation))
+            np.dot(columns, spread, out=inner_rows)
             inner += bias[:, i + 1]
             np.maximum(inner, 0.0, out=inner)
-            np.matmul(inner.reshape(flat), mix, out=change.reshape(flat))
+            np.dot(inner_rows, mix, out=change_rows)
             h += change
             h += offset
         weight, offset = self._last
-        return np.asarray(np.maximum(h, 0.0).reshape(flat) @ weight + offset, dtype=np.float64).reshape(
-            batch, n, -1
-        )
+        corrections = np.maximum(h, 0.0).reshape(-1, width) @ weight + offset
+        return np.asarray(corrections, dtype=np.float64).reshape(batch, n, -1)
 
 
 def _window(weight: Array32) -> Array32:

@@ -340,11 +340,11 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
             "the fastest (top; times from the results table, under parallel load) or within a percentage of "
             "the cheapest schedule (bottom). Only feasible schedules count"
         )
-        caption += _without_curve(frame, objectives)
+        caption += without_curve(frame, objectives)
         gallery.add("profile", "profile", caption, charts.profile_figure, times, objectives)
 
 
-def _without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
+def without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
     """The end of the profiles' caption: methods that never gave a feasible schedule."""
     drawn = set(profile[GROUP].itertuples(index=False, name=None))
     absent = [

@@ -40,6 +40,9 @@ COST_TOLERANCE = 1e-8
 #: With a limit broken somewhere, every peak of |ω| above this part of the bound gets its row.
 NEAR = 0.8
 MAX_ROUNDS = 100
+#: What a schedule does at all points is computed in this many blocks of time: a knot moves nothing before
+#: it, and reading the map from memory is a fifth of a solve.
+N_BLOCKS = 8
 
 
 def artifact(case: Case, regime: str, settings: Settings) -> str:
@@ -97,8 +100,8 @@ class _Condensed(NamedTuple):
     """(ω, P_s) at the points as maps of x, the knots of all generators, and the LP that uses them."""
 
     knots: Array  # times, shape (n_knots,), s
-    omega: Array  # (n_gen, n_points, n_x)
-    slack: Array  # (n_points, n_x)
+    gamma: Array  # (n_gen + 1, n_points, n_x): of the ω, then of P_s
+    blocks: list[Array]  # the same by time, without the columns of knots that come later
     weight: Array  # (n_knots,): how often a knot counts in the sum over all points
     first: Indices  # first point of each piece, shape (n_pieces,)
     program: GrowingProgram  # variables (x, cost of each piece); rows: ramps, pieces as +P_s, as -P_s
@@ -110,15 +113,22 @@ def _condensed(model: _Model) -> _Condensed:
     grid = np.asarray(np.arange(model.steps + 1) * model.koopman.dt_s, dtype=np.float64)
     knots = np.linspace(0.0, float(grid[-1]), N_KNOTS, dtype=np.float64)
     gamma = model.koopman.condense(n_gen, grid, knots).reshape(len(grid), n_gen + 1, -1)
-    slack = np.ascontiguousarray(gamma[:, n_gen])
+    gamma = np.ascontiguousarray(np.moveaxis(gamma, 1, 0))
     first = np.unique(np.linspace(0, len(grid), N_PIECES, endpoint=False).astype(int))
-    pieces = sp.csr_matrix(np.add.reduceat(slack, first))
+    pieces = sp.csr_matrix(np.add.reduceat(gamma[n_gen], first))
     ramps = sp.csr_matrix(np.kron(np.diff(np.eye(N_KNOTS), axis=0), np.eye(n_gen)))
     above = sp.eye(len(first))
     blocks: Any = [[ramps, None], [pieces, -above], [-pieces, -above]]
     program = GrowingProgram(sp.csr_matrix(sp.bmat(blocks)))
-    omega = np.ascontiguousarray(np.moveaxis(gamma[:, :n_gen], 1, 0))
-    return _Condensed(knots, omega, slack, hat_functions(grid, knots).sum(axis=0), first, program)
+    held = hat_functions(grid, knots).sum(axis=0)
+    return _Condensed(knots, gamma, _causal_blocks(gamma), held, first, program)
+
+
+def _causal_blocks(gamma: Array) -> list[Array]:
+    """Cut a map from knots to points by time, each part without its last columns that are zero."""
+    parts = np.array_split(gamma, N_BLOCKS, axis=1)
+    used = [1 + int(np.flatnonzero(part.any(axis=(0, 1))).max(initial=0)) for part in parts]
+    return [np.ascontiguousarray(part[..., :n]) for part, n in zip(parts, used, strict=True)]
 
 
 class _Answer(NamedTuple):
@@ -137,7 +147,7 @@ def _solve(
         free: (ω, P_s) without generator power, shape (n_points, n_gen + 1).
         deadline: on the clock of `time.perf_counter`.
     """
-    n_gen, n_x = len(case.generators), condensed.slack.shape[1]
+    n_gen, n_x = len(case.generators), condensed.gamma.shape[2]
     bound, price = case.omega_bound(regime), instance.cost_slack(case)
     cost = np.outer(condensed.weight, instance.cost_gen(case)).ravel()
     _restart(case, condensed, instance, np.append(cost, np.full(len(condensed.first), price)), free)
@@ -149,8 +159,9 @@ def _solve(
         if status != Status.OPTIMAL:
             return _Answer(status, solution, np.nan, iterations)
         x, pieces = solution[:n_x], solution[n_x:]
-        omega = free[:, :n_gen].T + condensed.omega @ x
-        p_slack = free[:, n_gen] + condensed.slack @ x
+        values = np.concatenate([block @ x[: block.shape[2]] for block in condensed.blocks], axis=1)
+        values += free.T
+        omega, p_slack = values[:n_gen], values[n_gen]
         short = np.add.reduceat(np.abs(p_slack), condensed.first) - pieces
         objective = float(cost @ x + price * (pieces + short).sum())
         peaks = _peaks(omega, bound) - limited
@@ -159,7 +170,7 @@ def _solve(
             return _Answer(Status.OPTIMAL, x, objective, iterations)
         if peaks:
             g, k = np.array(sorted(peaks)).T
-            rows = np.hstack([condensed.omega[g, k], np.zeros((len(k), len(pieces)))])
+            rows = np.hstack([condensed.gamma[g, k], np.zeros((len(k), len(pieces)))])
             program.add(rows, -bound - free[k, g], bound - free[k, g])
             limited |= peaks
         if len(cuts):
@@ -211,14 +222,14 @@ def _short_pieces(short: Array, tolerance: float) -> Indices:
 
 def _cuts(condensed: _Condensed, free: Array, p_slack: Array, pieces: Indices) -> tuple[Array, Array, Array]:
     """Rows Σ sign(P_s) P_s <= variable of a piece, with the signs at the present solution."""
-    n_points, n_x = condensed.slack.shape
+    _, n_points, n_x = condensed.gamma.shape
     ends = np.append(condensed.first, n_points)
     rows = np.zeros((len(pieces), n_x + len(condensed.first)))
     upper = np.empty(len(pieces))
     for row, piece in enumerate(pieces.tolist()):
         points = slice(ends[piece], ends[piece + 1])
         sign = np.sign(p_slack[points])
-        rows[row, :n_x] = sign @ condensed.slack[points]
+        rows[row, :n_x] = sign @ condensed.gamma[-1, points]
         rows[row, n_x + piece] = -1.0
         upper[row] = -sign @ free[points]
     return rows, np.full(len(pieces), -np.inf), upper

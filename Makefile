@@ -83,8 +83,8 @@ bench: solve-baselines solve-dpc  ## time each method alone on the machine
 report: bench  ## everything that is missing, then Tables V and VI and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
-quick:  ## the same road with 4 instances and little training, about three minutes
-	$(MAKE) report RESULTS=results/quick LIMIT=4 TRAIN="--seconds 20 --limit 40" BENCH="--instances 1"
+quick:  ## the same road with 4 instances and little training, about ten minutes
+	$(MAKE) report RESULTS=results/quick LIMIT=4 TRAIN="--seconds 20 --limit 40" BENCH="--instances 1 --repeats 1"
 
 test: $(STAMP)  ## lint, type check and tests
 	$(BIN)/ruff check ded_bench tests

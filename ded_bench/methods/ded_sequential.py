@@ -52,7 +52,7 @@ def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injec
     gen, alg = network.generators, network.algebraic
     theta = np.zeros((len(theta_gen), network.n_bus))
     theta[:, gen] = theta_gen
-    theta = network.solve_loads(theta, network.load_injections(p_load))
+    theta, _ = network.solve_loads(theta, network.load_injections(p_load))
     weights = network.coupling * np.cos(theta @ network.incidence.T)
     full = np.einsum("li,nl,lj->nij", network.incidence, weights, network.incidence, optimize=True)
     rows = np.append(gen, network.slack)

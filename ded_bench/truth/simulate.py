@@ -101,9 +101,9 @@ def simulate_many(
             inside = (t - grid[step]) / dt
             angles[:, network.generators] = angle
             wanted = injection[step] + inside * (injection[step + 1] - injection[step])
-            angles[:] = network.solve_loads(angles, wanted)
+            angles[:], injections = network.solve_loads(angles, wanted)
             power = p_gen[step] + inside * (p_gen[step + 1] - p_gen[step])
-            force = network.injections(angles)[:, network.generators]
+            force = injections[:, network.generators]
             return np.concatenate([speed.ravel(), network.acceleration(speed, power, force).ravel()])
 
         for step in range(len(grid) - 1):

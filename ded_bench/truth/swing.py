@@ -88,12 +88,15 @@ class Network:
         full[..., self.loads] = p_load
         return full[..., self.algebraic]
 
-    def solve_loads(self, theta: Array, injection: Array) -> Array:
-        """Angles of all buses, given those of generators and slack, from L_i = f_i(θ) (index 1).
+    def solve_loads(self, theta: Array, injection: Array) -> tuple[Array, Array]:
+        """Angles and injections of all buses, given angles of generators and slack: L_i = f_i(θ), index 1.
 
         Args:
             theta: angles, shape (..., n_bus); load entries are Newton's first guess.
             injection: wanted injections at the algebraic buses (see `load_injections`).
+
+        Returns:
+            θ, rad, and f(θ), pu; each of shape (..., n_bus).
 
         Raises:
             PowerFlowError: no solution from this guess.
@@ -111,7 +114,7 @@ class Network:
         wanted = np.zeros((*shape, self.n_bus))
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
-        theta = self._newton(
+        theta, _ = self._newton(
             np.zeros((*shape, self.n_bus)), wanted[..., self.unknown], self.unknown, self._outer_unknown
         )
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
@@ -144,14 +147,15 @@ class Network:
         part = self.incidence[:, rows]
         return (part[:, :, None] * part[:, None, :]).reshape(len(part), -1)
 
-    def _newton(self, theta: Array, wanted: Array, rows: Array, outer: Array) -> Array:
+    def _newton(self, theta: Array, wanted: Array, rows: Array, outer: Array) -> tuple[Array, Array]:
         theta = np.array(theta)
         n = len(rows)
         for _ in range(NEWTON_STEPS):
             across = theta @ self.incidence.T
-            mismatch = ((np.sin(across) * self.coupling) @ self.incidence)[..., rows] - wanted
+            injections = (np.sin(across) * self.coupling) @ self.incidence
+            mismatch = injections[..., rows] - wanted
             if np.abs(mismatch).max() < MISMATCH:
-                return theta
+                return theta, injections
             jacobian = ((np.cos(across) * self.coupling) @ outer).reshape(*theta.shape[:-1], n, n)
             try:
                 theta[..., rows] -= np.linalg.solve(jacobian, mismatch[..., None])[..., 0]

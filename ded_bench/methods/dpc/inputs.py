@@ -69,17 +69,10 @@ class Channels:
         demand = -p_load.sum(axis=-1)
         prior = _dispatch(case, inputs.cost, demand)
         p_slack = demand - prior.sum(axis=-1)
-        cost, slack = inputs.cost[:, 1:], inputs.cost[:, :1]
-        first, second = _pairs(cost.shape[1])
-        constants = (
-            inputs.cost / _positive(inputs.cost.sum(axis=1, keepdims=True)),
-            cost / _positive(cost + slack),
-            (cost[:, first] - cost[:, second]) / _positive(cost[:, first] + cost[:, second]),
-            inputs.p_initial,
-            inputs.omega,
-        )
+        above, below = _cost_ratios(prior.shape[2])
+        ratios = (inputs.cost @ above) / np.maximum(inputs.cost @ below, 1e-9)
         sequence = np.concatenate([p_load, bend, prior, p_slack[:, :, None]], axis=-1)
-        return Channels(sequence, np.concatenate(constants, axis=1), prior)
+        return Channels(sequence, np.concatenate([ratios, inputs.p_initial, inputs.omega], axis=1), prior)
 
     def with_prior(self, case: Case, dispatch: bool) -> Channels:
         """The same channels, with the static dispatch or the middle of the range as what is corrected."""
@@ -145,14 +138,20 @@ def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
 
 
 @functools.cache
-def _pairs(n_gen: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.triu_indices(n_gen, 1)
+def _cost_ratios(n_gen: int) -> tuple[Array, Array]:
+    """Numerators and denominators of ratios of costs, as maps of (slack, generators).
+
+    Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
+    difference in the sum.
+    """
+    unit = np.eye(1 + n_gen)
+    slack, generators = unit[:, :1], unit[:, 1:]
+    first, second = np.triu_indices(n_gen, 1)
+    above = [unit, generators, generators[:, first] - generators[:, second]]
+    below = [np.ones_like(unit), generators + slack, generators[:, first] + generators[:, second]]
+    return np.hstack(above), np.hstack(below)
 
 
 @functools.cache
 def _before(n_gen: int) -> np.ndarray:
     return np.tri(n_gen, k=-1, dtype=bool)
-
-
-def _positive(value: Array) -> Array:
-    return np.maximum(value, 1e-9)

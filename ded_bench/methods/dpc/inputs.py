@@ -76,8 +76,10 @@ class Channels:
 
     def with_prior(self, case: Case, dispatch: bool) -> Channels:
         """The same channels, with the static dispatch or the middle of the range as what is corrected."""
+        if dispatch:
+            return self
         middle = np.broadcast_to(0.5 * (case.p_min + case.p_max), self.prior.shape)
-        return self if dispatch else Channels(self.sequence, self.constants, middle)
+        return Channels(self.sequence, self.constants, middle)
 
     def static_cost(self, inputs: Inputs) -> Array:
         """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""
@@ -111,12 +113,14 @@ def _loads_and_bends(inputs: Inputs, knots: Array) -> tuple[Array, Array]:
     initial, start, duration, rate = (inputs.ramps[:, None, :, i] for i in range(4))
     since = np.maximum(knots[:, None] - start, 0.0)
     into = np.minimum(since, duration)
-    p_load = initial + rate * into
-    area = into * (since - 0.5 * into)  # ∫ into dt
-    mean = rate * (area[:, 1:] - area[:, :-1]) / (knots[1] - knots[0])
-    bend = np.zeros_like(p_load)
-    bend[:, 1:] = mean - 0.5 * rate * (into[:, 1:] + into[:, :-1])
-    return p_load, bend
+    half = 0.5 * into
+    area = into * (since - half)  # ∫ into dt
+    bend = np.zeros_like(into)
+    np.subtract(area[:, 1:], area[:, :-1], out=bend[:, 1:])
+    bend[:, 1:] *= 1.0 / (knots[1] - knots[0])
+    bend[:, 1:] -= half[:, 1:] + half[:, :-1]
+    bend *= rate
+    return initial + rate * into, bend
 
 
 def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
@@ -127,14 +131,16 @@ def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
         demand: shape (batch, n_knots), pu.
     """
     cost_gen, cost_slack = cost[:, 1:], cost[:, :1]
-    room = np.where(cost_gen < cost_slack, case.p_max - case.p_min, 0.0)
+    room = (cost_gen < cost_slack) * (case.p_max - case.p_min)
     # what generators that come earlier in the merit order can deliver; ties go by position
-    earlier = (cost_gen[:, None, :] < cost_gen[:, :, None]) | (
-        (cost_gen[:, None, :] == cost_gen[:, :, None]) & _before(room.shape[1])
-    )
-    below = (earlier * room[:, None, :]).sum(axis=2)
-    residual = (demand - case.p_min.sum())[:, :, None] - below[:, None]
-    return np.asarray(case.p_min + np.minimum(np.maximum(residual, 0.0), room[:, None]))
+    others, own = cost_gen[:, None, :], cost_gen[:, :, None]
+    earlier = np.where(_before(room.shape[1]), others <= own, others < own)
+    below = (earlier @ room[:, :, None])[:, None, :, 0] + case.p_min.sum()
+    raised = demand[:, :, None] - below
+    np.maximum(raised, 0.0, out=raised)
+    np.minimum(raised, room[:, None], out=raised)
+    raised += case.p_min
+    return raised
 
 
 @functools.cache

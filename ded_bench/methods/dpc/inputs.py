@@ -136,7 +136,7 @@ def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
     others, own = cost_gen[:, None, :], cost_gen[:, :, None]
     earlier = np.where(_before(room.shape[1]), others <= own, others < own)
     below = (earlier @ room[:, :, None])[:, None, :, 0] + case.p_min.sum()
-    raised = demand[:, :, None] - below
+    raised: Array = demand[:, :, None] - below
     np.maximum(raised, 0.0, out=raised)
     np.minimum(raised, room[:, None], out=raised)
     raised += case.p_min

@@ -32,7 +32,7 @@ from ded_bench.bench.figures import (
     plain,
     thin,
 )
-from ded_bench.bench.metrics import GROUP, title
+from ded_bench.bench.metrics import GROUP, natural, title
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -119,7 +119,12 @@ def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
         times, objectives: see `metrics.performance_profile`.
     """
     regimes = sorted({*times["regime"], *objectives["regime"]})
-    titles = pd.concat([times["title"], objectives["title"]]).nunique()
+    drawn = pd.concat([times, objectives])[["method", "settings", "title"]].drop_duplicates()
+    variants = {
+        str(method): ["default", *sorted({*slugs} - {"default"}, key=natural)]
+        for method, slugs in drawn.groupby("method")["settings"]
+    }
+    titles = drawn["title"].nunique()
     with new_figure(7.2, 4.6 + 0.2 * -(-titles // 3)) as figure:
         axes = figure.subplots(2, max(len(regimes), 1), sharey=True, sharex="row", squeeze=False)
         handles: list[Line2D] = []
@@ -129,6 +134,7 @@ def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
                 limit = _last(profile["ratio"], is_gap)
                 for key, curve in part.groupby(GROUP[1:], sort=False):
                     method, settings = (str(part) for part in key)
+                    variant = variants[method].index(settings)
                     ratio = np.array(curve["ratio"], dtype=float)
                     x = _excess(ratio) if is_gap else ratio
                     x = np.concatenate([x[:1], x, [limit]])
@@ -138,7 +144,7 @@ def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
                         y,
                         where="post",
                         color=colour(method),
-                        dashes=dashes(method, settings) or (None, None),
+                        dashes=dashes(method, variant) or (None, None),
                         linewidth=1.4 if settings == "default" else 0.9,
                         label=plain(str(curve["title"].iloc[0])),
                     )

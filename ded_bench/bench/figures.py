@@ -6,7 +6,6 @@ print in grey. Nothing here touches pyplot's global state.
 
 from __future__ import annotations
 
-import functools
 import io
 import re
 from collections.abc import Iterator, Sequence
@@ -112,31 +111,24 @@ def marker(method: str) -> str:
     return MARKERS[(known.index(method) if method in known else len(known)) % len(MARKERS)]
 
 
-def dashes(method: str, settings: str = "default") -> tuple[float, ...]:
-    """A line style that tells a method's settings apart, and methods in print; DED is solid."""
-    if (method, settings) == REFERENCE:
+def dashes(method: str, variant: int = 0) -> tuple[float, ...]:
+    """A line style that tells methods apart in print, and a method's settings; DED is solid.
+
+    Args:
+        variant: which of the method's settings in the figure; 0 are its default.
+    """
+    if (method, variant) == (REFERENCE[0], 0):
         return ()
     known = list(METHODS)
     place = known.index(method) if method in known else len(known)
-    return DASHES[1 + (place + variant(method, settings)) % (len(DASHES) - 1)]
-
-
-@functools.cache
-def variant(method: str, settings: str) -> int:
-    """Which of a method's settings: 0 the default, others in the method's order, unknown ones after them."""
-    if settings == "default":
-        return 0
-    known = [name for name in METHODS[method].settings if name != "default"] if method in METHODS else []
-    if settings in known:
-        return 1 + known.index(settings)
-    return 1 + len(known) + sum(settings.encode()) % len(DASHES)
+    return DASHES[1 + (place + variant) % (len(DASHES) - 1)]
 
 
 def _draw(ax: Axes, shown: Shown, t: Array, values: Array) -> Line2D:
     (line,) = ax.plot(
         *thin(t, values),
         color=colour(shown.method),
-        dashes=dashes(shown.method, shown.settings) or (None, None),
+        dashes=dashes(shown.method) or (None, None),
         label=plain(title(shown.method, shown.settings)),
     )
     return line

@@ -4,60 +4,32 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import hashlib
 import json
 import math
 import re
 import shutil
-from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
-from ded_bench.bench import gallery
-from ded_bench.bench.certificate import Certificate, save_certificate
 from ded_bench.bench.layout import GAPS, TABLE_V, TABLE_VI
-from ded_bench.bench.page import Heading, Items, Picture, Table, Text, Warnings, render_html, render_markdown
 from ded_bench.bench.report import write_report
 from ded_bench.bench.results import Key, Results, Row
 from ded_bench.bench.run import scored_row
 from ded_bench.bench.selection import figure_schedules, plan
-from ded_bench.bench.tables import Column, to_html, to_latex, to_markdown
 from ded_bench.bench.timing import TimingRow, format_timing
 from ded_bench.koopman.physics import linear_model
 from ded_bench.problem.arrays import write_arrays
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import load_split, write_benchmark
+from ded_bench.problem.sampling import load_split
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.strict import write_atomically, write_record
 from ded_bench.truth.score import score_many
-
-HORIZON = 1.0
-TEST, TRAIN = 5, 3
-
-
-@pytest.fixture(scope="module")
-def problems(ninebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A benchmark of eight instances of one second."""
-    folder = tmp_path_factory.mktemp("problems")
-    write_benchmark(ninebus, TEST + TRAIN, 3, folder)
-    names = sorted(path.stem for path in (folder / "instances").glob("*.json"))
-    for path in (folder / "instances").glob("*.json"):
-        instance, _ = Instance.load_file(path, ninebus)
-        write_record(instance.model_copy(update={"horizon_s": HORIZON}), path)
-    split = load_split(folder)
-    write_record(
-        split.model_copy(update={"test": tuple(names[:TEST]), "train": tuple(names[TEST:])}),
-        folder / "split.json",
-    )
-    return folder
+from tests.bench.conftest import TEST, TRAIN
+from tests.bench.reading import Page
 
 
 def dispatch(case: Case, instance: Instance, lag: float) -> Schedule:
@@ -144,19 +116,6 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
     return write_report(ninebus, finished, problems, workers=2)
 
 
-@pytest.fixture
-def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files of figures hold a digest of what is drawn instead of the drawing, which takes long."""
-
-    def sketch(figure: Figure, stem: Path, formats: tuple[str, ...], dpi: int) -> None:
-        lines = [line for ax in figure.axes for line in ax.get_lines()]
-        drawn = b"".join(np.asarray(line.get_ydata(), dtype=float).tobytes() for line in lines)
-        for form in formats:
-            write_atomically(stem.parent / f"{stem.name}.{form}", hashlib.sha256(drawn).hexdigest())
-
-    monkeypatch.setattr(gallery, "save_figure", sketch)
-
-
 def copy(finished: Path, tmp_path: Path) -> Path:
     return Path(
         shutil.copytree(finished, tmp_path / "copy", ignore=shutil.ignore_patterns("figures", "tables"))
@@ -170,31 +129,6 @@ def cells(markdown: str, heading: str) -> list[list[str]]:
     assert lines
     rows = [line.strip().strip("|").split(" | ") for line in lines.group(1).splitlines()]
     return [[cell.strip() for cell in row] for row in rows[2:]]
-
-
-class Page(HTMLParser):
-    """Collects what a browser would load, and the text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def every(self, tag: str) -> Iterator[dict[str, str | None]]:
-        return (attributes for name, attributes in self.tags if name == tag)
 
 
 def test_every_file_is_written(report: list[Path], finished: Path) -> None:
@@ -356,34 +290,6 @@ def test_kept_schedules_are_enough_for_the_same_figures(
 
 
 @pytest.mark.usefixtures("sketched")
-def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
-    files = write_report(ninebus, tmp_path / "empty", problems)
-    text = (tmp_path / "empty" / "report.md").read_text()
-    assert "No rows yet" in text
-    assert "ded-bench solve" in text
-    assert "run `ded-bench bench`" in text
-    assert "`ded-bench train-dpc` trains one" in text
-    made = pd.read_csv(tmp_path / "empty" / "tables" / "table_v.csv")
-    assert made["paper_solve_s"].tolist() == [32.34, 17.34, 6.8e-4, 32.38, 18.8, 6.8e-4]
-    assert (made["n"] == 0).all()
-    assert all(path.is_file() for path in files)
-
-
-@pytest.mark.usefixtures("sketched")
-def test_another_case_has_no_paper_columns_filled(threebus: Case, tmp_path: Path) -> None:
-    """And rows of other cases in the folder are not its own."""
-    folder = tmp_path / "other"
-    Results(folder).add(
-        [Row("x", "test", "TO", "ded", "default", "Optimal", objective=1.0, case="elsewhere")]
-    )
-    write_report(threebus, folder, tmp_path / "no-problems")
-    text = (folder / "report.md").read_text()
-    assert "No rows yet" in text
-    assert "The problem files cannot be read" in text
-    assert len(pd.read_csv(folder / "tables" / "table_v.csv")) == 0
-
-
-@pytest.mark.usefixtures("sketched")
 def test_broken_pieces_are_named_and_left_out(
     ninebus: Case, problems: Path, finished: Path, tmp_path
 ) -> None:
@@ -404,41 +310,6 @@ def test_broken_pieces_are_named_and_left_out(
     for name in ("koopman/bad.safetensors", "policies/bad.safetensors", "bad.history.csv", broken.name):
         assert name in text
     assert "certificate cannot be read" in text
-
-
-@pytest.mark.usefixtures("sketched")
-def test_certificate_is_shown(ninebus: Case, problems: Path, tmp_path: Path) -> None:
-    facts = {
-        "case": "9bus",
-        "method": "ded-dpc",
-        "reference": "ded-ko-knots",
-        "regime": "TO",
-        "settings": "default",
-        "seed": 2_000_000,
-        "count": 10_000,
-        "successes": 9_950,
-        "meets_limits": 9_960,
-        "near_reference": 9_970,
-        "tolerance_hz": 1e-6,
-        "tolerance_pu": 1e-8,
-        "gap_percent": 1.0,
-        "delta": 0.01,
-        "clopper_pearson": 0.9931,
-        "hoeffding": 0.9798,
-        "artifacts": "abc",
-        "version": "0",
-        "host": "here",
-        "date": "2026-01-01T00:00:00Z",
-    }
-    save_certificate(tmp_path, Certificate(**facts))
-    save_certificate(tmp_path, Certificate(**facts | {"regime": "NO"}))
-    save_certificate(tmp_path, Certificate(**facts | {"successes": 9_951}))
-    write_report(ninebus, tmp_path, problems)
-    text = (tmp_path / "report.md").read_text()
-    assert "at least 99.31% of fresh TO instances meet every limit" in text
-    assert "| TO | DED-DPC | 10000 | 9951 | 9960 | 9970 | 99.31 % | 97.98 % |" in text
-    assert "9950 of 10000" in text  # NO
-    assert text.count("of 10000 did") == 2  # the third replaced the first
 
 
 @pytest.mark.usefixtures("sketched")
@@ -483,15 +354,6 @@ def test_what_cannot_be_compared_is_said(
 
 
 @pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize("name", ["results.csv", "timing.csv"])
-def test_a_wrong_table_is_bad_input(ninebus: Case, problems: Path, tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text("a,b\n1,2\n")
-    with pytest.raises(InputError) as caught:
-        write_report(ninebus, tmp_path, problems)
-    assert name in caught.value.source
-
-
-@pytest.mark.usefixtures("sketched")
 def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
     ninebus, problems, finished, tmp_path
 ) -> None:
@@ -503,72 +365,6 @@ def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
     assert not list((folder / "figures").glob("schedule_*"))
     assert len(pd.read_csv(folder / "tables" / "summary.csv")) == 1
     assert "no trajectory is drawn" in (folder / "report.md").read_text()
-
-
-FRAME = pd.DataFrame(
-    {"regime": ["NO", "NO", "TO"], "x": [1.23456e-9, np.nan, 12.0], "n": [1, 2, 3], "s": ["a|b", "&", ""]}
-)
-COLUMNS = (Column("regime", "Regime"), Column("x", "x_1 (%)"), Column("n", "n"), Column("s", "text"))
-
-
-def test_markdown_table() -> None:
-    lines = to_markdown(FRAME, COLUMNS).splitlines()
-    assert lines[0] == "| Regime | x_1 (%) | n | text |"
-    assert lines[1] == "| --- | ---: | ---: | --- |"
-    assert lines[2:] == ["| NO | 1.23e-09 | 1 | a\\|b |", "| NO | – | 2 | & |", "| TO | 12 | 3 |  |"]
-
-
-def test_latex_table() -> None:
-    text = to_latex(FRAME, COLUMNS, "50 % & more_", "tab:x")
-    assert "\\begin{tabular}{lrrl}" in text
-    assert "Regime & x\\_1 (\\%) & n & text \\\\" in text
-    assert "NO & $1.23 \\times 10^{-9}$ & 1 & a|b \\\\" in text
-    assert "     & -- & 2 & \\& \\\\" in text
-    assert text.count("\\midrule") == 2
-    assert "\\caption{50 \\% \\& more\\_}" in text
-    assert text.count("{") == text.count("}")
-
-
-def test_html_table() -> None:
-    page = Page(to_html(FRAME, COLUMNS))
-    assert not page.open
-    assert [a.get("class") for a in page.every("tr")] == [None, None, None, "first"]
-    assert [a.get("class") for a in page.every("td")][:4] == [None, "number", "number", None]
-
-
-def test_both_renderings_of_every_block(tmp_path: Path) -> None:
-    (tmp_path / "p.png").write_bytes(b"picture")
-    blocks = [
-        Heading("A <title>", 1),
-        Warnings(("watch `out`",)),
-        Heading("Part one"),
-        Text("some **bold** & `code`"),
-        Items(("first", "second")),
-        Table(FRAME, COLUMNS, "caption"),
-        Picture("p.png", "a `picture`"),
-    ]
-    markdown = render_markdown(blocks)
-    for part in (
-        "# A &lt;title>",
-        "> **Note:** watch `out`",
-        "## Part one",
-        "- second",
-        "**caption**",
-        "](p.png)",
-    ):
-        assert part in markdown
-    text = render_html(blocks, tmp_path)
-    page = Page(text)
-    assert not page.open
-    for part in (
-        "<strong>bold</strong> &amp; <code>code</code>",
-        "<li>second</li>",
-        'href="#part-one"',
-        'id="part-one"',
-    ):
-        assert part in text
-    assert "A <title>" in page.text
-    assert base64.b64encode(b"picture").decode() in text
 
 
 def test_keys_of_the_plan_include_ded_for_comparison(finished: Path) -> None:

@@ -15,8 +15,9 @@ REGIMES := NO TO
 POLICIES := ded-dpc-paper ded-dpc
 MODELS := linear koopman-single koopman-paper
 STEPS  := steps25 steps50 steps100 steps1000
-STUDIES := study study-narrow study-wide study-near study-shallow study-no-dispatch study-no-bends \
-  study-no-prior study-raw study-constant study-batch32 study-batch512 study-fresh4000
+STUDIES := study study-narrow study-wide study-near study-shallow study-one-stage study-three-stages \
+  study-no-response study-no-dispatch study-no-bends study-no-prior study-raw study-constant \
+  study-batch32 study-batch512 study-fresh4000
 
 CHOICE   = --case $(CASE) --split $(SPLIT) $(if $(LIMIT),--limit $(LIMIT))
 

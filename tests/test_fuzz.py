@@ -30,7 +30,9 @@ from ded_bench.bench.results import Results, Row, format_rows, read_rows
 from ded_bench.bench.timing import TimingRow, format_timing, read_timing
 from ded_bench.koopman.physics import linear_model
 from ded_bench.methods.dpc import ded_dpc, policy
-from ded_bench.methods.dpc.network import ResidualNetwork
+from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.network import StagedNetwork
+from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import Scope
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
@@ -96,7 +98,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     with torch.random.fork_rng():
         torch.manual_seed(0)
         plain = policy.PaperNetwork(policy.n_channels(case), case.p_min, case.p_max)
-        network = ResidualNetwork.make(case, 4, (1, 2))
+        response = Response.make(case, knot_times(instance.horizon_s, ded_dpc.N_KNOTS))
+        network = StagedNetwork(case, response, 2, 4, (1, 2))
     policy.Policy(case, "TO", 0.05, plain, {"seed": 0}).save(folder / "paper.safetensors")
     ded_dpc.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
     return folder

@@ -87,11 +87,16 @@ def energy_form(case: Case, theta: Array) -> EnergyForm:
     return EnergyForm(skew, dissipation, energy, feedthrough)
 
 
-def linear_model(case: Case) -> Koopman:
+def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
     """The linearisation at the nominal point, exactly discretised: the yardstick (kind `linear`).
 
     It starts from the linearised P_s and N of x_0, as a linear model of the DAE would.
+
+    Args:
+        case: the grid.
+        dt_s: step, s; the case's own by default.
     """
+    dt_s = case.sampling.dt_s if dt_s is None else dt_s
     network = Network(case)
     theta = network.power_flow(case.p_nominal, case.load_nominal)
     linear = network.linearise(theta)
@@ -104,7 +109,7 @@ def linear_model(case: Case) -> Koopman:
     b = steady_state(case)
     form = energy_form(case, theta)
     block = np.zeros((4 * n, 4 * n))
-    block[: 2 * n, : 2 * n] = a * case.sampling.dt_s
+    block[: 2 * n, : 2 * n] = a * dt_s
     block[: 2 * n, 2 * n :] = np.eye(2 * n)
     exact = expm(block)
     k, phi = exact[: 2 * n, : 2 * n], exact[: 2 * n, 2 * n :]
@@ -123,7 +128,7 @@ def linear_model(case: Case) -> Koopman:
         kind="linear",
         case_id=case.id,
         case_fingerprint=case.fingerprint,
-        dt_s=case.sampling.dt_s,
+        dt_s=dt_s,
         k=k,
         b=b,
         g=b + phi @ (form.feedthrough - b),

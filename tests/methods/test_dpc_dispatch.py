@@ -16,8 +16,9 @@ from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
 from ded_bench.methods.dpc.follower import Clip, Follow, follow
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import NumpyNetwork, ResidualNetwork
+from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import Scope, policy_file
 from ded_bench.methods.solution import Settings, Status
 from ded_bench.problem.case import Case
@@ -45,26 +46,46 @@ def some_instances(case: Case, count: int, first: int = 0, horizon: float = HORI
     return chosen
 
 
-def random_network(case: Case, size: float = 1.0) -> ResidualNetwork:
-    """A network whose last layer is not zero, with inputs normalised."""
+def response_of(case: Case, horizon: float = HORIZON) -> Response:
+    return Response.make(case, knot_times(horizon, N_KNOTS))
+
+
+def channels_of(case: Case, inputs: Inputs) -> Channels:
+    return Channels.of(case, inputs, response_of(case))
+
+
+def random_network(case: Case, size: float = 1.0, horizon: float = HORIZON) -> StagedNetwork:
+    """A network whose last layers are not zero, with inputs normalised."""
     torch.manual_seed(0)
-    network = ResidualNetwork.make(case)
-    torch.nn.init.normal_(network.last.weight, std=size)
-    network.normalise(Channels.of(case, Inputs.of(case, some_instances(case, 20)), KNOTS))
+    response = response_of(case, horizon)
+    network = StagedNetwork(case, response, 2, 16, (1, 2, 4))
+    for stage in network.stages:
+        torch.nn.init.normal_(stage.last.weight, std=size)
+    inputs = Inputs.of(case, some_instances(case, 20, horizon=horizon))
+    network.normalise(Channels.of(case, inputs, response), response)
     return network.eval()
 
 
 def random_policy(case: Case, size: float = 1.0, horizon: float = HORIZON) -> DispatchPolicy:
     scope = Scope(case, next(iter(case.regimes)), horizon)
-    return DispatchPolicy(scope, random_network(case, size), {"seed": 0})
+    return DispatchPolicy(scope, random_network(case, size, horizon), {"seed": 0})
+
+
+def tensors(channels: Channels) -> list[torch.Tensor]:
+    """What the network takes, in float32."""
+    arrays = channels.start, channels.undriven, channels.sequence, channels.constants
+    return [torch.as_tensor(a, dtype=torch.float32) for a in arrays]
 
 
 def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
     inputs = Inputs.of(case, some_instances(case, 30))
     inputs.cost[:10] = np.round(inputs.cost[:10])  # ties, and costs of zero
-    channels = Channels.of(case, inputs, KNOTS)
+    channels = channels_of(case, inputs)
     expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(KNOTS))
-    np.testing.assert_allclose(channels.prior, expected, atol=1e-12)
+    static = channels.sequence[..., sequence_groups(case)["dispatch"]][..., :-1]
+    np.testing.assert_allclose(static, expected, atol=1e-12)
+    step = case.ramp_pu_per_s * KNOTS[1]
+    np.testing.assert_array_equal(channels.start, follow(static[:, 1:], inputs.p_initial, step))
     p_slack = -inputs.p_load(KNOTS).sum(axis=2) - expected.sum(axis=2)
     total = (expected * inputs.cost[:, None, 1:]).sum(axis=2) + inputs.cost[:, :1] * np.abs(p_slack)
     np.testing.assert_allclose(channels.static_cost(inputs), total.mean(axis=1), atol=1e-12)
@@ -73,7 +94,7 @@ def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
 
 def test_bends_say_what_loads_do_between_knots(case: Case) -> None:
     instances = some_instances(case, 5)
-    channels = Channels.of(case, Inputs.of(case, instances), KNOTS)
+    channels = channels_of(case, Inputs.of(case, instances))
     n_load, spacing = len(case.loads), KNOTS[1]
     for b, instance in enumerate(instances):
         fine = np.linspace(0.0, HORIZON, (N_KNOTS - 1) * 400 + 1)
@@ -100,7 +121,7 @@ def test_bounds_ramps_and_initial_input_hold_for_any_weights(case: Case, size: f
         assert np.maximum(p - case.p_max, case.p_min - p).max() <= 1e-12
         np.testing.assert_array_equal(p[0], instance.p_initial(case))
     moved = np.abs(np.diff([s.p for s in policy(instances)], axis=1)).max()
-    assert moved == pytest.approx(policy.step)  # the limit was reached
+    assert moved == pytest.approx(policy.network.step)  # the limit was reached
 
 
 def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case) -> None:
@@ -148,14 +169,33 @@ def test_clip_lets_descent_lead_back_inside() -> None:
 
 def test_numpy_twin_equals_the_torch_network(case: Case) -> None:
     network = random_network(case)
-    channels = Channels.of(case, Inputs.of(case, some_instances(case, 9)), KNOTS)
+    channels = channels_of(case, Inputs.of(case, some_instances(case, 9)))
     with torch.no_grad():
-        expected = network(
-            *(torch.as_tensor(a, dtype=torch.float32) for a in (channels.sequence, channels.constants))
-        )
-    twin = NumpyNetwork(network)
-    np.testing.assert_allclose(twin(channels), expected.numpy(), rtol=1e-4, atol=1e-5)
-    assert expected.abs().max() > 0.1
+        expected = network(*tensors(channels)).numpy()
+    twin = NumpyStages(case, response_of(case), network)
+    np.testing.assert_allclose(twin(channels), expected, rtol=1e-4, atol=1e-4)
+    assert np.abs(expected - channels.start).max() > 0.05
+
+
+def test_the_response_is_the_linear_models(case: Case) -> None:
+    """Condensed in coarse steps, from equilibrium: the rollout in fine ones."""
+    rng, response = np.random.default_rng(0), response_of(case)
+    fine = linear_model(case, response.nodes[1] / 8)
+    grid = np.linspace(0.0, HORIZON, 8 * (len(response.nodes) - 1) + 1)
+    n_gen, n_load = len(case.generators), len(case.loads)
+    omega = rng.normal(0.0, 0.01, (3, n_gen))
+    loads = -rng.uniform(0.5, 1.5, (3, len(response.nodes), n_load))
+    powers = rng.uniform(0.5, 1.5, (3, N_KNOTS, n_gen))
+    seen = response(response.undriven(omega, loads), powers).reshape(3, N_KNOTS, 2, n_gen + 1)
+    for b in range(3):
+        columns = [np.interp(grid, KNOTS, column) for column in powers[b].T]
+        columns += [np.interp(grid, response.nodes, column) for column in loads[b].T]
+        inputs = np.stack(columns, axis=1)
+        outputs = fine.rollout(fine.b @ inputs[0] + np.pad(omega[b], (0, n_gen)), inputs)[:, : n_gen + 1]
+        np.testing.assert_allclose(seen[b, :, 0], outputs[::16], atol=1e-5)  # float32
+        np.testing.assert_allclose(seen[b, 1:, 1], outputs[8::16], atol=1e-5)
+        np.testing.assert_array_equal(seen[b, 0, 0], seen[b, 0, 1])
+        assert np.ptp(outputs, axis=0).min() > 1e-2
 
 
 def test_batches_threads_and_single_calls_agree(threebus: Case) -> None:
@@ -199,24 +239,28 @@ def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
 def test_gradient_of_the_loss_matches_finite_differences(threebus: Case) -> None:
     model, instances = linear_model(threebus), some_instances(threebus, 3)
     inputs, stride = Inputs.of(threebus, instances), 10
-    channels = Channels.of(threebus, inputs, KNOTS)
+    channels = channels_of(threebus, inputs)
     free = coarse_free_response(Network(threebus), model, inputs, instances[0].grid, stride)
-    pool = Pool.of(threebus, channels, inputs, free, len(instances[0].grid))
+    pool = Pool.of(channels, inputs, free, len(instances[0].grid))
     pool = Pool(*(getattr(pool, name).double() for name in pool.__dataclass_fields__))
-    low, high = torch.as_tensor(threebus.p_min) - 5, torch.as_tensor(threebus.p_max) + 5  # `Clip` is apart
     objective = Objective.make(threebus, model, instances[0].grid, KNOTS, stride, torch.float64)
-    loss = Loss(objective, low, high, 1.0, 1e-3, 0.1)
-    network = random_network(threebus, 0.1).double()
+    loss = Loss(objective, 1e-3, 0.1)
+    network = random_network(threebus, 0.003).double()
+    network.step = 1.0
+    for limit in (network.low.sub_, network.high.add_):  # `Clip` is tested apart
+        limit(5.0)
 
     def total() -> torch.Tensor:
         cost, excess = loss(loss.powers(network, pool), pool, 0.03)
         return cost.sum() + ded_dpc_train._penalty(excess).sum()
 
     total().backward()
+    first, second = network.stages
     for weight, index in (
-        (network.last.bias, (0,)),
-        (network.mix[2].bias, (3,)),
-        (network.embed[2].bias, (40,)),
+        (second.last.bias, (0,)),
+        (first.mix[2].bias, (3,)),
+        (first.last.bias, (0,)),
+        (second.embed[2].bias, (40,)),
     ):
         with torch.no_grad():
             weight[index] += 1e-6
@@ -277,31 +321,24 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
 def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path) -> None:
     """What was trained is what the file answers with, without the prior and blind to the dispatch."""
     path = tmp_path / "v.safetensors"
-    options = {"width": 8, "dilations": (1, 2), "batch": 16, "rate": "constant", "epochs": 2}
-    policy = short_training(threebus, path, prior=False, blind=("dispatch",), **options)
-    assert policy.training["variant"] == {
-        "width": 8,
-        "dilations": (1, 2),
-        "batch": 16,
-        "rate": "constant",
-        "prior": False,
-        "blind": ("dispatch",),
-    }
+    options = {"stages": 1, "width": 8, "dilations": (1, 2), "batch": 16, "rate": "constant"}
+    options |= {"prior": False, "blind": ("dispatch", "response")}
+    policy = short_training(threebus, path, epochs=2, **options)
+    assert policy.training["variant"] == options
     loaded = DispatchPolicy.load(path, threebus, policy.scope.regime)
     inputs = Inputs.of(threebus, some_instances(threebus, 4))
     np.testing.assert_array_equal(loaded.powers(inputs), policy.powers(inputs))
-    channels = Channels.of(threebus, inputs, policy.knots)
-    sequence = torch.as_tensor(channels.sequence, dtype=torch.float32)
+    channels = policy.channels(inputs)
+    middle = np.broadcast_to(0.5 * (threebus.p_min + threebus.p_max), channels.start[:, 1:].shape)
+    np.testing.assert_array_equal(channels.start, follow(middle, inputs.p_initial, policy.network.step))
+    start, undriven, sequence, constants = tensors(channels)
     other = sequence.clone()
     other[..., sequence_groups(threebus)["dispatch"]] += 0.3
-    constants = torch.as_tensor(channels.constants, dtype=torch.float32)
     with torch.no_grad():
-        seen, unseen = policy.network(sequence, constants), policy.network(other, constants)
+        seen = policy.network(start, undriven, sequence, constants)
+        unseen = policy.network(start, undriven + 0.3, other, constants)
     torch.testing.assert_close(seen, unseen)
-    correction = 0.5 * (threebus.p_max - threebus.p_min) * seen.double().numpy()[:, 1:]
-    targets = 0.5 * (threebus.p_min + threebus.p_max) + correction
-    expected = follow(np.clip(targets, threebus.p_min, threebus.p_max), inputs.p_initial, policy.step)
-    np.testing.assert_allclose(policy.powers(inputs), expected, atol=1e-5)  # NumPy twin in float32
+    np.testing.assert_allclose(policy.powers(inputs), seen.numpy(), atol=1e-5)
     with pytest.raises(TypeError, match="colour"):
         short_training(threebus, path, colour="red")
 
@@ -340,10 +377,9 @@ def test_the_exported_network_is_the_same_function(case: Case, tmp_path: Path) -
     policy.export(tmp_path / "policy.pt2")
     exported = torch.export.load(str(tmp_path / "policy.pt2")).module()
     for count in (1, 7):
-        channels = Channels.of(case, Inputs.of(case, some_instances(case, count)), KNOTS)
-        tensors = [torch.as_tensor(a, dtype=torch.float32) for a in (channels.sequence, channels.constants)]
+        inputs = tensors(channels_of(case, Inputs.of(case, some_instances(case, count))))
         with torch.no_grad():
-            torch.testing.assert_close(exported(*tensors), policy.network(*tensors))
+            torch.testing.assert_close(exported(*inputs), policy.network(*inputs))
 
 
 def test_policy_refuses_what_it_was_not_trained_for(
@@ -366,11 +402,16 @@ def test_policy_refuses_what_it_was_not_trained_for(
     with pytest.raises(InputError, match=r"train-dpc --method ded-dpc .* --settings train400"):
         prepare(threebus, regime, Settings(name="train400", search=(tmp_path,)))
     broken = DispatchPolicy(policy.scope, policy.network, {"seed": 0})
-    broken.network.dilations = (1, 2, 70)
-    broken.save(path)
-    with pytest.raises(InputError, match="dilations"):
-        DispatchPolicy.load(path, threebus, regime)
-    broken.network.dilations = (1, 2)
-    broken.save(path)
-    with pytest.raises(InputError, match="width or depth"):
-        DispatchPolicy.load(path, threebus, regime)
+    for name, value, problem in (
+        ("dilations", [1, 2, 70], "numbers of knots"),
+        ("dilations", [1, 2], "width or depth"),
+        ("width", 17, "width or depth"),
+        ("stages", 3, "width or depth"),
+        ("stages", None, "lacks"),
+    ):
+        right = broken.network.shape
+        broken.network.shape = right | {name: value}
+        broken.save(path)
+        with pytest.raises(InputError, match=problem):
+            DispatchPolicy.load(path, threebus, regime)
+        broken.network.shape = right

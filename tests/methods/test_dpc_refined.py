@@ -16,9 +16,10 @@ from ded_bench.methods.dpc.ded_dpc import N_KNOTS, DispatchPolicy
 from ded_bench.methods.dpc.ded_dpc_refined import SETTINGS, artifact, prepare
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import ResidualNetwork
+from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.objective import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.refine import Refiner
+from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import Scope, policy_file
 from ded_bench.methods.solution import Settings, Status
 from ded_bench.problem.case import Case
@@ -37,8 +38,10 @@ def tightest(case: Case) -> str:
 
 def static_policy(case: Case, regime: str) -> DispatchPolicy:
     """The follower of the static dispatch: a network that corrects nothing."""
-    network = ResidualNetwork.make(case).eval()
-    return DispatchPolicy(Scope(case, regime, case.sampling.horizon_s), network, {"seed": 0})
+    horizon = case.sampling.horizon_s
+    response = Response.make(case, knot_times(horizon, N_KNOTS))
+    network = StagedNetwork(case, response, 1, 4, (1,)).eval()
+    return DispatchPolicy(Scope(case, regime, horizon), network, {"seed": 0})
 
 
 def optimum(case: Case, regime: str, instance: Instance) -> float:
@@ -113,7 +116,7 @@ def test_hard_limits_hold_after_any_number_of_steps(case: Case, steps: int) -> N
     refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
     start = policy.powers(inputs)
     p_gen = refiner(inputs, start, steps)
-    assert np.abs(np.diff(p_gen, axis=1)).max() <= policy.step + 1e-12
+    assert np.abs(np.diff(p_gen, axis=1)).max() <= policy.network.step + 1e-12
     assert np.maximum(p_gen - case.p_max, case.p_min - p_gen).max() <= 1e-12
     np.testing.assert_array_equal(p_gen[:, 0], inputs.p_initial)
     if not steps:
@@ -142,6 +145,6 @@ def test_it_serves_as_a_method(threebus: Case, tmp_path: Path) -> None:
     assert answers["default"].solve_s > 0
     assert not np.array_equal(answers["default"].schedule.p, answers["steps25"].schedule.p)
     before = artifact(threebus, regime, settings["default"])
-    torch.nn.init.ones_(policy.network.last.bias)
+    torch.nn.init.ones_(policy.network.stages[0].last.bias)
     policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
     assert artifact(threebus, regime, settings["default"]) != before

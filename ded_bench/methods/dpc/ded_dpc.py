@@ -1,4 +1,7 @@
-"""DED-DPC (`ded-dpc`): a network corrects the static dispatch; bounds, ramps and P_0 hold for any weights."""
+"""DED-DPC (`ded-dpc`): a network looks at what a schedule would do and corrects it, in stages.
+
+Bounds, ramps and P_0 hold for any weights.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import NumpyNetwork, ResidualNetwork
+from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
+from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import (
     Scope,
     find_policy_file,
@@ -35,29 +38,31 @@ from ded_bench.problem.strict import write_atomically
 
 METHOD = "ded-dpc"
 N_KNOTS = 50
-MAX_WIDTH = 4096
 #: Instances worked on at once: what is computed on the way stays in a core's cache.
 CHUNK = 32
 #: Short trainings, for comparison with each other only: each `study-…` changes one thing of `study`.
-STUDY: dict[str, Any] = {"epochs": 6}
+STUDY: dict[str, Any] = {"epochs": 2}
 #: What the policy was trained on and how, by slug; values are options of `ded_dpc_train.train`.
 #: `train400` sees nothing but the benchmark's training instances, in about as many steps.
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "train400": {"fresh": 0, "epochs": 6000},
     "study": STUDY,
-    "study-narrow": STUDY | {"width": 16},
-    "study-wide": STUDY | {"width": 64},
-    "study-near": STUDY | {"dilations": (1, 1, 1, 1, 1, 1)},
+    "study-narrow": STUDY | {"width": 12},
+    "study-wide": STUDY | {"width": 48},
+    "study-near": STUDY | {"dilations": (1, 1, 1, 1)},
     "study-shallow": STUDY | {"dilations": (2, 8)},
     "study-no-dispatch": STUDY | {"blind": ("dispatch",)},
     "study-no-bends": STUDY | {"blind": ("bends",)},
+    "study-no-response": STUDY | {"blind": ("response",)},
+    "study-one-stage": STUDY | {"stages": 1},
+    "study-three-stages": STUDY | {"stages": 3},
     "study-no-prior": STUDY | {"prior": False},
     "study-raw": STUDY | {"normalise": False},
     "study-constant": STUDY | {"rate": "constant"},
     "study-batch32": STUDY | {"batch": 32},
     "study-batch512": STUDY | {"batch": 512},
-    "study-fresh4000": {"epochs": 96, "fresh": 4000},
+    "study-fresh4000": {"epochs": 32, "fresh": 4000},
 }
 
 
@@ -66,17 +71,22 @@ class DispatchPolicy:
     """A trained network with all that is needed to apply it."""
 
     scope: Scope
-    network: ResidualNetwork
+    network: StagedNetwork
     training: dict[str, Any]
 
-    @functools.cached_property
+    @property
     def knots(self) -> Array:
         """Knot times, shape (n_knots,), s."""
-        return knot_times(self.scope.horizon_s, N_KNOTS)
+        return self.response.knots
 
     @functools.cached_property
-    def _numpy(self) -> NumpyNetwork:
-        return NumpyNetwork(self.network)
+    def response(self) -> Response:
+        """What the network looks at."""
+        return Response.make(self.scope.case, knot_times(self.scope.horizon_s, N_KNOTS))
+
+    @functools.cached_property
+    def _numpy(self) -> NumpyStages:
+        return NumpyStages(self.scope.case, self.response, self.network)
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -93,40 +103,30 @@ class DispatchPolicy:
     def powers(self, inputs: Inputs, threads: int = 1) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
         if len(inputs) <= CHUNK:
-            return follow(self._targets(inputs), inputs.p_initial, self.step)
+            return self._numpy(self.channels(inputs))
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
         if threads == 1:
-            targets = [self._targets(part) for part in parts]
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                targets = list(pool.map(self._targets, parts))
-        return follow(np.concatenate(targets), inputs.p_initial, self.step)
+            return np.concatenate([self.powers(part) for part in parts])
+        with ThreadPoolExecutor(threads) as pool:
+            return np.concatenate(list(pool.map(self.powers, parts)))
 
-    def _targets(self, inputs: Inputs) -> Array:
-        """Corrected dispatch at all knots but the first, within bounds."""
-        case = self.scope.case
-        channels = Channels.of(case, inputs, self.knots).with_prior(case, self.training.get("prior", True))
-        half = 0.5 * (case.p_max - case.p_min)
-        targets = channels.prior[:, 1:] + half * self._numpy(channels)[:, 1:]
-        return np.minimum(np.maximum(targets, case.p_min), case.p_max)
-
-    @functools.cached_property
-    def step(self) -> float:
-        """Largest change of power between two knots, pu."""
-        return float(self.scope.case.ramp_pu_per_s * self.scope.horizon_s / (N_KNOTS - 1))
+    def channels(self, inputs: Inputs) -> Channels:
+        """What the network reads of instances."""
+        return Channels.of(self.scope.case, inputs, self.response, self.training.get("prior", True))
 
     def save(self, path: Path) -> None:
         """Write weights, normalisation and header."""
-        shape = {"width": self.network.width, "dilations": list(self.network.dilations)}
-        write_policy(path, METHOD, self.scope, self.network, self.training | shape)
+        write_policy(path, METHOD, self.scope, self.network, self.training | self.network.shape)
 
     def export(self, path: Path) -> None:
-        """Write the network alone (channels in, corrections out) for runtimes that know `torch.export`."""
+        """Write the network (channels in, powers at the knots out) for runtimes that know `torch.export`."""
         case = self.scope.case
         n_sequence, n_constants = n_channels(case)
-        example = torch.zeros(2, N_KNOTS, n_sequence), torch.zeros(2, n_constants)
+        n_gen, n_outputs = len(case.generators), self.response.n_outputs
+        widths = (n_gen, n_outputs, n_sequence)
+        example = (*(torch.zeros(2, N_KNOTS, n) for n in widths), torch.zeros(2, n_constants))
         batch = {0: torch.export.Dim("batch")}
-        program = torch.export.export(self.network, example, dynamic_shapes=(batch, batch))
+        program = torch.export.export(self.network, example, dynamic_shapes=(batch,) * 4)
         buffer = io.BytesIO()
         torch.export.save(program, buffer)
         write_atomically(path, buffer.getvalue())
@@ -135,17 +135,19 @@ class DispatchPolicy:
     def load(path: str | Path, case: Case, regime: str) -> DispatchPolicy:
         """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
         arrays, scope, training = read_policy(path, METHOD, case, regime)
-        width, dilations = training.get("width"), training.get("dilations")
-        if not (isinstance(width, int) and isinstance(dilations, list) and 0 < width <= MAX_WIDTH):
-            raise InputError(path, "training", "lacks the network's width and dilations")
+        stages, width, dilations = (training.get(name) for name in ("stages", "width", "dilations"))
+        if not (isinstance(stages, int) and isinstance(width, int) and isinstance(dilations, list)):
+            raise InputError(path, "training", "lacks the network's stages, width and dilations")
         if not all(isinstance(d, int) and 0 < d < N_KNOTS for d in dilations):
             raise InputError(path, "training", "has dilations that are no numbers of knots")
-        layers = sum(name.startswith("mix.") and name.endswith(".bias") for name in arrays)
-        if len(dilations) != layers or arrays.get("first.bias", np.zeros(0)).shape != (width,):
+        layers = {name for name in arrays if ".mix." in name and name.endswith(".bias")}
+        widths = {arrays[name].shape for name in layers} | {(width,)}
+        if len(layers) != stages * len(dilations) or len(widths) != 1 or not layers:
             raise InputError(path, "training", "has another width or depth than the weights")
         if not isinstance(training.get("prior", True), bool):
             raise InputError(path, "training", "has a prior that is neither true nor false")
-        network = ResidualNetwork.make(case, width, tuple(dilations))
+        response = Response.make(case, knot_times(scope.horizon_s, N_KNOTS))
+        network = StagedNetwork(case, response, stages, width, tuple(dilations))
         load_weights(network, arrays, path)
         return DispatchPolicy(scope, network.eval(), training)
 

@@ -19,11 +19,11 @@ from tqdm import tqdm
 
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.ded_dpc import METHOD, N_KNOTS, DispatchPolicy
-from ded_bench.methods.dpc.follower import Clip, Follow
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import DILATIONS, WIDTH, ResidualNetwork
+from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import Scope, reading_checkpoint
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -60,11 +60,12 @@ PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history",
 class Variant:
     """What the ablation study changes of network and training, one at a time."""
 
+    stages: int = STAGES
     width: int = WIDTH
     dilations: tuple[int, ...] = DILATIONS
     batch: int = BATCH
     rate: str = "cosine"  # or "constant": of the learning rate, after its warm-up
-    prior: bool = True  # corrections of the static dispatch, or powers from the middle of their range
+    prior: bool = True  # corrections of the static dispatch, or of the middle of the generators' range
     blind: tuple[str, ...] = ()  # groups of channels that the network does not see
     normalise: bool = True
 
@@ -73,27 +74,20 @@ class Variant:
 class Pool:
     """Instances as tensors, ready for the loss."""
 
+    start: Tensor  # (batch, n_knots, n_gen), pu
+    undriven: Tensor  # (batch, n_knots, n_outputs)
     sequence: Tensor  # (batch, n_knots, n_sequence)
     constants: Tensor  # (batch, n_constants)
-    prior: Tensor  # (batch, n_knots, n_gen), pu
-    p_initial: Tensor  # (batch, n_gen), pu
     cost: Tensor  # (batch, 1 + n_gen)
     scale: Tensor  # (batch,): what costs are relative to
     free: Tensor  # (batch, n_gen + 1, n_coarse)
 
     @staticmethod
-    def of(case: Case, channels: Channels, inputs: Inputs, free: np.ndarray, n_points: int) -> Pool:
+    def of(channels: Channels, inputs: Inputs, free: np.ndarray, n_points: int) -> Pool:
         """Convert channels and free responses to float32."""
         scale = np.maximum(channels.static_cost(inputs), SMALLEST_COST) * n_points
-        arrays = (
-            channels.sequence,
-            channels.constants,
-            channels.prior,
-            inputs.p_initial,
-            inputs.cost,
-            scale,
-            free,
-        )
+        seen = channels.start, channels.undriven, channels.sequence, channels.constants
+        arrays = (*seen, inputs.cost, scale, free)
         return Pool(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32) for a in arrays))
 
     def to(self, device: str) -> Pool:
@@ -112,18 +106,12 @@ class Loss:
     """Relative cost and frequency excess of a network's schedules."""
 
     objective: Objective
-    p_min: Tensor
-    p_max: Tensor
-    step: float  # largest change between two knots, pu
     omega_bound: float  # rad/s
     spacing_s: float  # of the coarse points
 
-    def powers(self, network: ResidualNetwork, pool: Pool) -> Tensor:
+    def powers(self, network: StagedNetwork, pool: Pool) -> Tensor:
         """Schedules at the knots, (batch, n_knots, n_gen), pu: what `DispatchPolicy.powers` computes."""
-        half = 0.5 * (self.p_max - self.p_min)
-        targets = pool.prior + half * network(pool.sequence, pool.constants)
-        targets = Clip.apply(targets[:, 1:], self.p_min, self.p_max)  # type: ignore[no-untyped-call]
-        powers: Tensor = Follow.apply(targets, pool.p_initial, self.step)  # type: ignore[no-untyped-call]
+        powers: Tensor = network(pool.start, pool.undriven, pool.sequence, pool.constants)
         return powers
 
     def __call__(self, powers: Tensor, pool: Pool, margin: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -164,7 +152,7 @@ def train(
     chosen = Variant(**variant)
     first = instances[0]
     scope = Scope(case, regime, first.horizon_s)
-    knots = knot_times(first.horizon_s, N_KNOTS)
+    response = Response.make(case, knot_times(first.horizon_s, N_KNOTS))
     stride = coarse_stride(first.dt_s, first.steps)
     generator = torch.Generator().manual_seed(seed)
     if fresh:
@@ -177,26 +165,22 @@ def train(
         held_out = [instances[i] for i in order[:n_held]]
         drawn = [instances[i] for i in order[n_held:]] or held_out
     inputs = [Inputs.of(case, part) for part in (drawn, held_out)]
-    channels = [Channels.of(case, part, knots).with_prior(case, chosen.prior) for part in inputs]
+    channels = [Channels.of(case, part, response, chosen.prior) for part in inputs]
     free = [coarse_free_response(Network(case), model, part, first.grid, stride) for part in inputs]
     data, check = (
-        Pool.of(case, c, i, f, len(first.grid)).to(device)
-        for c, i, f in zip(channels, inputs, free, strict=True)
+        Pool.of(c, i, f, len(first.grid)).to(device) for c, i, f in zip(channels, inputs, free, strict=True)
     )
     loss = Loss(
-        Objective.make(case, model, first.grid, knots, stride).to(device),
-        torch.as_tensor(case.p_min, dtype=torch.float32, device=device),
-        torch.as_tensor(case.p_max, dtype=torch.float32, device=device),
-        case.ramp_pu_per_s * first.horizon_s / (N_KNOTS - 1),
+        Objective.make(case, model, first.grid, response.knots, stride).to(device),
         case.omega_bound(regime),
         stride * first.dt_s,
     )
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        network = ResidualNetwork.make(case, chosen.width, chosen.dilations)
+        network = StagedNetwork(case, response, chosen.stages, chosen.width, chosen.dilations)
     if chosen.normalise:
-        network.normalise(channels[0])
-    network.hide(case, chosen.blind)
+        network.normalise(channels[0], response)
+    network.hide(chosen.blind)
     network.to(device)
     run = _Run(network, loss, generator, chosen, out.with_suffix(".checkpoint.pt"), len(data))
     if resume:
@@ -232,7 +216,7 @@ class _Run:
 
     def __init__(
         self,
-        network: ResidualNetwork,
+        network: StagedNetwork,
         loss: Loss,
         generator: torch.Generator,
         variant: Variant,
@@ -282,7 +266,7 @@ class _Run:
         rate = LAST + (1.0 - LAST) * falling
         for group in self.optimiser.param_groups:
             group["lr"] = LEARNING_RATE * rate * min(1.0, 0.05 + progress / WARM_UP)
-        batch = data[rows.to(data.prior.device)]
+        batch = data[rows.to(data.start.device)]
         cost, excess = self.loss(self.loss.powers(self.network, batch), batch, MARGIN)
         penalty = _penalty(excess)
         price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress * self.loss.spacing_s

@@ -2,7 +2,8 @@
 
 The angles at t = 0 are no input: they follow from P_0 and the initial loads, which are, so that no
 power flow has to be solved. Loads enter as forecasts at the knots, with their bend between two
-knots, and as the static dispatch that they would have if nothing had inertia.
+knots, and as the static dispatch that they would have if nothing had inertia; what they do to
+frequency and slack power is in `response`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.methods.dpc.follower import follow
+from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
@@ -56,30 +59,35 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What the network reads, not yet normalised, and the static dispatch that it corrects."""
+    """What the network reads of instances, not yet normalised, and the schedule that it corrects first."""
 
-    sequence: Array  # (batch, n_knots, n_sequence)
+    sequence: Array  # (batch, n_knots, n_sequence): see `sequence_groups`
     constants: Array  # (batch, n_constants)
-    prior: Array  # static dispatch of the loads at each knot, (batch, n_knots, n_gen), pu; is corrected
+    start: Array  # schedule to correct, (batch, n_knots, n_gen), pu
+    undriven: Array32  # see `Response.undriven`
 
     @staticmethod
-    def of(case: Case, inputs: Inputs, knots: Array) -> Channels:
-        """Compute the channels at knots, shape (n_knots,), s."""
-        p_load, bend = _loads_and_bends(inputs, knots)
-        demand = -p_load.sum(axis=-1)
-        prior = _dispatch(case, inputs.cost, demand)
-        p_slack = demand - prior.sum(axis=-1)
-        above, below = _cost_ratios(prior.shape[2])
-        ratios = (inputs.cost @ above) / np.maximum(inputs.cost @ below, 1e-9)
-        sequence = np.concatenate([p_load, bend, prior, p_slack[:, :, None]], axis=-1)
-        return Channels(sequence, np.concatenate([ratios, inputs.p_initial, inputs.omega], axis=1), prior)
+    def of(case: Case, inputs: Inputs, response: Response, dispatch: bool = True) -> Channels:
+        """Compute the channels at the knots of a response.
 
-    def with_prior(self, case: Case, dispatch: bool) -> Channels:
-        """The same channels, with the static dispatch or the middle of the range as what is corrected."""
-        if dispatch:
-            return self
-        middle = np.broadcast_to(0.5 * (case.p_min + case.p_max), self.prior.shape)
-        return Channels(self.sequence, self.constants, middle)
+        The first schedule follows the static dispatch of the loads at each knot, or, without
+        `dispatch`, the middle of the generators' range.
+        """
+        knots = response.knots
+        p_load, bend = _loads_and_bends(inputs, response.nodes)
+        demand = -p_load[:, ::2].sum(axis=-1)
+        static = _dispatch(case, inputs.cost, demand)
+        p_slack = demand - static.sum(axis=-1)
+        above, below = _cost_ratios(static.shape[2])
+        ratios = (inputs.cost @ above) / np.maximum(inputs.cost @ below, 1e-9)
+        middle = np.broadcast_to(0.5 * (case.p_min + case.p_max), static.shape)
+        targets = static if dispatch else middle
+        return Channels(
+            np.concatenate([p_load[:, ::2], bend, static, p_slack[:, :, None]], axis=-1),
+            np.concatenate([ratios, inputs.p_initial, inputs.omega], axis=1),
+            follow(targets[:, 1:], inputs.p_initial, float(case.ramp_pu_per_s * (knots[1] - knots[0]))),
+            response.undriven(inputs.omega, p_load),
+        )
 
     def static_cost(self, inputs: Inputs) -> Array:
         """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""
@@ -90,7 +98,7 @@ class Channels:
 
 
 def n_channels(case: Case) -> tuple[int, int]:
-    """Number of sequence channels and of constants."""
+    """Number of channels of the sequence and of constants."""
     n_gen, n_load = len(case.generators), len(case.loads)
     return 2 * n_load + n_gen + 1, (1 + n_gen) + n_gen + n_gen * (n_gen - 1) // 2 + 2 * n_gen
 
@@ -105,19 +113,20 @@ def sequence_groups(case: Case) -> dict[str, slice]:
     }
 
 
-def _loads_and_bends(inputs: Inputs, knots: Array) -> tuple[Array, Array]:
-    """Loads at the knots, and how far their mean since the last knot is off the chord; pu.
+def _loads_and_bends(inputs: Inputs, nodes: Array) -> tuple[Array, Array]:
+    """Loads at the nodes, and how far their mean between two knots is off the chord; pu.
 
-    The bend tells where between two knots a ramp starts or ends; each is (batch, n_knots, n_load).
+    Every second node is a knot. The bend tells where between two knots a ramp starts or ends; shapes
+    (batch, n_nodes, n_load) and (batch, n_knots, n_load).
     """
     initial, start, duration, rate = (inputs.ramps[:, None, :, i] for i in range(4))
-    since = np.maximum(knots[:, None] - start, 0.0)
+    since = np.maximum(nodes[:, None] - start, 0.0)
     into = np.minimum(since, duration)
-    half = 0.5 * into
-    area = into * (since - half)  # ∫ into dt
-    bend = np.zeros_like(into)
+    half = 0.5 * into[:, ::2]
+    area = into[:, ::2] * (since[:, ::2] - half)  # ∫ into dt
+    bend = np.zeros_like(half)
     np.subtract(area[:, 1:], area[:, :-1], out=bend[:, 1:])
-    bend[:, 1:] *= 1.0 / (knots[1] - knots[0])
+    bend[:, 1:] *= 1.0 / (nodes[2] - nodes[0])
     bend[:, 1:] -= half[:, 1:] + half[:, :-1]
     bend *= rate
     return initial + rate * into, bend

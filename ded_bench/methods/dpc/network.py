@@ -1,33 +1,83 @@
-"""The network of `ded-dpc`: dilated residual convolutions over the knots, in torch and in NumPy.
+"""The network of `ded-dpc`: stages that look at what a schedule would do and correct it.
 
-It corrects the static dispatch: targets = prior + half range × output. Constants of the instance
-(costs, P_0, ω(0)) enter once, as a bias of every layer. The NumPy twin answers a single instance
-in a tenth of a millisecond, where torch's overhead per layer would dominate.
+Each stage sees the schedule so far, its `Response`, and the instance; its output moves the targets
+that the follower tracks (in half ranges of each generator). A stage is a net of dilated residual
+convolutions over the knots. Constants of the instance (costs, P_0, ω(0)) enter once, as a bias of
+every layer. It exists in torch and in NumPy, which answers a single instance in a fraction of a
+millisecond, where torch's overhead per layer would dominate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ded_bench.methods.dpc.follower import Clip, Follow, follow
 from ded_bench.methods.dpc.inputs import Channels, n_channels, sequence_groups
+from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.problem.case import Array, Case
 
-Array32 = NDArray[np.float32]
-#: With windows of three these dilations reach 31 knots to either side.
-DILATIONS = (1, 2, 4, 8, 16, 1)
-WIDTH, EMBEDDING = 32, 64
+STAGES, WIDTH, EMBEDDING = 2, 24, 64
+#: With windows of three these dilations reach 16 knots to either side, in each stage.
+DILATIONS = (1, 2, 4, 8)
 #: Channels divided by this are no input any more.
 HIDDEN_SCALE = 1e30
 
 
+class StagedNetwork(nn.Module):
+    """Schedules from channels: corrected and followed once per stage; differentiable."""
+
+    def __init__(self, case: Case, response: Response, stages: int, width: int, dilations: tuple[int, ...]):
+        super().__init__()
+        n_gen = len(case.generators)
+        n_seen = n_gen + response.n_outputs
+        n_sequence, n_constants = n_channels(case)
+        self.stages = nn.ModuleList(
+            ResidualNetwork(n_seen + n_sequence, n_constants, n_gen, width, dilations) for _ in range(stages)
+        )
+        self.groups = {"response": slice(n_gen, n_seen)}
+        for name, part in sequence_groups(case).items():
+            self.groups[name] = slice(n_seen + part.start, n_seen + part.stop)
+        self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
+        self.step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
+        for name, value in (("of_power", response.of_power), ("low", case.p_min), ("high", case.p_max)):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)
+
+    of_power: Tensor
+    low: Tensor
+    high: Tensor
+
+    def normalise(self, channels: Channels, response: Response) -> None:
+        """Set the affine input normalisation of all stages from training data."""
+        seen = response(channels.undriven, channels.start)
+        sequence = np.concatenate([channels.start, seen, channels.sequence], axis=-1)
+        for stage in self.stages:
+            cast(ResidualNetwork, stage).normalise(sequence, channels.constants)
+
+    def hide(self, groups: Sequence[str]) -> None:
+        """Scale groups of channels to nothing: `response`, or one of `inputs.sequence_groups`."""
+        for stage in self.stages:
+            for name in groups:
+                cast(ResidualNetwork, stage).sequence_scale[self.groups[name]] = HIDDEN_SCALE
+
+    def forward(self, start: Tensor, undriven: Tensor, sequence: Tensor, constants: Tensor) -> Tensor:
+        """Powers at the knots, (batch, n_knots, n_gen), pu, from `Channels` in float32."""
+        p_gen, half = start, 0.5 * (self.high - self.low)
+        for stage in self.stages:
+            seen = undriven + (p_gen.flatten(1) @ self.of_power).view_as(undriven)
+            corrections = stage(torch.cat([p_gen, seen, sequence], dim=2), constants)
+            targets = Clip.apply((p_gen + half * corrections)[:, 1:], self.low, self.high)  # type: ignore[no-untyped-call]
+            p_gen = Follow.apply(targets, start[:, 0], self.step)  # type: ignore[no-untyped-call]
+        return p_gen
+
+
 class ResidualNetwork(nn.Module):
-    """Channels in, corrections of the static dispatch out (in half ranges of each generator).
+    """One stage: channels in, corrections out (in half ranges of each generator).
 
     Convolutions run along the second axis of images one pixel high: with channels stored last, as
     they come, that is a third faster to train on a CPU than one-dimensional convolutions.
@@ -48,7 +98,7 @@ class ResidualNetwork(nn.Module):
         with torch.no_grad():
             for layer in self.mix:
                 layer.weight.mul_(0.5)  # type: ignore[operator]
-        nn.init.zeros_(self.last.weight)  # training starts from the static dispatch
+        nn.init.zeros_(self.last.weight)  # training starts from the schedule as it is
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
         for name, n in (("sequence", n_sequence), ("constants", n_constants)):
             self.register_buffer(f"{name}_mean", torch.zeros(n))
@@ -59,25 +109,15 @@ class ResidualNetwork(nn.Module):
     constants_mean: Tensor
     constants_scale: Tensor
 
-    @staticmethod
-    def make(case: Case, width: int = WIDTH, dilations: tuple[int, ...] = DILATIONS) -> ResidualNetwork:
-        """An untrained network for a case."""
-        return ResidualNetwork(*n_channels(case), len(case.generators), width, dilations)
-
-    def normalise(self, channels: Channels) -> None:
-        """Set the affine input normalisation from training data."""
-        for name in ("sequence", "constants"):
-            values = getattr(channels, name).reshape(-1, getattr(channels, name).shape[-1])
-            getattr(self, f"{name}_mean").copy_(torch.as_tensor(values.mean(axis=0)))
-            getattr(self, f"{name}_scale").copy_(torch.as_tensor(values.std(axis=0)).clamp_min(1e-6))
-
-    def hide(self, case: Case, groups: Sequence[str]) -> None:
-        """Scale groups of sequence channels to nothing (see `inputs.sequence_groups`)."""
-        for name in groups:
-            self.sequence_scale[sequence_groups(case)[name]] = HIDDEN_SCALE
+    def normalise(self, sequence: Array, constants: Array) -> None:
+        """Set the affine input normalisation from training data, channels in the last axis."""
+        for name, values in (("sequence", sequence), ("constants", constants)):
+            rows = values.reshape(-1, values.shape[-1])
+            getattr(self, f"{name}_mean").copy_(torch.as_tensor(rows.mean(axis=0)))
+            getattr(self, f"{name}_scale").copy_(torch.as_tensor(rows.std(axis=0)).clamp_min(1e-6))
 
     def forward(self, sequence: Tensor, constants: Tensor) -> Tensor:
-        """Corrections, shape (batch, n_knots, n_gen), from `Channels` in float32."""
+        """Corrections, shape (batch, n_knots, n_gen)."""
         x = ((sequence - self.sequence_mean) / self.sequence_scale).transpose(1, 2)[:, :, None]
         embedded = self.embed((constants - self.constants_mean) / self.constants_scale)
         bias = embedded.unflatten(1, (-1, self.width, 1, 1))
@@ -88,8 +128,28 @@ class ResidualNetwork(nn.Module):
         return corrections
 
 
+class NumpyStages:
+    """The same function as a StagedNetwork, for inference without torch; the last follower in float64."""
+
+    def __init__(self, case: Case, response: Response, network: StagedNetwork) -> None:
+        self._case, self._response, self._step = case, response, network.step
+        self._stages = [NumpyNetwork(cast(ResidualNetwork, stage)) for stage in network.stages]
+
+    def __call__(self, channels: Channels) -> Array:
+        """Powers at the knots, (batch, n_knots, n_gen), pu."""
+        p_gen, initial = channels.start, channels.start[:, 0]
+        low, high = self._case.p_min, self._case.p_max
+        half = 0.5 * (high - low)
+        for stage in self._stages:
+            seen = self._response(channels.undriven, p_gen)
+            corrections = stage(np.concatenate([p_gen, seen, channels.sequence], axis=2), channels.constants)
+            targets = (p_gen + half * corrections)[:, 1:]
+            p_gen = follow(np.minimum(np.maximum(targets, low), high), initial, self._step)
+        return p_gen
+
+
 class NumpyNetwork:
-    """The same function as a ResidualNetwork, for inference without torch."""
+    """The same function as a ResidualNetwork."""
 
     def __init__(self, network: ResidualNetwork) -> None:
         state = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
@@ -114,12 +174,12 @@ class NumpyNetwork:
         self._last = state["last.weight"][:, :, 0, 0].T.copy(), state["last.bias"]
         self._width = network.width
 
-    def __call__(self, channels: Channels) -> Array:
+    def __call__(self, sequence: Array, constants: Array) -> Array:
         """Corrections, shape (batch, n_knots, n_gen)."""
-        sequence = ((channels.sequence - self._shift) * self._scale).astype(np.float32)
-        hidden = np.maximum(channels.constants.astype(np.float32) @ self._enter[0] + self._enter[1], 0.0)
+        sequence32 = ((sequence - self._shift) * self._scale).astype(np.float32)
+        hidden = np.maximum(constants.astype(np.float32) @ self._enter[0] + self._enter[1], 0.0)
         bias = (hidden @ self._embed[0] + self._embed[1]).reshape(len(hidden), -1, 1, self._width)
-        batch, n, _ = sequence.shape
+        batch, n, _ = sequence32.shape
         width, margin = self._width, max((dilation for dilation, *_ in self._blocks), default=1)
         # zeros before the first knot and after the last; from here on in place, since memory costs time
         padded = np.zeros((batch, n + 2 * margin, width), dtype=np.float32)
@@ -128,7 +188,7 @@ class NumpyNetwork:
         windows = columns.reshape(batch, n, 3, width)
         inner_rows, change_rows = inner.reshape(-1, width), change.reshape(-1, width)
         h = padded[:, margin : margin + n]
-        h += _neighbours(_padded(sequence), n, 1).reshape(batch, n, -1) @ self._first
+        h += _neighbours(_padded(sequence32), n, 1).reshape(batch, n, -1) @ self._first
         h += bias[:, 0]
         for i, (dilation, spread, mix, offset) in enumerate(self._blocks):
             np.copyto(windows, _neighbours(padded, n, dilation))

@@ -40,9 +40,9 @@ COST_TOLERANCE = 1e-8
 #: With a limit broken somewhere, every peak of |ω| above this part of the bound gets its row.
 NEAR = 0.8
 MAX_ROUNDS = 100
-#: What a schedule does at all points is computed in this many blocks of time: a knot moves nothing before
-#: it, and reading the map from memory is a fifth of a solve.
-N_BLOCKS = 8
+#: What a schedule does at all points is computed in this many blocks of time. Within one it depends on
+#: few numbers: the state at its start and the knots nearby.
+N_BLOCKS = 16
 
 
 def artifact(case: Case, regime: str, settings: Settings) -> str:
@@ -101,7 +101,8 @@ class _Condensed(NamedTuple):
 
     knots: Array  # times, shape (n_knots,), s
     gamma: Array  # (n_gen + 1, n_points, n_x): of the ω, then of P_s
-    blocks: list[Array]  # the same by time, without the columns of knots that come later
+    blocks: list[tuple[Array, Array]]  # the same by time, each as a product of two small matrices
+    p_slack_sum: Array  # (n_points + 1, n_x): P_s summed over all points before one
     weight: Array  # (n_knots,): how often a knot counts in the sum over all points
     first: Indices  # first point of each piece, shape (n_pieces,)
     program: GrowingProgram  # variables (x, cost of each piece); rows: ramps, pieces as +P_s, as -P_s
@@ -115,20 +116,30 @@ def _condensed(model: _Model) -> _Condensed:
     gamma = model.koopman.condense(n_gen, grid, knots).reshape(len(grid), n_gen + 1, -1)
     gamma = np.ascontiguousarray(np.moveaxis(gamma, 1, 0))
     first = np.unique(np.linspace(0, len(grid), N_PIECES, endpoint=False).astype(int))
-    pieces = sp.csr_matrix(np.add.reduceat(gamma[n_gen], first))
+    p_slack_sum = _sums(gamma[n_gen])
+    pieces = sp.csr_matrix(np.diff(p_slack_sum[np.append(first, len(grid))], axis=0))
     ramps = sp.csr_matrix(np.kron(np.diff(np.eye(N_KNOTS), axis=0), np.eye(n_gen)))
     above = sp.eye(len(first))
     blocks: Any = [[ramps, None], [pieces, -above], [-pieces, -above]]
     program = GrowingProgram(sp.csr_matrix(sp.bmat(blocks)))
     held = hat_functions(grid, knots).sum(axis=0)
-    return _Condensed(knots, gamma, _causal_blocks(gamma), held, first, program)
+    return _Condensed(knots, gamma, _blocks(gamma), p_slack_sum, held, first, program)
 
 
-def _causal_blocks(gamma: Array) -> list[Array]:
-    """Cut a map from knots to points by time, each part without its last columns that are zero."""
-    parts = np.array_split(gamma, N_BLOCKS, axis=1)
-    used = [1 + int(np.flatnonzero(part.any(axis=(0, 1))).max(initial=0)) for part in parts]
-    return [np.ascontiguousarray(part[..., :n]) for part, n in zip(parts, used, strict=True)]
+def _blocks(gamma: Array) -> list[tuple[Array, Array]]:
+    """Cut a map from knots to points by time, and each part into two factors without what is round-off."""
+    blocks = []
+    for part in np.array_split(gamma, N_BLOCKS, axis=1):
+        left, size, right = np.linalg.svd(part.reshape(-1, part.shape[2]), full_matrices=False)
+        rank = int((size > 1e-14 * size[0]).sum())
+        left = (left * size)[:, :rank].reshape(*part.shape[:2], rank)
+        blocks.append((np.ascontiguousarray(left), right[:rank].copy()))
+    return blocks
+
+
+def _sums(values: Array) -> Array:
+    """Sums over everything before each row, and over everything."""
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
 
 
 class _Answer(NamedTuple):
@@ -152,6 +163,7 @@ def _solve(
     cost = np.outer(condensed.weight, instance.cost_gen(case)).ravel()
     _restart(case, condensed, instance, np.append(cost, np.full(len(condensed.first), price)), free)
     program, iterations = condensed.program, 0
+    free_by_output, free_sum = np.ascontiguousarray(free.T), _sums(free[:, n_gen])
     limited: set[tuple[int, int]] = set()  # (generator, point) whose frequency has a row
     for _ in range(MAX_ROUNDS):
         status, solution, count = program.solve(max(deadline - time.perf_counter(), 0.0))
@@ -159,8 +171,8 @@ def _solve(
         if status != Status.OPTIMAL:
             return _Answer(status, solution, np.nan, iterations)
         x, pieces = solution[:n_x], solution[n_x:]
-        values = np.concatenate([block @ x[: block.shape[2]] for block in condensed.blocks], axis=1)
-        values += free.T
+        values = np.concatenate([left @ (right @ x) for left, right in condensed.blocks], axis=1)
+        values += free_by_output
         omega, p_slack = values[:n_gen], values[n_gen]
         short = np.add.reduceat(np.abs(p_slack), condensed.first) - pieces
         objective = float(cost @ x + price * (pieces + short).sum())
@@ -174,7 +186,7 @@ def _solve(
             program.add(rows, -bound - free[k, g], bound - free[k, g])
             limited |= peaks
         if len(cuts):
-            program.add(*_cuts(condensed, free[:, n_gen], p_slack, cuts))
+            program.add(*_cuts(condensed, free_sum, p_slack, cuts))
     return _Answer(Status.FAILED, solution, np.nan, iterations)
 
 
@@ -220,16 +232,19 @@ def _short_pieces(short: Array, tolerance: float) -> Indices:
     return np.flatnonzero(short > tolerance / len(short))
 
 
-def _cuts(condensed: _Condensed, free: Array, p_slack: Array, pieces: Indices) -> tuple[Array, Array, Array]:
-    """Rows Σ sign(P_s) P_s <= variable of a piece, with the signs at the present solution."""
-    _, n_points, n_x = condensed.gamma.shape
-    ends = np.append(condensed.first, n_points)
-    rows = np.zeros((len(pieces), n_x + len(condensed.first)))
-    upper = np.empty(len(pieces))
-    for row, piece in enumerate(pieces.tolist()):
-        points = slice(ends[piece], ends[piece + 1])
-        sign = np.sign(p_slack[points])
-        rows[row, :n_x] = sign @ condensed.gamma[-1, points]
-        rows[row, n_x + piece] = -1.0
-        upper[row] = -sign @ free[points]
-    return rows, np.full(len(pieces), -np.inf), upper
+def _cuts(
+    condensed: _Condensed, free_sum: Array, p_slack: Array, pieces: Indices
+) -> tuple[Array, Array, Array]:
+    """Rows Σ sign(P_s) P_s <= variable of a piece, with the signs at the present solution.
+
+    Args:
+        free_sum: P_s without generator power, summed over all points before one.
+    """
+    first, n_pieces = condensed.first, len(condensed.first)
+    sign = np.where(p_slack > 0, 1.0, -1.0)
+    start = np.union1d(first, np.flatnonzero(np.diff(sign)) + 1)  # of stretches of one sign in one piece
+    ends, piece = np.append(start, len(sign)), np.searchsorted(start, first)
+    across = np.add.reduceat(sign[start, None] * np.diff(condensed.p_slack_sum[ends], axis=0), piece)
+    known = np.add.reduceat(sign[start] * np.diff(free_sum[ends]), piece)
+    rows = np.hstack([across[pieces], -np.eye(n_pieces)[pieces]])
+    return rows, np.full(len(pieces), -np.inf), -known[pieces]

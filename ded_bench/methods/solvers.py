@@ -240,13 +240,13 @@ class GrowingProgram:
 
     def restart(self, cost: Array, lower: Array, upper: Array, row_lower: Array, row_upper: Array) -> None:
         """Set the numbers of columns and first rows; forget other rows and earlier solutions."""
-        highs, columns = self._highs, np.arange(self._n, dtype=np.int32)
+        highs = self._highs
+        columns, rows = (np.arange(n, dtype=np.int32) for n in (self._n, self._n_rows))
         if extra := highs.getNumRow() - self._n_rows:
             highs.deleteRows(extra, np.arange(self._n_rows, self._n_rows + extra, dtype=np.int32))
         highs.changeColsBounds(self._n, columns, lower, upper)
         highs.changeColsCost(self._n, columns, cost)
-        for row, (low, high) in enumerate(zip(row_lower.tolist(), row_upper.tolist(), strict=True)):
-            highs.changeRowBounds(row, low, high)
+        highs.changeRowsBounds(self._n_rows, rows, row_lower, row_upper)
         highs.clearSolver()
 
     def add(self, rows: Array, lower: Array, upper: Array) -> None:

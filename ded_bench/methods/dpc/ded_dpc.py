@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import io
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ded_bench.methods.dpc.answer import method
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
@@ -29,7 +29,7 @@ from ded_bench.methods.dpc.store import (
     weights_fingerprint,
     write_policy,
 )
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
@@ -173,16 +173,5 @@ def artifact(case: Case, regime: str, settings: Settings) -> str:
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return the policy as a method; `solve_s` covers features, network and all grid points."""
-    policy = find_policy(case, regime, settings)
-
-    def solve(instance: Instance) -> Solution:
-        policy(instance)  # the first call of a process pays for libraries, not for inference
-        started = time.perf_counter()
-        schedule = policy(instance)[0]
-        schedule.at(instance.grid)
-        elapsed = time.perf_counter() - started
-        version = f"numpy {np.__version__}"
-        return Solution(Status.POLICY, schedule, solve_s=elapsed, solver_version=version)
-
-    return solve
+    """Return the policy as a method."""
+    return method(find_policy(case, regime, settings))

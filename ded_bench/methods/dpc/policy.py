@@ -7,7 +7,6 @@ bounds, linear interpolation. Policy files are safetensors: arrays and a JSON he
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ded_bench.methods.dpc.answer import method
 from ded_bench.methods.dpc.features import Features
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.store import (
@@ -29,7 +29,7 @@ from ded_bench.methods.dpc.store import (
     write_policy,
 )
 from ded_bench.methods.dpc.store import policy_file as policy_file
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -193,16 +193,5 @@ def artifact(case: Case, regime: str, settings: Settings) -> str:
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return the policy as a method; `solve_s` covers features, network and all grid points."""
-    policy = find_policy(case, regime, settings)
-
-    def solve(instance: Instance) -> Solution:
-        policy(instance)  # the first call of a process pays for libraries, not for inference
-        started = time.perf_counter()
-        schedule = policy(instance)[0]
-        schedule.at(instance.grid)
-        elapsed = time.perf_counter() - started
-        version = f"numpy {np.__version__}"
-        return Solution(Status.POLICY, schedule, solve_s=elapsed, solver_version=version)
-
-    return solve
+    """Return the policy as a method."""
+    return method(find_policy(case, regime, settings))

@@ -33,7 +33,8 @@ SETTINGS = {"default": "highs"}
 #: Knots lie at j * horizon / (N_KNOTS - 1).
 N_KNOTS = 50
 #: The slack's cost Σ|P_s| is a sum over this many pieces of the horizon, each with a variable above it.
-N_PIECES = 100
+#: More pieces take fewer rounds, but each round longer.
+N_PIECES = 70
 #: What the LP may leave open at the end: frequency in rad/s (1.6e-9 Hz), cost as a fraction of all.
 OMEGA_TOLERANCE = 1e-8
 COST_TOLERANCE = 1e-8

@@ -251,8 +251,10 @@ class GrowingProgram:
 
     def add(self, rows: Array, lower: Array, upper: Array) -> None:
         """Add rows, shape (n_new, n), with lower <= rows @ x <= upper."""
-        a = sp.csr_matrix(rows)
-        self._highs.addRows(len(rows), lower, upper, a.nnz, a.indptr[:-1], a.indices, a.data)
+        row, column = np.nonzero(rows)
+        start = np.searchsorted(row, np.arange(len(rows)))
+        values = rows[row, column]
+        self._highs.addRows(len(rows), lower, upper, len(values), start, column, values)
 
     def solve(self, time_limit_s: float) -> tuple[Status, Array, int]:
         """Status, x and iterations, starting from the solution before the last rows were added."""

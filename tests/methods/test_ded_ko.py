@@ -163,6 +163,18 @@ def test_knots_reach_the_optimum_of_the_program_with_all_rows(
     assert solution.schedule.p.shape == (ded_ko_knots.N_KNOTS, len(case.generators))
 
 
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_knots_answer_alike_whatever_was_solved_before(case: Case, koopman: Koopman, regime: str) -> None:
+    """Every solve starts cold: not even the choice among equal optima depends on the last instance."""
+    solve = ded_ko_knots.prepare_with(case, koopman, regime, Settings())
+    fresh = solve(short(case, 0))
+    solve(short(case, 1))
+    again = solve(short(case, 0))
+    assert again.solver_objective == pytest.approx(fresh.solver_objective, rel=1e-12)
+    np.testing.assert_allclose(again.schedule.p, fresh.schedule.p, rtol=0, atol=1e-12)
+    assert again.iterations == fresh.iterations
+
+
 def test_tight_bounds_and_signs_need_more_rounds_than_one(ninebus: Case) -> None:
     """Where frequency limits bind and P_s changes sign, rows must have been added, or nothing was tested."""
     koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))

@@ -41,12 +41,12 @@ N_KNOTS = 50
 #: Instances worked on at once: what is computed on the way stays in a core's cache.
 CHUNK = 32
 #: Short trainings, for comparison with each other only: each `study-…` changes one thing of `study`.
-STUDY: dict[str, Any] = {"epochs": 2}
+STUDY: dict[str, Any] = {"epochs": 8, "fresh": 16_000}
 #: What the policy was trained on and how, by slug; values are options of `ded_dpc_train.train`.
 #: `train400` sees nothing but the benchmark's training instances, in about as many steps.
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
-    "train400": {"fresh": 0, "epochs": 6000},
+    "train400": {"fresh": 0, "epochs": 2000},
     "study": STUDY,
     "study-narrow": STUDY | {"width": 12},
     "study-wide": STUDY | {"width": 48},
@@ -62,7 +62,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "study-constant": STUDY | {"rate": "constant"},
     "study-batch32": STUDY | {"batch": 32},
     "study-batch512": STUDY | {"batch": 512},
-    "study-fresh4000": {"epochs": 32, "fresh": 4000},
+    "study-fresh4000": {"epochs": 32, "fresh": 4_000},
 }
 
 

@@ -55,6 +55,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
+    "axes.titley": 1.0,  # else each drawing looks for ticks on top that a title must avoid
     "axes.formatter.useoffset": False,
     "axes.formatter.limits": (-4, 5),
     "grid.color": "#e3e3e3",

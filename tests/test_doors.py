@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from ded_bench.bench.metrics import summary
 from ded_bench.bench.paper import table_v, table_vi
 from ded_bench.bench.results import Results
 from ded_bench.bench.timing import read_timing, timing_frame
@@ -130,8 +131,8 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
     )
     assert command(*bench)[0] == 0
     frame, timing = Results(out).frame(), timing_frame(read_timing(out / "timing.csv"))
-    five = table_v(frame, timing, {}).set_index(["regime", "title"])
-    six = table_vi(frame, {}).set_index(["regime", "title"])
+    five = table_v(summary(frame), timing, {}).set_index(["regime", "title"])
+    six = table_vi(summary(frame), {}).set_index(["regime", "title"])
     for regime in ("NO", "TO"):
         assert five.loc[(regime, "flat"), "increase_percent"] == pytest.approx(2.0)
         assert five.loc[(regime, "flat"), "n"] == 2
@@ -196,7 +197,7 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     assert (
         f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     )
-    assert "mine" in set(table_v(Results(out).frame(), timing_frame([]), {})["title"])
+    assert "mine" in set(table_v(summary(Results(out).frame()), timing_frame([]), {})["title"])
     for wrong in (
         score,  # no name
         (*score, "--name", "ded"),

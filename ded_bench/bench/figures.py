@@ -55,6 +55,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
+    "axes.titley": 1.0,  # else each drawing looks for ticks on top that a title must avoid
     "axes.formatter.useoffset": False,
     "axes.formatter.limits": (-4, 5),
     "grid.color": "#e3e3e3",
@@ -63,6 +64,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.handlelength": 2.4,
     "pdf.fonttype": 42,
+    "ps.fonttype": 42,  # matplotlib splits a PDF's fonts by this one: into one part each, not two
     "svg.hashsalt": "ded-bench",
 }
 
@@ -87,12 +89,15 @@ def new_figure(width: float, height: float) -> Iterator[Figure]:
 def save_figure(figure: Figure, stem: Path, formats: Sequence[str] = ("png", "pdf"), dpi: int = DPI) -> None:
     """Write `<stem>.png` and `<stem>.pdf` without a date, so that equal figures are equal files."""
     with mpl.rc_context(STYLE):
+        if layout := figure.get_layout_engine():  # once; `savefig` would also draw everything twice
+            figure.set_dpi(dpi)
+            layout.execute(figure)
+            figure.set_layout_engine(None)
         for form in formats:
             buffer = io.BytesIO()
             metadata = {"CreationDate": None} if form == "pdf" else {"Software": None}
             figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
             write_atomically(stem.parent / f"{stem.name}.{form}", buffer.getvalue())
-            figure.set_layout_engine("none")  # what the first format laid out stays for the next
 
 
 def plain(text: str) -> str:

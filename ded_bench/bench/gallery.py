@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
@@ -66,23 +67,17 @@ class Gallery:
     pictures: dict[str, list[Picture]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
-    pending: list[Call] = field(default_factory=list)
 
     def add(
         self, topic: str, name: str, caption: str, figure: Callable[..., Figure], *arguments: Any
-    ) -> None:
-        """Hang a picture under a topic; `paint` makes the figure by this call and writes it."""
+    ) -> Call:
+        """Hang a picture under a topic; returns the call that makes the figure and writes it."""
         formats, dpi = (("png",), WORST_DPI) if topic == "worst" else (("png", "pdf"), DPI)
         name = re.sub(r"[^A-Za-z0-9_.-]+", "-", name)
         stem = self.results.folder / "figures" / name
-        self.pending.append((paint, (stem, formats, dpi, figure, arguments)))
         self.files += [stem.parent / f"{name}.{form}" for form in formats]
         self.pictures.setdefault(topic, []).append(Picture(f"figures/{name}.png", caption))
-
-    def take_pending(self) -> list[Call]:
-        """The calls that draw what was added since this was last asked."""
-        pending, self.pending = self.pending, []
-        return pending
+        return paint, (stem, formats, dpi, figure, arguments)
 
     def of(self, topic: str, otherwise: str = "") -> list[Block]:
         """The pictures of a topic, or a sentence if there are none."""
@@ -119,22 +114,24 @@ def draw(
     frame = frame[frame["regime"].isin(list(case.regimes))]
     _read_instances(gallery, problems)
     chosen = plan(frame, gallery.has)
-    _read_schedules(gallery, chosen)
     models = _models(gallery)
-    _draw_tradeoff(gallery, frame, timing)
-    _draw_training(gallery)
-    _draw_problem(gallery)
-    _draw_eigenvalues(gallery, models)
     with Workers(workers) if workers > 1 else nullcontext() as pool:
-        simulations = _simulations(gallery, chosen)
-        calls: list[Call] = [(simulate_many, arguments) for arguments in simulations.values()]
-        for keys, runs in _answers(pool, [*calls, *gallery.take_pending()], [*simulations]):
-            _keep(gallery, keys, runs)
-        _draw_schedules(gallery, chosen)
-        _draw_tight(gallery, chosen, models)
-        _draw_worst(gallery, chosen)
-        _draw_models(gallery, models)
-        list(_answers(pool, gallery.take_pending(), []))
+        before = (
+            _simulations(gallery, chosen),  # first, since it takes longest
+            _draw_training(gallery),
+            _draw_problem(gallery),
+            _draw_tradeoff(gallery, frame, timing),
+            _draw_eigenvalues(gallery, models),
+        )
+        for answer in _answers(pool, itertools.chain(*before)):
+            _keep(gallery, answer)
+        after = (
+            _draw_schedules(gallery, chosen),
+            _draw_tight(gallery, chosen, models),
+            _draw_models(gallery, models),
+            _draw_worst(gallery, chosen),
+        )
+        list(_answers(pool, itertools.chain(*after)))
     if not any(chosen.representative.values()):
         gallery.notes.append("No schedule of a scored row is in the folder, so no trajectory is drawn.")
     return gallery
@@ -160,44 +157,45 @@ def _read_schedules(gallery: Gallery, chosen: Plan) -> None:
             gallery.notes.append(f"Not drawn: {error}")
 
 
-def _answers(
-    pool: Workers | None, calls: list[Call], labels: list[tuple[Key, ...]]
-) -> Iterator[tuple[tuple[Key, ...], object]]:
-    """Answers, or SimulationErrors, of the first calls, which have labels; any other error is raised."""
-    names: list[tuple[Key, ...]] = [*labels, *[()] * (len(calls) - len(labels))]
-    found = zip(names, map(_called, calls), strict=True) if pool is None else pool.imap(calls, names)
-    for name, answer in found:
-        if isinstance(answer, Exception) and not isinstance(answer, SimulationError):
+def _answers(pool: Workers | None, calls: Iterable[Call]) -> Iterator[object]:
+    """Answers of calls as they come; an error is raised."""
+    if pool is None:
+        yield from (function(*arguments) for function, arguments in calls)
+        return
+    for _, answer in pool.imap(calls, itertools.repeat(None)):
+        if isinstance(answer, Exception):
             raise answer
-        if name:
-            yield name, answer
+        yield answer
 
 
-def _called(call: Call) -> object:
-    function, arguments = call
-    try:
-        return function(*arguments)
-    except SimulationError as error:
-        return error
-
-
-def _simulations(gallery: Gallery, chosen: Plan) -> dict[tuple[Key, ...], tuple[Any, ...]]:
-    """Arguments of `simulate_many` by what it simulates: side by side, which costs little more than one."""
+def _simulations(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
+    """What the figures show, simulated side by side, which costs little more than one."""
+    _read_schedules(gallery, chosen)
     grids: dict[tuple[int, float], list[Key]] = {}
     for key in filter(gallery.schedules.__contains__, chosen.shown):
         instance = gallery.instances[key.instance]
         grids.setdefault((instance.steps, instance.dt_s), []).append(key)
-    return {
-        tuple(keys): (gallery.case, gallery.posed(keys), [gallery.schedules[key] for key in keys])
-        for keys in grids.values()
-    }
+    for keys in grids.values():
+        schedules = [gallery.schedules[key] for key in keys]
+        yield simulated, (gallery.case, keys, gallery.posed(keys), schedules)
 
 
-def _keep(gallery: Gallery, keys: tuple[Key, ...], runs: object) -> None:
-    if isinstance(runs, list):
-        gallery.trajectories |= dict(zip(keys, runs, strict=True))
-    else:
-        gallery.notes.append(f"Not drawn, since the simulation failed: {runs}")
+def simulated(
+    case: Case, keys: list[Key], instances: list[Instance], schedules: list[Schedule]
+) -> dict[Key, Trajectory] | str:
+    """Trajectories of runs, or a note why there are none; in whatever process this is called."""
+    try:
+        return dict(zip(keys, simulate_many(case, instances, schedules), strict=True))
+    except SimulationError as error:
+        return f"Not drawn, since the simulation failed: {error}"
+
+
+def _keep(gallery: Gallery, answer: object) -> None:
+    """Keep what a simulation answers; painters answer nothing."""
+    if isinstance(answer, dict):
+        gallery.trajectories |= answer
+    elif isinstance(answer, str):
+        gallery.notes.append(answer)
 
 
 def _models(gallery: Gallery) -> list[Koopman]:
@@ -228,7 +226,7 @@ def _names(shown: list[Shown]) -> str:
     return " and ".join(title(s.method, s.settings) for s in reversed(shown))
 
 
-def _draw_schedules(gallery: Gallery, chosen: Plan) -> None:
+def _draw_schedules(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
     for regime, keys in chosen.representative.items():
         if shown := _shown(gallery, keys):
             caption = (
@@ -236,10 +234,12 @@ def _draw_schedules(gallery: Gallery, chosen: Plan) -> None:
                 "generator powers with their bounds, loads, slack power."
             )
             heading = f"{keys[0].instance}, {regime}"
-            gallery.add("paper", f"schedule_{regime}", caption, schedule_figure, gallery.case, heading, shown)
+            yield gallery.add(
+                "paper", f"schedule_{regime}", caption, schedule_figure, gallery.case, heading, shown
+            )
 
 
-def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> None:
+def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> Iterator[Call]:
     """Frequencies and Koopman against swing, in the tightest regime that was run."""
     case = gallery.case
     tight = sorted(case.regimes, key=lambda name: case.regimes[name].omega_hz)
@@ -251,7 +251,9 @@ def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> None:
     shown = _shown(gallery, chosen.representative[regime])
     heading = f"{key.instance}, {regime}"
     caption = f"Generator frequencies under {_names(shown)} on {heading}; dotted: the bounds of the regime."
-    gallery.add("paper", f"frequencies_{regime}", caption, frequency_figure, case, regime, heading, shown)
+    yield gallery.add(
+        "paper", f"frequencies_{regime}", caption, frequency_figure, case, regime, heading, shown
+    )
     fitting = _fitting(gallery, models, key)
     if key in gallery.trajectories and fitting:
         model = next((m for m in fitting if m.kind == "koopman"), fitting[-1])
@@ -262,7 +264,7 @@ def _draw_tight(gallery: Gallery, chosen: Plan, models: list[Koopman]) -> None:
             f"{title(key.method, key.settings)} on {heading}."
         )
         drawn = (case, regime, heading, run, outputs, model.kind)
-        gallery.add("paper", f"koopman_{regime}", caption, koopman_figure, *drawn)
+        yield gallery.add("paper", f"koopman_{regime}", caption, koopman_figure, *drawn)
 
 
 def _fitting(gallery: Gallery, models: list[Koopman], key: Key) -> list[Koopman]:
@@ -277,12 +279,14 @@ def rollout(case: Case, model: Koopman, instances: list[Instance], runs: list[Tr
     return np.asarray(psi[..., : len(case.generators) + 1])
 
 
-def _draw_eigenvalues(gallery: Gallery, models: list[Koopman]) -> None:
+def _draw_eigenvalues(gallery: Gallery, models: list[Koopman]) -> Iterator[Call]:
     caption = "Eigenvalues of K against the physical modes at the nominal point (crosses)."
-    gallery.add("koopman", "koopman_eigenvalues", caption, charts.eigenvalue_figure, gallery.case, models)
+    yield gallery.add(
+        "koopman", "koopman_eigenvalues", caption, charts.eigenvalue_figure, gallery.case, models
+    )
 
 
-def _draw_models(gallery: Gallery, models: list[Koopman]) -> None:
+def _draw_models(gallery: Gallery, models: list[Koopman]) -> Iterator[Call]:
     case = gallery.case
     if not gallery.trajectories:
         return
@@ -298,10 +302,10 @@ def _draw_models(gallery: Gallery, models: list[Koopman]) -> None:
             f"Error of Koopman rollouts against the swing equations over time, under {len(keys)} schedules: "
             "those of the paper's figures and the worst of each method."
         )
-        gallery.add("koopman", "koopman_error", caption, charts.rollout_figure, case, t, errors)
+        yield gallery.add("koopman", "koopman_error", caption, charts.rollout_figure, case, t, errors)
 
 
-def _draw_worst(gallery: Gallery, chosen: Plan) -> None:
+def _draw_worst(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
     for (regime, method, settings), pairs in chosen.worst.items():
         is_reference = (method, settings) == REFERENCE
         columns = []
@@ -320,10 +324,10 @@ def _draw_worst(gallery: Gallery, chosen: Plan) -> None:
                 f"{dashed}dotted: bounds."
             )
             name = f"worst_{method}_{settings}_{regime}"
-            gallery.add("worst", name, caption, worst_figure, gallery.case, regime, heading, columns)
+            yield gallery.add("worst", name, caption, worst_figure, gallery.case, regime, heading, columns)
 
 
-def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) -> None:
+def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) -> Iterator[Call]:
     frame = main_rows(frame)
     points = tradeoff(frame, timing)
     if points["gap_percent"].notna().any():
@@ -332,7 +336,7 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
             "some schedules are infeasible; * timed under parallel load, not by `ded-bench bench`. The "
             "vertical scale is linear within ±0.01 %."
         )
-        gallery.add("tradeoff", "tradeoff", caption, charts.tradeoff_figure, points)
+        yield gallery.add("tradeoff", "tradeoff", caption, charts.tradeoff_figure, points)
     times, objectives = (performance_profile(frame, column) for column in ("solve_s", "objective"))
     if len(times) or len(objectives):
         caption = (
@@ -341,7 +345,7 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame, timing: pd.DataFrame) 
             "the cheapest schedule (bottom). Only feasible schedules count"
         )
         caption += without_curve(frame, objectives)
-        gallery.add("profile", "profile", caption, charts.profile_figure, times, objectives)
+        yield gallery.add("profile", "profile", caption, charts.profile_figure, times, objectives)
 
 
 def without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
@@ -355,7 +359,7 @@ def without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
     return f"; {', '.join(absent)} had none and no curve." if absent else "."
 
 
-def _draw_training(gallery: Gallery) -> None:
+def _draw_training(gallery: Gallery) -> Iterator[Call]:
     """One figure per method; the short trainings of a study are left to its table."""
     histories: dict[str, dict[str, pd.DataFrame]] = {}
     for path in sorted((gallery.results.folder / "policies").glob("*.history.csv")):
@@ -375,15 +379,15 @@ def _draw_training(gallery: Gallery) -> None:
             f"Loss of each policy of {title(method)} over its training time; right: the loss's terms on "
             "held-out instances."
         )
-        gallery.add("training", f"training_{method}", caption, charts.history_figure, curves)
+        yield gallery.add("training", f"training_{method}", caption, charts.history_figure, curves)
 
 
-def _draw_problem(gallery: Gallery) -> None:
+def _draw_problem(gallery: Gallery) -> Iterator[Call]:
     instances = list(gallery.instances.values())
     if not instances:
         return
     ranges = "the ranges of the sampler (dotted; the paper's Table III)"
     caption = f"Sampled parameters of the {len(instances)} instances against {ranges}."
-    gallery.add("problem", "parameters", caption, charts.parameters_figure, gallery.case, instances)
+    yield gallery.add("problem", "parameters", caption, charts.parameters_figure, gallery.case, instances)
     caption = "Load forecasts of a sample of test instances."
-    gallery.add("problem", "forecasts", caption, charts.forecasts_figure, gallery.case, instances)
+    yield gallery.add("problem", "forecasts", caption, charts.forecasts_figure, gallery.case, instances)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from ded_bench.bench.metrics import GROUP, HEAD, REFERENCE, groups, summary, table, title
+from ded_bench.bench.metrics import GROUP, HEAD, REFERENCE, groups, table, title
 from ded_bench.problem.case import Case
 
 
@@ -56,15 +56,15 @@ def paper_numbers(case: Case) -> Mapping[tuple[str, str], PaperRow]:
 
 
 def table_v(
-    frame: pd.DataFrame, timing: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
+    overview: pd.DataFrame, timing: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
 ) -> pd.DataFrame:
-    """The paper's Table V with the paper's numbers beside ours.
+    """The paper's Table V with the paper's numbers beside ours, from a summary of the rows.
 
     The increase is the mean signed gap over `n` instances; it is not available for DED itself. The
     time is the median of `solve_s` in the timing table (see `timing.latest_host`), empty without one.
     """
     rows = []
-    for row, theirs in _paper_rows(frame, paper):
+    for row, theirs in _paper_rows(overview, paper):
         increase = row.get("gap_percent_mean", np.nan)
         if (row["method"], row["settings"]) == REFERENCE:
             increase = np.nan
@@ -87,10 +87,10 @@ def table_v(
     return table(rows, TABLE_V_COLUMNS)
 
 
-def table_vi(frame: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]) -> pd.DataFrame:
-    """The paper's Table VI: mean over instances of the largest violation over time and generators."""
+def table_vi(overview: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]) -> pd.DataFrame:
+    """The paper's Table VI from a summary: mean of each instance's largest violation."""
     rows = []
-    for row, theirs in _paper_rows(frame, paper):
+    for row, theirs in _paper_rows(overview, paper):
         freq = row.get("freq_violation_hz_mean", np.nan)
         ramp = row.get("ramp_violation_mean", np.nan)
         failures = row["failures"]
@@ -111,11 +111,11 @@ def table_vi(frame: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]) -> 
 
 
 def _paper_rows(
-    frame: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
+    overview: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
 ) -> Iterator[tuple[dict[str, Any], PaperRow | None]]:
     """Rows of the summary and of the paper side by side; rows that nobody ran yet have n = 0."""
-    rows = {tuple(str(row[name]) for name in GROUP): row for row in summary(frame).to_dict("records")}
-    order = [(regime, method, settings) for regime, method, settings, _ in groups(frame)]
+    rows = {tuple(str(row[name]) for name in GROUP): row for row in overview.to_dict("records")}
+    order = [(regime, method, settings) for regime, method, settings, _ in groups(overview)]
     missing = [
         (regime, method, "default")
         for regime in dict.fromkeys(regime for regime, _ in paper)

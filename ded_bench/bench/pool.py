@@ -6,7 +6,6 @@ crash or hang, and only its own call is to blame: it is killed and replaced, and
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import itertools
 import multiprocessing
@@ -17,7 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
 from typing import Self, TypeVar
@@ -67,7 +66,7 @@ class Workers:
         self._executor.shutdown(cancel_futures=True)
 
     def imap(
-        self, calls: Sequence[Call], labels: Iterable[T], limits_s: Iterable[float | None] | None = None
+        self, calls: Iterable[Call], labels: Iterable[T], limits_s: Iterable[float | None] | None = None
     ) -> Iterator[tuple[T, object]]:
         """Yield (label, answer) of every call, in the order in which they finish.
 
@@ -75,6 +74,7 @@ class Workers:
         process died three times, NoAnswerError if it took longer than its limit.
 
         Args:
+            calls: asked for one after another as processes become free, so that they may be made meanwhile.
             limits_s: seconds from a call's start in its process until it is killed, the import of the
                 function's module not counted; None (for one call or all) waits for ever.
 
@@ -82,12 +82,14 @@ class Workers:
             WorkersLostError: no call can be answered any more.
         """
         limits = itertools.repeat(None) if limits_s is None else limits_s
-        waiting = collections.deque(zip(labels, calls, limits))  # noqa: B905  (repeat has no end)
+        waiting = zip(labels, calls, limits)  # noqa: B905  (repeat has no end)
         running: dict[Future[Answer], T] = {}
-        while waiting or running:
-            while waiting and len(running) < 2 * self.count:  # the next one is at hand when one ends
-                label, (function, arguments), limit_s = waiting.popleft()
+        while True:
+            wanted = max(2 * self.count - len(running), 0)  # the next one is at hand when one ends
+            for label, (function, arguments), limit_s in itertools.islice(waiting, wanted):
                 running[self._submit(pickle.dumps((function, arguments)), limit_s)] = label
+            if not running:
+                return
             done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
             for future in done:
                 yield running.pop(future), self._answer(future)

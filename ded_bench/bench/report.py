@@ -85,24 +85,25 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     timing = latest_host(timings[timings["case"] == case.id])
     paper = paper_numbers(case)
     gallery = draw(case, results, frame, timing, problems, workers)
+    overview, overall = summary(frame), summary(everything)
     frames = {
-        "table_v": table_v(main_rows(frame), timing, paper),
-        "table_vi": table_vi(main_rows(frame), paper),
-        "summary": summary(frame),
+        "table_v": table_v(main_rows(overview), timing, paper),
+        "table_vi": table_vi(main_rows(overview), paper),
+        "summary": overview,
         "claims": claims(frame),
         "times_under_load": table_times(frame),
         "worst": worst(frame),
         "training": training_table(folder, [c.name for c in TRAINING[1:-1]]),
-        "models": model_table(frame),
-        "ablation": ablation_table(everything, folder),
+        "models": model_table(overview),
+        "ablation": ablation_table(overall, folder),
     }
     if len(everything) > len(frame):
-        frames["summary_all"] = summary(everything)
+        frames["summary_all"] = overall
     rows_from = rows_caption(frame, everything)
     files = _write_tables(folder, frames, rows_from, timing)
-    notes = [*data_notes(frame, everything, timings, timing, case, problems), *gallery.notes]
+    notes = [*data_notes(frame, everything, overview, timings, timing, case, problems), *gallery.notes]
     blocks = [
-        *_opening(case, frame, everything, problems, notes),
+        *_opening(case, everything, overview, notes),
         *_results(frames, rows_from, timing, gallery),
         *_details(frames, rows_from, timing, gallery),
         *_training(frames, folder, gallery),
@@ -127,6 +128,7 @@ def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
 def data_notes(
     frame: pd.DataFrame,
     everything: pd.DataFrame,
+    overview: pd.DataFrame,
     timings: pd.DataFrame,
     timing: pd.DataFrame,
     case: Case,
@@ -164,8 +166,7 @@ def data_notes(
     ]
     if len(unscored):
         notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
-    short = summary(frame)
-    short = short[short["rows"] < n_test]
+    short = overview[overview["rows"] < n_test]
     if n_test and len(short) and (frame["split"] == "test").all():
         for count, rows in short.groupby("rows"):
             names = ", ".join(f"{row.title} {row.regime}" for row in rows.itertuples())
@@ -229,11 +230,11 @@ def _captions(rows_from: str, timing: pd.DataFrame) -> dict[str, str]:
 
 
 def _opening(
-    case: Case, frame: pd.DataFrame, everything: pd.DataFrame, problems: Path, notes: Sequence[str]
+    case: Case, everything: pd.DataFrame, overview: pd.DataFrame, notes: Sequence[str]
 ) -> list[Block]:
     counts = everything["split"].value_counts().to_dict()
     parts = ", ".join(f"{count} on {_split_name(str(name))} instances" for name, count in counts.items())
-    names = ", ".join(dict.fromkeys(summary(frame)["title"])) or "none yet"
+    names = ", ".join(dict.fromkeys(overview["title"])) or "none yet"
     dates = [date for date in everything["date"] if date]
     items = [
         f"Case `{case.id}`: {len(case.buses)} buses, {len(case.generators)} generators besides the slack "

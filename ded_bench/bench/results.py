@@ -8,6 +8,7 @@ import dataclasses
 import fcntl
 import functools
 import io
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +80,7 @@ class Row:
 #: No number of the table is larger unless the file is damaged; sums and ratios then stay finite.
 LARGEST = 1e15
 COLUMNS = tuple(field.name for field in dataclasses.fields(Row))
+_cells = operator.attrgetter(*COLUMNS)
 _TYPES = {field.name: str(field.type).removesuffix(" | None") for field in dataclasses.fields(Row)}
 _REQUIRED = ("instance", "split", "regime", "method", "settings", "status")
 
@@ -128,7 +130,7 @@ class Results:
 
     def frame(self) -> pd.DataFrame:
         """The table, one row each, typed columns; empty cells are missing values."""
-        frame = pd.DataFrame([dataclasses.astuple(row) for row in self.rows.values()], columns=list(COLUMNS))
+        frame = pd.DataFrame(map(_cells, self.rows.values()), columns=list(COLUMNS))
         for name, kind in _TYPES.items():
             if kind == "float":
                 frame[name] = frame[name].astype("float64")

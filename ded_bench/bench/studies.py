@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.bench.metrics import GROUP, REFERENCE, STUDY, is_study, summary, title
+from ded_bench.bench.metrics import GROUP, REFERENCE, STUDY, is_study, title
 from ded_bench.bench.results import Key, Results
 from ded_bench.koopman.data import trajectories
 from ded_bench.koopman.fit import rollout_table
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.store import MODELS
-from ded_bench.methods import get_method, registered
+from ded_bench.methods.dpc.settings import SETTINGS
 from ded_bench.methods.dpc.store import policy_file
 from ded_bench.methods.solution import DEFAULT_MODEL
 from ded_bench.problem.arrays import read_arrays
@@ -45,9 +45,9 @@ def main_rows(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[(named["_ours"] | ~best).to_numpy()]
 
 
-def model_table(frame: pd.DataFrame) -> pd.DataFrame:
-    """Summary rows of every method and settings that were run on more than one Koopman model."""
-    table = summary(frame)
+def model_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a summary: every method and settings that were run on more than one Koopman model."""
+    table = rows.copy()
     table[["name", "model"]] = [split_slug(slug) for slug in table["settings"]] or np.empty((0, 2))
     several = table.groupby(["method", "name"])["model"].transform("nunique") > 1
     named = [title(method, name) for method, name in zip(table["method"], table["name"], strict=True)]
@@ -59,14 +59,10 @@ def model_table(frame: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def ablation_table(frame: pd.DataFrame, folder: Path) -> pd.DataFrame:
-    """The short trainings of a study side by side: what differs, gaps, violations, cost of the training."""
-    reference = (frame["method"] == REFERENCE[0]) & (frame["settings"] == REFERENCE[1])
-    study = frame["settings"].map(is_study).astype(bool)
-    table = summary(frame[study | reference])
-    table = table[table["settings"].map(is_study).astype(bool)]
+def ablation_table(overview: pd.DataFrame, folder: Path) -> pd.DataFrame:
+    """The short trainings of a summary side by side: what differs, gaps, violations, cost of the training."""
     rows = []
-    for row in table.to_dict("records"):
+    for row in overview[overview["settings"].map(is_study).astype(bool)].to_dict("records"):
         name, model = split_slug(str(row["settings"]))
         path = policy_file(folder, str(row["method"]), str(row["regime"]), model, name)
         rows.append(row | {"change": _change(str(row["method"]), name, model)} | _facts(path))
@@ -131,7 +127,7 @@ def _facts(path: Path) -> dict[str, Any]:
 
 def _change(method: str, name: str, model: str) -> str:
     """What a study's settings change, in words."""
-    known = get_method(method).settings if method in registered() else {}
+    known = SETTINGS if method == "ded-dpc" else {}
     base, own = known.get(STUDY, {}), known.get(name, {})
     changed = [f"{key} = {value}" for key, value in own.items() if base.get(key) != value]
     changed += [] if model == DEFAULT_MODEL else [f"model = {model}"]

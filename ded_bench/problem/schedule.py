@@ -137,7 +137,7 @@ def _numbers(rows: list[tuple[int, list[str]]], header: list[str], path: str | P
     """The numbers of a table, shape (n_rows, n_columns); InputError names the first cell that is none."""
     shape = len(rows), len(header)
     try:
-        values = np.array([[float(cell) for cell in row] for _, row in rows]).reshape(shape)
+        values = np.array([row for _, row in rows], dtype=float).reshape(shape)
     except ValueError:  # some cell is no number, or some row too short or too long
         values = np.full(shape, np.nan)
     if not np.isfinite(values).all() or any("_" in cell for _, row in rows for cell in row):

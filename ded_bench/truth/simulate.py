@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -91,17 +92,23 @@ def simulate_many(
     try:
         theta[0] = np.stack([network.initial_angles(i) for i in instances])
         omega[0] = np.stack([i.omega_initial(case) for i in instances])
-        angles = theta[0].copy()
+        angles = theta[0]
+        recent = {0.0: angles}  # at the times of the last evaluations
         slope: Array | None = None  # at the end of the last step, hence at the start of the next
 
         def rhs(t: float, y: Array) -> Array:
+            nonlocal angles
             if slope is not None and t == grid[step]:
                 return slope
             angle, speed = y.reshape(2, batch, n_gen)
             inside = (t - grid[step]) / dt
-            angles[:, network.generators] = angle
+            guess = _extrapolated(recent, t)
+            guess[:, network.generators] = angle
             wanted = injection[step] + inside * (injection[step + 1] - injection[step])
-            angles[:], injections = network.solve_loads(angles, wanted)
+            angles, injections = network.solve_loads(guess, wanted)
+            recent[t] = angles
+            if len(recent) > 3:
+                del recent[next(iter(recent))]
             power = p_gen[step] + inside * (p_gen[step + 1] - p_gen[step])
             force = injections[:, network.generators]
             return np.concatenate([speed.ravel(), network.acceleration(speed, power, force).ravel()])
@@ -124,3 +131,9 @@ def simulate_many(
         Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b], case)
         for b in range(batch)
     ]
+
+
+def _extrapolated(values: Mapping[float, Array], t: float) -> Array:
+    """The polynomial through values at other times, at t: so near that Newton mostly needs one step."""
+    weights = (math.prod((t - b) / (a - b) for b in values if b != a) for a in values)
+    return np.asarray(sum(w * value for w, value in zip(weights, values.values(), strict=True)))

@@ -253,7 +253,7 @@ def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
 
 def test_table_v_puts_the_papers_numbers_beside_ours(table: pd.DataFrame) -> None:
     times = timing_frame([timed("ded", "TO", 5.0), timed("ded-ko", "TO", 30.0)])
-    ours = table_v(table, times, PAPER).set_index(["regime", "method"])
+    ours = table_v(summary(table), times, PAPER).set_index(["regime", "method"])
     ded, ko = ours.loc[("TO", "ded")], ours.loc[("TO", "ded-ko")]
     assert math.isnan(ded["increase_percent"])  # NA, as in the paper
     assert (ded["solve_s"], ded["paper_solve_s"], ded["ahead_time"]) == (5.0, 32.38, "yes")
@@ -264,31 +264,31 @@ def test_table_v_puts_the_papers_numbers_beside_ours(table: pd.DataFrame) -> Non
 
 def test_a_method_with_failures_is_never_ahead() -> None:
     rows = [row("a", "ded", 100.0), row("b", "ded", 100.0), row("a", "ded-ko", 100.1)]
-    assert table_v(frame_of(*rows), NO_TIMES, PAPER).set_index(["regime", "method"])["ahead_increase"][
-        "TO", "ded-ko"
-    ] == ("yes")
-    with_failure = table_v(frame_of(*rows, row("b", "ded-ko")), NO_TIMES, PAPER)
+    assert table_v(summary(frame_of(*rows)), NO_TIMES, PAPER).set_index(["regime", "method"])[
+        "ahead_increase"
+    ]["TO", "ded-ko"] == ("yes")
+    with_failure = table_v(summary(frame_of(*rows, row("b", "ded-ko"))), NO_TIMES, PAPER)
     assert with_failure.set_index(["regime", "method"])["ahead_increase"]["TO", "ded-ko"] == "no"
 
 
 def test_what_was_not_run_is_an_empty_row_beside_the_papers() -> None:
     for frame in (frame_of(), frame_of(row("a", "ded", 1.0))):
-        for made in (table_v(frame, NO_TIMES, PAPER), table_vi(frame, PAPER)):
+        for made in (table_v(summary(frame), NO_TIMES, PAPER), table_vi(summary(frame), PAPER)):
             rows = set(zip(made["regime"], made["method"], strict=True))
             assert rows == {(regime, name) for regime in ("NO", "TO") for name in EXPECTED}
             missing = made[(made["method"] == "ded-ko") & (made["regime"] == "NO")].iloc[0]
             assert (missing["n"], missing["failures"]) == (0, 0)
-    five = table_v(frame_of(), NO_TIMES, PAPER).set_index(["regime", "method"])
+    five = table_v(summary(frame_of()), NO_TIMES, PAPER).set_index(["regime", "method"])
     assert five.loc[("NO", "ded-dpc-paper"), "paper_increase_percent"] == 1.05
 
 
 def test_the_papers_policy_numbers_stand_beside_our_policy_if_there_is_one() -> None:
     rows = [row("a", "ded", 1.0), row("a", "ded-dpc-paper", 2.0)]
-    alone = table_v(frame_of(*rows), NO_TIMES, PAPER).set_index(["regime", "method"])[
+    alone = table_v(summary(frame_of(*rows)), NO_TIMES, PAPER).set_index(["regime", "method"])[
         "paper_increase_percent"
     ]
     assert alone["TO", "ded-dpc-paper"] == 5.2
-    both = table_v(frame_of(*rows, row("a", "ded-dpc", 1.5)), NO_TIMES, PAPER)
+    both = table_v(summary(frame_of(*rows, row("a", "ded-dpc", 1.5))), NO_TIMES, PAPER)
     beside = both.set_index(["regime", "method"])["paper_increase_percent"]
     assert beside["TO", "ded-dpc"] == 5.2
     assert math.isnan(beside["TO", "ded-dpc-paper"])
@@ -296,7 +296,7 @@ def test_the_papers_policy_numbers_stand_beside_our_policy_if_there_is_one() -> 
 
 def test_other_settings_and_other_methods_have_no_counterpart_in_the_paper() -> None:
     frame = frame_of(row("a", "ded", 1.0), row("a", "ded", 1.0, settings="fast"), row("a", "mine", 1.0))
-    made = table_vi(frame, PAPER)
+    made = table_vi(summary(frame), PAPER)
     mine = made[(made["method"] == "mine") | (made["settings"] == "fast")]
     assert len(mine) == 2
     assert mine["paper_ramp_violation"].isna().all()
@@ -304,19 +304,19 @@ def test_other_settings_and_other_methods_have_no_counterpart_in_the_paper() -> 
 
 
 def test_table_vi_means_the_maxima_and_knows_equal(table: pd.DataFrame) -> None:
-    made = table_vi(table, PAPER).set_index(["regime", "method"])
+    made = table_vi(summary(table), PAPER).set_index(["regime", "method"])
     ko = made.loc[("TO", "ded-ko")]
     assert ko["freq_violation_hz"] == pytest.approx((2e-4 + 1e-5) / 4)
     assert (ko["n"], ko["failures"], ko["ahead_frequency"]) == (4, 1, "no")
     same = frame_of(row("a", "ded", 1.0, regime="NO", ramp_violation=1.84e-9))
-    ded = table_vi(same, PAPER).set_index(["regime", "method"]).loc[("NO", "ded")]
+    ded = table_vi(summary(same), PAPER).set_index(["regime", "method"]).loc[("NO", "ded")]
     assert (ded["ahead_frequency"], ded["ahead_ramp"]) == ("equal", "equal")
 
 
 def test_the_papers_numbers_belong_to_its_case_only(ninebus: Case, threebus: Case) -> None:
     assert paper_numbers(ninebus) == PAPER
     assert paper_numbers(threebus) == {}
-    assert len(table_v(frame_of(), NO_TIMES, {})) == 0
+    assert len(table_v(summary(frame_of()), NO_TIMES, {})) == 0
 
 
 def test_an_empty_table_has_its_columns() -> None:

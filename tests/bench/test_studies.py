@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.bench.metrics import judged_rows
+from ded_bench.bench.metrics import judged_rows, summary
 from ded_bench.bench.results import Key, Results
 from ded_bench.bench.studies import (
     ROLLOUTS,
@@ -64,25 +64,25 @@ def test_the_papers_tables_keep_to_one_model_and_to_no_study(table: pd.DataFrame
 
 
 def test_models_stand_side_by_side(table: pd.DataFrame) -> None:
-    models = model_table(judged_rows(table))
+    models = model_table(summary(judged_rows(table)))
     assert models["model"].to_list() == ["koopman", "koopman-paper", "linear"]
     assert set(models["title"]) == {"DED-KO"}
     np.testing.assert_allclose(models["gap_percent_mean"], [1.0, 2.0, 3.0])
-    assert not len(model_table(frame_of(row("a", "ded", 1.0))))
-    assert not len(model_table(frame_of()))
+    assert not len(model_table(summary(frame_of(row("a", "ded", 1.0)))))
+    assert not len(model_table(summary(frame_of())))
 
 
 def test_ablation_says_what_differs_and_what_it_cost(table: pd.DataFrame, tmp_path: Path) -> None:
     for slug, seconds in (("study", 10.0), ("study-narrow", 7.0)):
         header = {"training": {"seconds": seconds, "epochs": 6, "parameters": 5}}
         write_arrays(policy_file(tmp_path, "ded-dpc", "TO", settings=slug), {"x": np.zeros(1)}, header)
-    rows = ablation_table(table, tmp_path)
+    rows = ablation_table(summary(table), tmp_path)
     assert rows["change"].to_list() == ["width = 16", "nothing", "model = linear"]
     np.testing.assert_allclose(rows["gap_percent_mean"], [10.0, 20.0, 30.0])
     assert rows["n"].to_list() == [1, 1, 1]  # no DED on instance b
     assert rows["seconds"].to_list()[:2] == [7.0, 10.0]
     assert rows["seconds"].isna().to_list() == [False, False, True]  # no such policy in the folder
-    assert not len(ablation_table(frame_of(row("a", "ded", 1.0)), tmp_path))
+    assert not len(ablation_table(summary(frame_of(row("a", "ded", 1.0))), tmp_path))
 
 
 def test_training_table_names_files_that_cannot_be_read(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_ablation_says_what_differs_and_what_it_cost(table: pd.DataFrame, tmp_pa
         header = {"training": {"seconds": seconds, "epochs": 6, "parameters": 5}}
         write_arrays(policy_file(tmp_path, "ded-dpc", "TO", settings=slug), {"x": np.zeros(1)}, header)
     rows = ablation_table(summary(table), tmp_path)
-    assert rows["change"].to_list() == ["width = 16", "nothing", "model = linear"]
+    assert rows["change"].to_list() == ["width = 12", "nothing", "model = linear"]
     np.testing.assert_allclose(rows["gap_percent_mean"], [10.0, 20.0, 30.0])
     assert rows["n"].to_list() == [1, 1, 1]  # no DED on instance b
     assert rows["seconds"].to_list()[:2] == [7.0, 10.0]

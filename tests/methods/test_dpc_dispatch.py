@@ -1,4 +1,4 @@
-"""Our policy: what holds for any weights, its two networks, its loss, training, files, refusals."""
+"""Our policy: what holds for any weights, its networks, its loss, training, files, refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ded_bench.koopman.physics import linear_model
 from ded_bench.methods.dpc import ded_dpc_train
 from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, SETTINGS, DispatchPolicy, prepare
 from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
-from ded_bench.methods.dpc.follower import Clip, Follow, follow
+from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
@@ -129,42 +129,6 @@ def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case)
     schedules = random_policy(case)(instances)
     for verdict in score_many(case, instances, schedules, [next(iter(case.regimes))] * 4):
         assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) <= 1e-12
-
-
-def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:
-    rng = np.random.default_rng(0)
-    targets, start = rng.uniform(-1, 1, (7, 20, 3)), rng.uniform(-1, 1, (7, 3))
-    p = follow(targets, start, 0.3)
-    for b in range(7):
-        np.testing.assert_array_equal(follow(targets[b : b + 1], start[b : b + 1], 0.3)[0], p[b])
-    torch_p = Follow.apply(torch.as_tensor(targets), torch.as_tensor(start), 0.3)
-    np.testing.assert_array_equal(torch_p.numpy(), p)
-    slow = follow(targets, start, 10.0)
-    np.testing.assert_array_equal(slow[:, 1:], targets)  # without a limit it is where it should be
-
-
-def test_gradient_of_the_follower_is_the_recursions() -> None:
-    rng = np.random.default_rng(1)
-    targets = torch.tensor(rng.uniform(-1, 1, (5, 12, 2)), requires_grad=True)
-    start = torch.tensor(rng.uniform(-1, 1, (5, 2)))
-    weight = torch.tensor(rng.normal(size=(5, 13, 2)))
-    (weight * Follow.apply(targets, start, 0.4)).sum().backward()
-    plain = targets.detach().clone().requires_grad_()
-    p = [start]
-    for target in plain.unbind(1):
-        p.append(p[-1] + (target - p[-1]).clamp(-0.4, 0.4))
-    (weight * torch.stack(p, dim=1)).sum().backward()
-    torch.testing.assert_close(targets.grad, plain.grad)
-    assert 0 < int((targets.grad == 0).sum()) < targets.numel()
-
-
-def test_clip_lets_descent_lead_back_inside() -> None:
-    value = torch.tensor([-2.0, -2.0, 0.5, 3.0, 3.0], requires_grad=True)
-    low, high = torch.tensor(0.0), torch.tensor(1.0)
-    clipped = Clip.apply(value, low, high)
-    (clipped * torch.tensor([1.0, -1.0, 2.0, 1.0, -1.0])).sum().backward()
-    torch.testing.assert_close(clipped.detach(), torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0]))
-    torch.testing.assert_close(value.grad, torch.tensor([0.0, -1.0, 2.0, 1.0, 0.0]))
 
 
 def test_numpy_twin_equals_the_torch_network(case: Case) -> None:

@@ -35,11 +35,12 @@ N_KNOTS = 50
 #: The slack's cost Σ|P_s| is a sum over this many pieces of the horizon, each with a variable above it.
 #: More pieces take fewer rounds, but each round longer.
 N_PIECES = 70
-#: What the LP may leave open at the end: frequency in rad/s (1.6e-9 Hz), cost as a fraction of all.
-OMEGA_TOLERANCE = 1e-8
-COST_TOLERANCE = 1e-8
+#: What the LP may leave open at the end: frequency in rad/s (1.6e-8 Hz; HiGHS leaves as much in each
+#: row), cost as a fraction of all (a hundredth of the smallest gap that tables show).
+OMEGA_TOLERANCE = 1e-7
+COST_TOLERANCE = 1e-6
 #: With a limit broken somewhere, every peak of |ω| above this part of the bound gets its row.
-NEAR = 0.8
+NEAR = 0.9
 MAX_ROUNDS = 100
 #: What a schedule does at all points is computed in this many blocks of time. Within one it depends on
 #: few numbers: the state at its start and the knots nearby.

@@ -66,7 +66,7 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
     p_gen = solution.schedule.at(instance.grid)
     model = replay(case, koopman, instance, solution.schedule)
     assert model.objective == pytest.approx(solution.solver_objective, rel=1e-8)
-    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 2 * np.pi * 1e-8
+    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 1.1 * ded_ko_knots.OMEGA_TOLERANCE
     assert np.abs(np.diff(p_gen, axis=0)).max() <= case.ramp_pu_per_s * instance.dt_s + 1e-9
     assert (p_gen - case.p_max).max() <= 1e-8
     assert (case.p_min - p_gen).max() <= 1e-8
@@ -208,7 +208,7 @@ def test_a_looser_regime_is_never_dearer(case: Case, koopman: Koopman) -> None:
                 method.prepare_with(case, koopman, regime, Settings())(short(case, index)).solver_objective
                 for regime in ("NO", "TO")
             )
-            assert loose <= tight * (1 + 1e-8)
+            assert loose <= tight * (1 + ded_ko_knots.COST_TOLERANCE)
 
 
 @pytest.mark.parametrize("method", METHODS)

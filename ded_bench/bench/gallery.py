@@ -48,7 +48,7 @@ from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_split
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.simulate import SimulationError, Trajectory, simulate_many
+from ded_bench.truth.simulate import SimulationError, Trajectory, bends, simulate_many
 from ded_bench.truth.swing import Network
 
 #: Worst instances are drawn for the page only, at a coarser resolution.
@@ -169,13 +169,17 @@ def _answers(pool: Workers | None, calls: Iterable[Call]) -> Iterator[object]:
 
 
 def _simulations(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
-    """What the figures show, simulated side by side, which costs little more than one."""
+    """What the figures show, simulated side by side, which costs little more than one.
+
+    Schedules that bend at many points are kept apart: they would force short steps on all others.
+    """
     _read_schedules(gallery, chosen)
-    grids: dict[tuple[int, float], list[Key]] = {}
+    alike: dict[tuple[int, float, bool], list[Key]] = {}
     for key in filter(gallery.schedules.__contains__, chosen.shown):
         instance = gallery.instances[key.instance]
-        grids.setdefault((instance.steps, instance.dt_s), []).append(key)
-    for keys in grids.values():
+        bent = bends(gallery.schedules[key].at(instance.grid))
+        alike.setdefault((instance.steps, instance.dt_s, 20 * len(bent) > instance.steps), []).append(key)
+    for keys in alike.values():
         schedules = [gallery.schedules[key] for key in keys]
         yield simulated, (gallery.case, keys, gallery.posed(keys), schedules)
 

@@ -183,9 +183,10 @@ def _storable(value: float | None) -> float | None:
 
 
 def _batches(tasks: Sequence[Task]) -> Iterator[list[Task]]:
-    grids: dict[tuple[int, float], list[Task]] = {}
+    """Tasks to be simulated side by side: of one grid, and of one method, whose schedules bend alike."""
+    groups: dict[tuple[int, float, str], list[Task]] = {}
     for task in tasks:
-        grids.setdefault((task.instance.steps, task.instance.dt_s), []).append(task)
-    for group in grids.values():
+        groups.setdefault((task.instance.steps, task.instance.dt_s, task.method), []).append(task)
+    for group in groups.values():
         for start in range(0, len(group), SCORE_BATCH):
             yield group[start : start + SCORE_BATCH]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.integrate import RK45
+from scipy.integrate import DOP853, RK45
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -18,8 +19,13 @@ from ded_bench.truth.swing import Network, PowerFlowError
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Local error control of the integrator; steps of one grid interval are well inside it.
+#: Local error control of the integrators; steps of one grid interval are well inside it.
 RTOL, ATOL = 1e-9, 1e-10
+LONG_RTOL, LONG_ATOL = 1e-11, 1e-12
+#: Inputs that bend by less are linear, pu.
+ROUND_OFF = 1e-12
+#: Points whose loads' angles are solved for together: more would not stay in the cache.
+POINTS_AT_ONCE = 500
 
 
 class SimulationError(ArithmeticError):
@@ -65,11 +71,11 @@ def simulate(case: Case, instance: Instance, schedule: Schedule) -> Trajectory:
 def simulate_many(
     case: Case, instances: Sequence[Instance], schedules: Sequence[Schedule]
 ) -> list[Trajectory]:
-    """Integrate instances side by side with scipy's explicit Runge-Kutta 5(4).
+    """Integrate instances side by side with scipy's explicit Runge-Kutta methods.
 
     Load-bus angles are solved by Newton's method at every evaluation of the right-hand side. No
-    step spans a grid point, where schedules and loads may have kinks; within a step the inputs are
-    linear in time.
+    step spans a grid point where a schedule or a load bends. From one grid point to the next goes
+    the method of order 5(4); further goes that of order 8, whose dense output gives the points between.
 
     Raises:
         ValueError: the instances do not share one time grid.
@@ -81,56 +87,130 @@ def simulate_many(
         schedule.check(instance.horizon_s)
     if len({(i.steps, i.dt_s) for i in instances}) != 1:
         raise ValueError("instances simulated side by side must share one time grid")
-    grid, dt = instances[0].grid, instances[0].dt_s
-    network = Network(case)
-    n_gen, batch = len(case.generators), len(instances)
-    p_gen = np.stack([s.at(grid) for s in schedules], axis=1)  # time first: one row per step
-    p_load = np.stack([i.p_load(case) for i in instances], axis=1)
-    injection = network.load_injections(p_load)
-    theta = np.empty((len(grid), batch, network.n_bus))
-    omega = np.empty((len(grid), batch, n_gen))
     try:
-        theta[0] = np.stack([network.initial_angles(i) for i in instances])
-        omega[0] = np.stack([i.omega_initial(case) for i in instances])
-        angles = theta[0]
-        recent = {0.0: angles}  # at the times of the last evaluations
-        slope: Array | None = None  # at the end of the last step, hence at the start of the next
+        run = _Run(Network(case), instances, schedules)
+        for first, last in itertools.pairwise(bends(run.p_gen, run.p_load)):
+            run.advance(first, last)
+        theta = run.all_angles()
+    except PowerFlowError as error:
+        raise SimulationError(f"the system cannot follow this schedule: {error}") from None
+    p_slack = run.network.injections(theta)[:, :, run.network.slack]
+    grid, omega, p_gen, p_load = run.grid, run.omega, run.p_gen, run.p_load
+    return [
+        Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b], case)
+        for b in range(len(instances))
+    ]
+
+
+def bends(*inputs: Array) -> list[int]:
+    """Grid points, with the first and the last, between which all inputs are linear.
+
+    Args:
+        inputs: time is their first axis, pu.
+    """
+    bent = np.ones(len(inputs[0]), dtype=bool)
+    bent[1:-1] = False
+    for values in inputs:
+        bend = np.abs(np.diff(values, n=2, axis=0))
+        bent[1:-1] |= bend.reshape(len(bend), -1).max(axis=1, initial=0.0) > ROUND_OFF
+    return [int(k) for k in np.flatnonzero(bent)]
+
+
+class _Run:
+    """Instances that are integrated side by side; in all arrays time comes first, then the instance."""
+
+    def __init__(
+        self, network: Network, instances: Sequence[Instance], schedules: Sequence[Schedule]
+    ) -> None:
+        self.network, self.grid, self._dt = network, instances[0].grid, instances[0].dt_s
+        self.p_gen = np.stack([s.at(self.grid) for s in schedules], axis=1)
+        self.p_load = np.stack([i.p_load(network.case) for i in instances], axis=1)
+        self.omega = np.empty(self.p_gen.shape)
+        self.omega[0] = np.stack([i.omega_initial(network.case) for i in instances])
+        self._theta = np.empty((*self.p_gen.shape[:2], network.n_bus))
+        self._theta[0] = np.stack([network.initial_angles(i) for i in instances])
+        self._injection = network.load_injections(self.p_load)
+        self._whole = np.arange(len(self.grid)) == 0  # where _theta has all buses, not only generators
+        self._ends = [(0.0, self._theta[0])]  # times and angles of all buses where steps end
+        self._recent = dict(self._ends)  # the same at the last evaluations
+        self._slope: Array | None = None  # right-hand side where the last step ended
+        self._long_step_s = self._dt
+
+    def advance(self, first: int, last: int) -> None:
+        """Integrate from a grid point to another; inputs are linear between them."""
+        start, stop = self.grid[first], self.grid[last]
+        angles, slope = self._theta[first], self._slope
 
         def rhs(t: float, y: Array) -> Array:
             nonlocal angles
-            if slope is not None and t == grid[step]:
+            if slope is not None and t == start:
                 return slope
-            angle, speed = y.reshape(2, batch, n_gen)
-            inside = (t - grid[step]) / dt
-            guess = _extrapolated(recent, t)
-            guess[:, network.generators] = angle
-            wanted = injection[step] + inside * (injection[step + 1] - injection[step])
-            angles, injections = network.solve_loads(guess, wanted)
-            recent[t] = angles
-            if len(recent) > 3:
-                del recent[next(iter(recent))]
-            power = p_gen[step] + inside * (p_gen[step + 1] - p_gen[step])
-            force = injections[:, network.generators]
-            return np.concatenate([speed.ravel(), network.acceleration(speed, power, force).ravel()])
+            cell = min(max(int(t / self._dt), first), last - 1)
+            inside = (t - self.grid[cell]) / self._dt
+            angle, speed = y.reshape(2, *self.omega.shape[1:])
+            guess = _extrapolated(self._recent, t)
+            guess[:, self.network.generators] = angle
+            angles, injections = self.network.solve_loads(guess, _between(self._injection, cell, inside))
+            self._remember(t, angles)
+            force = injections[:, self.network.generators]
+            rate = self.network.acceleration(speed, _between(self.p_gen, cell, inside), force)
+            return np.concatenate([speed.ravel(), rate.ravel()])
 
-        for step in range(len(grid) - 1):
-            y = np.concatenate([theta[step][:, network.generators].ravel(), omega[step].ravel()])
-            start, stop = grid[step], grid[step + 1]
-            solver = RK45(rhs, start, y, stop, first_step=stop - start, rtol=RTOL, atol=ATOL)
-            while solver.status == "running":
-                solver.step()
+        y = np.concatenate([angles[:, self.network.generators].ravel(), self.omega[first].ravel()])
+        short = last == first + 1
+        method, rtol, atol = (RK45, RTOL, ATOL) if short else (DOP853, LONG_RTOL, LONG_ATOL)
+        step_s = stop - start if short else min(self._long_step_s, stop - start)
+        solver = method(rhs, start, y, stop, first_step=step_s, rtol=rtol, atol=atol)
+        done = first
+        while solver.status == "running":
+            solver.step()
             if solver.status == "failed":
                 raise SimulationError("the integrator's step size vanished")
             # The last evaluation of a step is at its end, where the next one starts.
-            theta[step + 1], omega[step + 1] = angles, solver.y.reshape(2, batch, n_gen)[1]
-            slope = solver.f
-    except PowerFlowError as error:
-        raise SimulationError(f"the system cannot follow this schedule: {error}") from None
-    p_slack = network.injections(theta)[:, :, network.slack]
-    return [
-        Trajectory(grid, theta[:, b], omega[:, b], p_gen[:, b], p_load[:, b], p_slack[:, b], case)
-        for b in range(batch)
-    ]
+            self._slope = solver.f
+            self._ends.append((solver.t, angles))
+            reached = int(np.searchsorted(self.grid, solver.t, side="right")) - 1
+            if not short:
+                self._long_step_s = solver.h_abs
+                self._keep(slice(done + 1, reached + 1), solver.dense_output())
+            done = reached
+        self._theta[last] = self._ends[-1][1]
+        self.omega[last] = solver.y.reshape(2, *self.omega.shape[1:])[1]
+        self._whole[last] = True
+
+    def _keep(self, points: slice, states: Callable[[Array], Array]) -> None:
+        """Keep what a dense output says at grid points; the loads' angles are solved for in the end."""
+        times = self.grid[points]
+        if len(times):
+            y = states(times).T.reshape(len(times), 2, *self.omega.shape[1:])
+            self._theta[points][:, :, self.network.generators], self.omega[points] = y[:, 0], y[:, 1]
+
+    def _remember(self, t: float, angles: Array) -> None:
+        near = [s for s in self._recent if abs(s - t) < 1e-3 * self._dt]  # useless to extrapolate from
+        for s in near or list(self._recent)[:-2]:
+            del self._recent[s]
+        self._recent[t] = angles
+
+    def all_angles(self) -> Array:
+        """Angles of all buses at all grid points, shape (n, batch, n_bus), rad."""
+        missing = np.flatnonzero(~self._whole)
+        ends = np.array([t for t, _ in self._ends])
+        for start in range(0, len(missing), POINTS_AT_ONCE):
+            points = missing[start : start + POINTS_AT_ONCE]
+            times = self.grid[points]
+            after = np.searchsorted(ends, times)
+            near = np.stack([self._ends[k][1] for k in range(after[0] - 1, after[-1] + 1)])
+            part = ((times - ends[after - 1]) / (ends[after] - ends[after - 1]))[:, None, None]
+            place = after - after[0]
+            guess = (1.0 - part) * near[place] + part * near[place + 1]
+            guess[:, :, self.network.generators] = self._theta[points][:, :, self.network.generators]
+            self._theta[points], _ = self.network.solve_loads(guess, self._injection[points])
+        return self._theta
+
+
+def _between(values: Array, cell: int, inside: float) -> Array:
+    """Linear interpolation between two neighbouring points."""
+    return np.asarray(values[cell] + inside * (values[cell + 1] - values[cell]))
 
 
 def _extrapolated(values: Mapping[float, Array], t: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pandas as pd
@@ -36,6 +37,7 @@ from ded_bench.bench.metrics import (
     title,
     worst,
 )
+from ded_bench.bench.notes import data_notes, named
 from ded_bench.bench.page import (
     Block,
     Heading,
@@ -54,11 +56,7 @@ from ded_bench.bench.tables import Column, to_latex, to_markdown
 from ded_bench.bench.timing import latest_host, read_timing, timing_frame
 from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
-from ded_bench.problem.sampling import load_manifest, load_split
 from ded_bench.problem.strict import write_atomically
-
-#: One-minute load average above which a timing was not alone on the machine.
-BUSY = 1.5
 
 
 def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> list[Path]:
@@ -83,8 +81,30 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     frame = judged_rows(everything)
     timings = timing_frame(read_timing(folder / "timing.csv"))
     timing = latest_host(timings[timings["case"] == case.id])
+    with ThreadPoolExecutor(1) as aside:  # meanwhile `draw` mostly waits for other processes
+        computed = aside.submit(_frames, case, folder, frame, everything, timing)
+        gallery = draw(case, results, frame, timing, problems, workers)
+        frames = computed.result()
+    rows_from = rows_caption(frame, everything)
+    files = _write_tables(folder, frames, rows_from, timing)
+    notes = data_notes(frame, everything, frames["summary"], timings, timing, case, problems)
+    blocks = [
+        *_opening(case, everything, frames["summary"], [*notes, *gallery.notes]),
+        *_results(frames, rows_from, timing, gallery),
+        *_details(frames, rows_from, timing, gallery),
+        *_training(frames, folder, gallery),
+        *_closing(everything, gallery),
+    ]
+    write_atomically(folder / "report.md", render_markdown(blocks))
+    write_atomically(folder / "report.html", render_html(blocks, folder))
+    return [*files, *gallery.files, folder / "report.md", folder / "report.html"]
+
+
+def _frames(
+    case: Case, folder: Path, frame: pd.DataFrame, everything: pd.DataFrame, timing: pd.DataFrame
+) -> dict[str, pd.DataFrame]:
+    """All tables by the name of their file."""
     paper = paper_numbers(case)
-    gallery = draw(case, results, frame, timing, problems, workers)
     overview, overall = summary(frame), summary(everything)
     frames = {
         "table_v": table_v(main_rows(overview), timing, paper),
@@ -99,19 +119,7 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     }
     if len(everything) > len(frame):
         frames["summary_all"] = overall
-    rows_from = rows_caption(frame, everything)
-    files = _write_tables(folder, frames, rows_from, timing)
-    notes = [*data_notes(frame, everything, overview, timings, timing, case, problems), *gallery.notes]
-    blocks = [
-        *_opening(case, everything, overview, notes),
-        *_results(frames, rows_from, timing, gallery),
-        *_details(frames, rows_from, timing, gallery),
-        *_training(frames, folder, gallery),
-        *_closing(everything, gallery),
-    ]
-    write_atomically(folder / "report.md", render_markdown(blocks))
-    write_atomically(folder / "report.html", render_html(blocks, folder))
-    return [*files, *gallery.files, folder / "report.md", folder / "report.html"]
+    return frames
 
 
 def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
@@ -123,68 +131,6 @@ def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
         left = len(everything) - len(frame)
         return f"{instances} test instances" + (f"; {left} other rows left out" if left else "")
     return f"all {instances} instances, none of them of the test split"
-
-
-def data_notes(
-    frame: pd.DataFrame,
-    everything: pd.DataFrame,
-    overview: pd.DataFrame,
-    timings: pd.DataFrame,
-    timing: pd.DataFrame,
-    case: Case,
-    problems: Path,
-) -> list[str]:
-    """What a reader must know before comparing numbers."""
-    notes = []
-    versions = sorted(set(everything["problems_version"]))
-    try:
-        manifest = load_manifest(problems)
-        n_test = len(load_split(problems).test)
-    except InputError as error:
-        notes.append(f"The problem files cannot be read: {error}")
-        manifest, n_test = None, 0
-    if not len(everything):
-        notes.append(
-            f"No rows yet: `ded-bench solve --case {case.id} --method ded --regime NO,TO` makes some."
-        )
-    if len(versions) > 1:
-        notes.append(
-            f"Rows of different problem versions are not comparable: {', '.join(map(_named, versions))}."
-        )
-    elif manifest and versions and versions[0] != manifest.version:
-        notes.append(
-            f"Rows are of problem version {_named(versions[0])}, but the files are {manifest.version}."
-        )
-    if everything["version"].nunique() > 1:
-        notes.append(
-            f"Rows of several versions of ded-bench: {', '.join(sorted(set(everything['version'])))}."
-        )
-    if strange := sorted(set(frame["regime"]) - set(case.regimes)):
-        notes.append(f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}.")
-    unscored = frame[
-        frame["objective"].isna() & (frame["error"] == "") & frame["status"].isin(("Optimal", "Policy"))
-    ]
-    if len(unscored):
-        notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
-    short = overview[overview["rows"] < n_test]
-    if n_test and len(short) and (frame["split"] == "test").all():
-        for count, rows in short.groupby("rows"):
-            names = ", ".join(f"{row.title} {row.regime}" for row in rows.itertuples())
-            notes.append(f"Only {count} of {n_test} test instances were run: {names}.")
-    if not len(timing):
-        notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
-    elif (timing["load_average"] > BUSY).any():
-        notes.append("Some methods were timed while the machine was busy (see the column load).")
-    if len(timings) > len(timing):
-        notes.append(f"Times of other hosts or cases are left out: {len(timings) - len(timing)} rows.")
-    stale = sorted(set(timing["problems_version"]) - set(versions)) if versions else []
-    if stale:
-        notes.append(f"Times were taken on problem version {', '.join(map(_named, stale))}.")
-    return notes
-
-
-def _named(version: str) -> str:
-    return version or "(none given)"
 
 
 def _write_tables(
@@ -244,7 +190,7 @@ def _opening(
         + "; ".join(f"{r}, |ω| ≤ {limit.omega_hz:g} Hz" for r, limit in case.regimes.items())
         + ".",
         f"Rows: {len(everything)}" + (f" ({parts})." if parts else "."),
-        f"Problem version: {', '.join(map(_named, sorted(set(everything['problems_version'])))) or '–'}.",
+        f"Problem version: {', '.join(map(named, sorted(set(everything['problems_version'])))) or '–'}.",
         f"Rows made: {min(dates)} to {max(dates)}." if dates else "Rows made: –.",
     ]
     blocks: list[Block] = [

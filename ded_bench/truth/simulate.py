@@ -112,7 +112,7 @@ def bends(*inputs: Array) -> list[int]:
     bent[1:-1] = False
     for values in inputs:
         bend = np.abs(np.diff(values, n=2, axis=0))
-        bent[1:-1] |= bend.reshape(len(bend), -1).max(axis=1, initial=0.0) > ROUND_OFF
+        bent[1:-1] |= bend.max(axis=tuple(range(1, bend.ndim)), initial=0.0) > ROUND_OFF
     return [int(k) for k in np.flatnonzero(bent)]
 
 
@@ -147,7 +147,8 @@ class _Run:
                 return slope
             cell = min(max(int(t / self._dt), first), last - 1)
             inside = (t - self.grid[cell]) / self._dt
-            angle, speed = y.reshape(2, *self.omega.shape[1:])
+            state = y.reshape(2, *self.omega.shape[1:])
+            angle, speed = state[0], state[1]
             guess = _extrapolated(self._recent, t)
             guess[:, self.network.generators] = angle
             angles, injections = self.network.solve_loads(guess, _between(self._injection, cell, inside))

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import sample_instance, sample_instances
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.simulate import SimulationError, simulate, simulate_many
+from ded_bench.truth.simulate import SimulationError, bends, simulate, simulate_many
 from ded_bench.truth.swing import Network
 
 
@@ -233,6 +233,32 @@ def test_chain_follows_its_scalar_swing_equation(threebus, quiet_instance, p_sta
 
 
 # Batches.
+
+
+def test_long_steps_agree_with_short_ones(case, alter):
+    """A neighbour that bends at every grid point forces short steps on a schedule of few knots.
+
+    Tolerance: of the short steps, whose local error may be 1e-9 of θ and settles within seconds.
+    """
+    instance = alter(sample_instance(case, 31, 1), horizon_s=6.0)
+    rng = np.random.default_rng(1)
+    p = rng.uniform(case.p_min, case.p_max, (5, len(case.generators)))
+    few = Schedule(t=np.linspace(0, instance.horizon_s, 5), p=p)
+    zigzag = case.p_nominal + 1e-3 * (-1.0) ** np.arange(len(instance.grid))[:, None]
+    alone = simulate(case, instance, few)
+    beside, _ = simulate_many(case, [instance, instance], [few, Schedule(instance.grid, zigzag)])
+    assert len(bends(alone.p_gen, alone.p_load)) < 30
+    np.testing.assert_allclose(alone.omega, beside.omega, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(alone.theta, beside.theta, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(alone.p_slack, beside.p_slack, rtol=0, atol=2e-9)
+
+
+def test_bends_are_where_inputs_are_not_linear():
+    line = np.linspace(0.0, 1.0, 11)[:, None]
+    corner = np.minimum(line, 0.3)
+    assert bends(line) == [0, 10]
+    assert bends(line, corner) == [0, 3, 10]
+    assert bends(line[:2]) == [0, 1]
 
 
 def test_side_by_side_equals_one_by_one(case, alter):

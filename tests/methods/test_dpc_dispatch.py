@@ -14,9 +14,10 @@ from ded_bench.methods.dpc import ded_dpc_train
 from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, SETTINGS, DispatchPolicy, prepare
 from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
 from ded_bench.methods.dpc.follower import follow
+from ded_bench.methods.dpc.inference import NumpyStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
+from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.store import Scope, policy_file
@@ -136,7 +137,8 @@ def test_numpy_twin_equals_the_torch_network(case: Case) -> None:
     channels = channels_of(case, Inputs.of(case, some_instances(case, 9)))
     with torch.no_grad():
         expected = network(*tensors(channels)).numpy()
-    twin = NumpyStages(case, response_of(case), network)
+    state = {name: value.numpy() for name, value in network.state_dict().items()}
+    twin = NumpyStages(case, response_of(case), state, network.dilations)
     np.testing.assert_allclose(twin(channels), expected, rtol=1e-4, atol=1e-4)
     assert np.abs(expected - channels.start).max() > 0.05
 

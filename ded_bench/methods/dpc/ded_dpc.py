@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 from ded_bench.methods.dpc.answer import method
+from ded_bench.methods.dpc.inference import NumpyStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.network import NumpyStages, StagedNetwork
+from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.settings import SETTINGS as SETTINGS
 from ded_bench.methods.dpc.store import (
@@ -39,8 +40,8 @@ from ded_bench.problem.strict import write_atomically
 
 METHOD = "ded-dpc"
 N_KNOTS = 50
-#: Instances worked on at once: what is computed on the way stays in a core's cache.
-CHUNK = 32
+#: Instances worked on at once: more would not stay in a core's cache, fewer would pay more per call.
+CHUNK = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,8 @@ class DispatchPolicy:
 
     @functools.cached_property
     def _numpy(self) -> NumpyStages:
-        return NumpyStages(self.scope.case, self.response, self.network)
+        state = {name: value.numpy() for name, value in self.network.state_dict().items()}
+        return NumpyStages(self.scope.case, self.response, state, self.network.dilations)
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.

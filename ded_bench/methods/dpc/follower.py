@@ -32,14 +32,14 @@ def follow(targets: Array, p_initial: Array, step: float) -> Array:
     batch, n, n_gen = targets.shape
     if batch == 1:  # plain floats: NumPy's overhead on a few numbers would be ten times the work
         columns = zip(targets[0].T.tolist(), p_initial[0].tolist(), strict=True)
-        return np.array([_follow_one(column, start, step) for column, start in columns]).T[None]
-    p = np.empty((n + 1, batch, n_gen))
-    p[0] = p_initial
-    wanted = np.ascontiguousarray(targets.swapaxes(0, 1))
-    for j in range(n):
-        np.minimum(p[j] + step, wanted[j], out=p[j + 1])
-        np.maximum(p[j] - step, p[j + 1], out=p[j + 1])
-    return p.swapaxes(0, 1)
+        return np.array([[_follow_one(column, start, step)] for column, start in columns]).T.swapaxes(0, 1)
+    p = np.empty((n + 1, n_gen, batch))  # a knot's numbers side by side
+    p[0] = p_initial.T
+    wanted = np.ascontiguousarray(targets.transpose(1, 2, 0))
+    for before, after, target in zip(p, p[1:], wanted, strict=False):
+        np.minimum(before + step, target, out=after)
+        np.maximum(before - step, after, out=after)
+    return p.transpose(2, 0, 1)
 
 
 def _follow_one(targets: list[float], p: float, step: float) -> list[float]:

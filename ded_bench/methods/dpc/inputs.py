@@ -59,9 +59,12 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What the network reads of instances, not yet normalised, and the schedule that it corrects first."""
+    """What the network reads of instances, not yet normalised, and the schedule that it corrects first.
 
-    sequence: Array  # (batch, n_knots, n_sequence): see `sequence_groups`
+    In memory the batch comes last and the channel first: NumPy's loops then run over whole channels.
+    """
+
+    sequence: Array  # (batch, n_knots, n_sequence), see `sequence_groups`
     constants: Array  # (batch, n_constants)
     start: Array  # schedule to correct, (batch, n_knots, n_gen), pu
     undriven: Array32  # see `Response.undriven`
@@ -73,20 +76,25 @@ class Channels:
         The first schedule follows the static dispatch of the loads at each knot, or, without
         `dispatch`, the middle of the generators' range.
         """
-        knots = response.knots
+        knots, n_load, n_gen = response.knots, len(case.loads), len(case.generators)
+        cost = inputs.cost.T
         p_load, bend = _loads_and_bends(inputs, response.nodes)
-        demand = -p_load[:, ::2].sum(axis=-1)
-        static = _dispatch(case, inputs.cost, demand)
-        p_slack = demand - static.sum(axis=-1)
-        above, below = _cost_ratios(static.shape[2])
-        ratios = (inputs.cost @ above) / np.maximum(inputs.cost @ below, 1e-9)
-        middle = np.broadcast_to(0.5 * (case.p_min + case.p_max), static.shape)
-        targets = static if dispatch else middle
+        at_knots = p_load[:, ::2]
+        demand = -at_knots.sum(axis=0)
+        static = _dispatch(case, cost, demand)
+        sequence = np.empty((2 * n_load + n_gen + 1, *demand.shape))
+        sequence[:n_load], sequence[n_load : 2 * n_load] = at_knots, bend
+        sequence[2 * n_load : -1], sequence[-1] = static, demand - static.sum(axis=0)
+        above, below = _cost_ratios(n_gen)
+        ratios = (above @ cost) / np.maximum(below @ cost, 1e-9)
+        targets = (
+            static if dispatch else np.broadcast_to(_column(0.5 * (case.p_min + case.p_max)), static.shape)
+        )
         return Channels(
-            np.concatenate([p_load[:, ::2], bend, static, p_slack[:, :, None]], axis=-1),
-            np.concatenate([ratios, inputs.p_initial, inputs.omega], axis=1),
-            follow(targets[:, 1:], inputs.p_initial, float(case.ramp_pu_per_s * (knots[1] - knots[0]))),
-            response.undriven(inputs.omega, p_load),
+            sequence.T,
+            np.concatenate([ratios, inputs.p_initial.T, inputs.omega.T]).T,
+            follow(targets.T[:, 1:], inputs.p_initial, float(case.ramp_pu_per_s * (knots[1] - knots[0]))),
+            response.undriven(inputs.omega, p_load.T),
         )
 
     def static_cost(self, inputs: Inputs) -> Array:
@@ -117,44 +125,57 @@ def _loads_and_bends(inputs: Inputs, nodes: Array) -> tuple[Array, Array]:
     """Loads at the nodes, and how far their mean between two knots is off the chord; pu.
 
     Every second node is a knot. The bend tells where between two knots a ramp starts or ends; shapes
-    (batch, n_nodes, n_load) and (batch, n_knots, n_load).
+    (n_load, n_nodes, batch) and (n_load, n_knots, batch).
     """
-    initial, start, duration, rate = (inputs.ramps[:, None, :, i] for i in range(4))
-    since = np.maximum(nodes[:, None] - start, 0.0)
+    initial, start, duration, rate = inputs.ramps.T[:, :, None]
+    since = nodes[:, None] - start
+    np.maximum(since, 0.0, out=since)
     into = np.minimum(since, duration)
     half = 0.5 * into[:, ::2]
-    area = into[:, ::2] * (since[:, ::2] - half)  # ∫ into dt
+    area = since[:, ::2] - half
+    area *= into[:, ::2]  # ∫ into dt
     bend = np.zeros_like(half)
     np.subtract(area[:, 1:], area[:, :-1], out=bend[:, 1:])
     bend[:, 1:] *= 1.0 / (nodes[2] - nodes[0])
-    bend[:, 1:] -= half[:, 1:] + half[:, :-1]
+    bend[:, 1:] -= half[:, 1:]
+    bend[:, 1:] -= half[:, :-1]
     bend *= rate
-    return initial + rate * into, bend
+    into *= rate
+    into += initial
+    return into, bend
 
 
 def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
     """`problem.dispatch.merit_order` for costs that are the same at all knots.
 
     Args:
-        cost: (slack, generators), shape (batch, 1 + n_gen).
-        demand: shape (batch, n_knots), pu.
+        cost: (slack, generators), shape (1 + n_gen, batch).
+        demand: shape (n_knots, batch), pu.
+
+    Returns:
+        Shape (n_gen, n_knots, batch), pu.
     """
-    cost_gen, cost_slack = cost[:, 1:], cost[:, :1]
-    room = (cost_gen < cost_slack) * (case.p_max - case.p_min)
+    cost_gen, cost_slack = cost[1:], cost[:1]
+    room = (cost_gen < cost_slack) * _column(case.p_max - case.p_min)[:, 0]
     # what generators that come earlier in the merit order can deliver; ties go by position
-    others, own = cost_gen[:, None, :], cost_gen[:, :, None]
-    earlier = np.where(_before(room.shape[1]), others <= own, others < own)
-    below = (earlier @ room[:, :, None])[:, None, :, 0] + case.p_min.sum()
-    raised: Array = demand[:, :, None] - below
+    others, own = cost_gen, cost_gen[:, None]
+    earlier = np.where(_before(len(room))[:, :, None], others <= own, others < own)
+    below = (earlier * room).sum(axis=1) + case.p_min.sum()
+    raised: Array = demand - below[:, None]
     np.maximum(raised, 0.0, out=raised)
     np.minimum(raised, room[:, None], out=raised)
-    raised += case.p_min
+    raised += _column(case.p_min)
     return raised
+
+
+def _column(values: Array) -> Array:
+    """One value per generator, for arrays over (generators, knots, batch)."""
+    return values[:, None, None]
 
 
 @functools.cache
 def _cost_ratios(n_gen: int) -> tuple[Array, Array]:
-    """Numerators and denominators of ratios of costs, as maps of (slack, generators).
+    """Numerators and denominators of ratios of costs, as matrices to multiply (slack, generators) by.
 
     Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
     difference in the sum.
@@ -164,7 +185,7 @@ def _cost_ratios(n_gen: int) -> tuple[Array, Array]:
     first, second = np.triu_indices(n_gen, 1)
     above = [unit, generators, generators[:, first] - generators[:, second]]
     below = [np.ones_like(unit), generators + slack, generators[:, first] + generators[:, second]]
-    return np.hstack(above), np.hstack(below)
+    return np.hstack(above).T.copy(), np.hstack(below).T.copy()
 
 
 @functools.cache

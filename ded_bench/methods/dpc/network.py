@@ -3,8 +3,7 @@
 Each stage sees the schedule so far, its `Response`, and the instance; its output moves the targets
 that the follower tracks (in half ranges of each generator). A stage is a net of dilated residual
 convolutions over the knots. Constants of the instance (costs, P_0, ω(0)) enter once, as a bias of
-every layer. It exists in torch and in NumPy, which answers a single instance in a fraction of a
-millisecond, where torch's overhead per layer would dominate.
+every layer. Here it is for training, in torch; `inference` is the same function for answers.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from ded_bench.methods.dpc.follower import Clip, Follow, follow
+from ded_bench.methods.dpc.follower import Clip, Follow
 from ded_bench.methods.dpc.inputs import Channels, n_channels, sequence_groups
-from ded_bench.methods.dpc.response import Array32, Response
+from ded_bench.methods.dpc.response import Response
 from ded_bench.problem.case import Array, Case
 
 STAGES, WIDTH, EMBEDDING = 2, 24, 64
@@ -43,9 +42,13 @@ class StagedNetwork(nn.Module):
         self.groups = {"response": slice(n_gen, n_seen)}
         for name, part in sequence_groups(case).items():
             self.groups[name] = slice(n_seen + part.start, n_seen + part.stop)
+        self.dilations = dilations
         self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
         self.step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
-        for name, value in (("of_power", response.of_power), ("low", case.p_min), ("high", case.p_max)):
+        n_knots = len(response.knots)
+        by_knot = response.of_power.reshape(response.n_outputs, n_knots, n_gen, n_knots).transpose(3, 2, 1, 0)
+        of_power = by_knot.reshape(n_knots * n_gen, -1)
+        for name, value in (("of_power", of_power), ("low", case.p_min), ("high", case.p_max)):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)
 
     of_power: Tensor
@@ -126,105 +129,3 @@ class ResidualNetwork(nn.Module):
             h = h + mix(F.relu(spread(h) + bias[:, i + 1]))
         corrections: Tensor = self.last(F.relu(h))[:, :, 0].transpose(1, 2)
         return corrections
-
-
-class NumpyStages:
-    """The same function as a StagedNetwork, for inference without torch; the last follower in float64."""
-
-    def __init__(self, case: Case, response: Response, network: StagedNetwork) -> None:
-        self._case, self._response, self._step = case, response, network.step
-        self._stages = [NumpyNetwork(cast(ResidualNetwork, stage)) for stage in network.stages]
-
-    def __call__(self, channels: Channels) -> Array:
-        """Powers at the knots, (batch, n_knots, n_gen), pu."""
-        p_gen, initial = channels.start, channels.start[:, 0]
-        low, high = self._case.p_min, self._case.p_max
-        half = 0.5 * (high - low)
-        for stage in self._stages:
-            seen = self._response(channels.undriven, p_gen)
-            corrections = stage(np.concatenate([p_gen, seen, channels.sequence], axis=2), channels.constants)
-            targets = (p_gen + half * corrections)[:, 1:]
-            p_gen = follow(np.minimum(np.maximum(targets, low), high), initial, self._step)
-        return p_gen
-
-
-class NumpyNetwork:
-    """The same function as a ResidualNetwork."""
-
-    def __init__(self, network: ResidualNetwork) -> None:
-        state = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
-        scale = 1.0 / state["sequence_scale"]
-        self._shift, self._scale = state["sequence_mean"], scale
-        # normalisation of the constants and biases of the convolutions go into the embedding
-        weight = state["embed.0.weight"] / state["constants_scale"]
-        self._enter = weight.T.copy(), state["embed.0.bias"] - weight @ state["constants_mean"]
-        n = len(network.spread)
-        bias = [state["first.bias"], *(state[f"spread.{i}.bias"] for i in range(n))]
-        self._embed = state["embed.2.weight"].T.copy(), state["embed.2.bias"] + np.concatenate(bias)
-        self._first = _window(state["first.weight"])
-        self._blocks = [
-            (
-                network.dilations[i],
-                _window(state[f"spread.{i}.weight"]),
-                state[f"mix.{i}.weight"][:, :, 0, 0].T.copy(),
-                state[f"mix.{i}.bias"],
-            )
-            for i in range(n)
-        ]
-        self._last = state["last.weight"][:, :, 0, 0].T.copy(), state["last.bias"]
-        self._width = network.width
-
-    def __call__(self, sequence: Array, constants: Array) -> Array:
-        """Corrections, shape (batch, n_knots, n_gen)."""
-        sequence32 = ((sequence - self._shift) * self._scale).astype(np.float32)
-        hidden = np.maximum(constants.astype(np.float32) @ self._enter[0] + self._enter[1], 0.0)
-        bias = (hidden @ self._embed[0] + self._embed[1]).reshape(len(hidden), -1, 1, self._width)
-        batch, n, _ = sequence32.shape
-        width, margin = self._width, max((dilation for dilation, *_ in self._blocks), default=1)
-        # zeros before the first knot and after the last; from here on in place, since memory costs time
-        padded = np.zeros((batch, n + 2 * margin, width), dtype=np.float32)
-        columns = np.empty((batch * n, 3 * width), dtype=np.float32)
-        inner, change = np.empty((2, batch, n, width), dtype=np.float32)
-        windows = columns.reshape(batch, n, 3, width)
-        inner_rows, change_rows = inner.reshape(-1, width), change.reshape(-1, width)
-        h = padded[:, margin : margin + n]
-        h += _neighbours(_padded(sequence32), n, 1).reshape(batch, n, -1) @ self._first
-        h += bias[:, 0]
-        for i, (dilation, spread, mix, offset) in enumerate(self._blocks):
-            np.copyto(windows, _neighbours(padded, n, dilation))
-            np.dot(columns, spread, out=inner_rows)
-            inner += bias[:, i + 1]
-            np.maximum(inner, 0.0, out=inner)
-            np.dot(inner_rows, mix, out=change_rows)
-            h += change
-            h += offset
-        weight, offset = self._last
-        corrections = np.maximum(h, 0.0).reshape(-1, width) @ weight + offset
-        return np.asarray(corrections, dtype=np.float64).reshape(batch, n, -1)
-
-
-def _window(weight: Array32) -> Array32:
-    """A convolution's weight (out, in, 1, 3) as a matrix for `_neighbours`, (3 in, out)."""
-    return np.ascontiguousarray(weight[:, :, 0].transpose(2, 1, 0).reshape(-1, len(weight)))
-
-
-def _padded(x: Array32) -> Array32:
-    """One row of zeros on either side."""
-    batch, n, width = x.shape
-    out = np.zeros((batch, n + 2, width), dtype=np.float32)
-    out[:, 1:-1] = x
-    return out
-
-
-def _neighbours(padded: Array32, n: int, dilation: int) -> Array32:
-    """Each of n knots beside those `dilation` before and after it: a view, (batch, n, 3, width)."""
-    batch, length, width = padded.shape
-    first = (length - n) // 2 - dilation
-    per_batch, per_knot, per_channel = padded.strides
-    return np.ndarray(
-        (batch, n, 3, width),
-        np.float32,
-        padded,
-        first * per_knot,
-        (per_batch, per_knot, dilation * per_knot, per_channel),
-    )

@@ -76,6 +76,11 @@ class Network:
         self.d = np.array([case.machines[g].d for g in case.generators])
         self._outer_algebraic = self._outer(self.algebraic)
         self._outer_unknown = self._outer(self.unknown)
+        flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
+        self._first_step = np.zeros_like(flat)
+        self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
+            flat[np.ix_(self.unknown, self.unknown)]
+        )
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
@@ -114,9 +119,8 @@ class Network:
         wanted = np.zeros((*shape, self.n_bus))
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
-        theta, _ = self._newton(
-            np.zeros((*shape, self.n_bus)), wanted[..., self.unknown], self.unknown, self._outer_unknown
-        )
+        theta = wanted @ self._first_step  # Newton's first step from θ = 0
+        theta, _ = self._newton(theta, wanted[..., self.unknown], self.unknown, self._outer_unknown)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
             raise PowerFlowError("an angle across a line exceeds 90 degrees")
         return theta

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.problem.case import Array, Case
+from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 from ded_bench.truth.swing import Network
 
@@ -24,20 +25,12 @@ class Features:
     @staticmethod
     def of(network: Network, instances: Sequence[Instance], knots: Array) -> Features:
         """Collect the features of instances; solves one power flow for all of them."""
-        case: Case = network.case
-        p_load = np.stack([i.p_load(case, knots) for i in instances])
-        p_initial = np.stack([i.p_initial(case) for i in instances])
-        omega = np.stack([i.omega_initial(case) for i in instances])
-        cost = np.array([[i.cost[bus] for bus in (case.slack, *case.generators)] for i in instances])
-        return Features.from_arrays(network, p_load, cost, p_initial, omega)
-
-    @staticmethod
-    def from_arrays(network: Network, p_load: Array, cost: Array, p_initial: Array, omega: Array) -> Features:
-        """Collect features from stacked arrays; x_0 follows from the power flow at t = 0."""
+        inputs = Inputs.of(network.case, instances)
+        p_load, p_initial = inputs.p_load(knots), inputs.p_initial
         theta = network.power_flow(p_initial, p_load[:, 0])
         p_slack = -p_initial.sum(axis=1) - p_load[:, 0].sum(axis=1)
-        state = np.concatenate([theta[:, network.unknown], p_slack[:, None], omega], axis=1)
-        return Features(p_load, cost, state, p_initial)
+        state = np.concatenate([theta[:, network.unknown], p_slack[:, None], inputs.omega], axis=1)
+        return Features(p_load, inputs.cost, state, p_initial)
 
     def channels(self) -> Array:
         """All features as channels over the knots, constants repeated, (batch, n_channels, n_knots)."""

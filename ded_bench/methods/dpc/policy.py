@@ -38,6 +38,7 @@ from ded_bench.truth.swing import Network
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
 METHOD = "ded-dpc-paper"
 N_KNOTS, FILTERS, WINDOWS = 50, 30, (5, 10, 5)
+ZERO = np.float32(0.0)
 
 
 class PaperNetwork(nn.Module):
@@ -88,32 +89,37 @@ class NumpyPaperNetwork:
 
     def __init__(self, network: PaperNetwork) -> None:
         state = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
-        self._mean, self._scale = state["mean"], state["scale"]
-        self._low, self._range = state["p_min"][:, 0], (state["p_max"] - state["p_min"])[:, 0]
+        self._mean, self._scale = state["mean"], 1.0 / state["scale"]
+        self._low, self._half = state["p_min"], 0.5 * (state["p_max"] - state["p_min"])
         weights = [value for name, value in state.items() if name.endswith(".weight")]  # (out, in, window)
-        matrices = [w.transpose(2, 1, 0).reshape(-1, len(w)) for w in weights]
-        biases = [value for name, value in state.items() if name.endswith(".bias")]
+        matrices = [w.transpose(0, 2, 1).reshape(len(w), -1) for w in weights]
+        biases = [value[:, None] for name, value in state.items() if name.endswith(".bias")]
         self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
 
     def __call__(self, channels: Array) -> Array:
         """See `PaperNetwork.forward`."""
-        h = ((channels.astype(np.float32) - self._mean) / self._scale).transpose(0, 2, 1)
+        h = (channels.astype(np.float32) - self._mean) * self._scale
         for i, (window, weight, bias) in enumerate(self._layers):
             if i:
-                np.maximum(h, 0.0, out=h)
-            h = _windows(h, window) @ weight
+                np.maximum(h, ZERO, out=h)
+            h = np.matmul(weight, _windows(h, window))
             h += bias
-        power = self._low + 0.5 * (1.0 + np.tanh(h)) * self._range
-        return np.asarray(power, dtype=np.float64)
+        np.tanh(h, out=h)
+        h += 1.0
+        power = self._low + self._half * h
+        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
 
 
 def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """What a convolution sees at each knot, zeros outside: a view, (batch, n, window * width)."""
-    batch, n, width = x.shape
-    padded = np.zeros((batch, n + window - 1, width), dtype=np.float32)
+    """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
+    batch, width, n = x.shape
+    padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
     before = (window - 1) // 2
-    padded[:, before : before + n] = x
-    return np.ndarray((batch, n, window * width), np.float32, padded, strides=padded.strides)
+    padded[:, :, before : before + n] = x
+    per_instance, per_channel, per_knot = padded.strides
+    strides = per_instance, per_knot, per_channel, per_knot
+    seen = np.ndarray((batch, window, width, n), np.float32, padded, strides=strides)
+    return seen.reshape(batch, -1, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +154,7 @@ class Policy:
         batch = [instances] if isinstance(instances, Instance) else list(instances)
         self._scope.check(batch)
         powers = self._numpy(Features.of(self._grid, batch, self.knots).channels())
-        powers = np.clip(powers, self.case.p_min, self.case.p_max)  # the bounds again, in float64
+        powers = np.minimum(np.maximum(powers, self.case.p_min), self.case.p_max)  # again, in float64
         return [Schedule(self.knots, p) for p in powers]
 
     @property

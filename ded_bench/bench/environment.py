@@ -10,7 +10,7 @@ import os
 import platform
 from pathlib import Path
 
-PACKAGES = ("pyomo", "casadi", "highspy", "torch", "numpy", "scipy", "pandas")
+PACKAGES = ("pyomo", "casadi", "highspy", "torch", "numba", "numpy", "scipy", "pandas")
 
 
 @functools.cache

@@ -89,29 +89,6 @@ class Schedule:
             raise InputError(source, "t", f"must end at the horizon {horizon_s}, not {self.t[-1]}")
 
 
-class Interpolation:
-    """`Schedule.at` for many schedules on the same knots at the same times: what they share is kept.
-
-    Args:
-        t: knot times, strictly increasing, s.
-        times: in increasing order, within the knots, s.
-        n_gen: number of generators.
-    """
-
-    def __init__(self, t: Array, times: Array, n_gen: int) -> None:
-        interval = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
-        self._count = np.bincount(interval, minlength=len(t) - 1)
-        self._width = np.diff(t)[:, None]
-        self._since = np.repeat((times - t[interval])[:, None], n_gen, axis=1)  # full: broadcasting is slow
-
-    def __call__(self, p: Array) -> Array:
-        """Powers at the times, shape (n_times, n_gen), from powers at the knots, (n_knots, n_gen)."""
-        found = np.repeat(np.diff(p, axis=0) / self._width, self._count, axis=0)
-        found *= self._since
-        found += np.repeat(p[:-1], self._count, axis=0)
-        return found
-
-
 def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Column names, and the other rows that are not blank, each with its line number."""
     try:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ded_bench.koopman.physics import linear_model
+from ded_bench.methods.dpc.answer import Interpolation
 from ded_bench.methods.dpc.features import Features
 from ded_bench.methods.dpc.loss import Q_INITIAL, Q_OMEGA, Q_RAMP, Condensed, knot_times, loss_terms
 from ded_bench.methods.dpc.policy import (
@@ -29,6 +30,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.swing import Network
 
 HORIZON = 4.0
@@ -232,3 +234,12 @@ def test_policy_refuses_what_it_was_not_trained_for(
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match=r"p\.safetensors"):
         Policy.load(path, threebus, policy.regime)
+
+
+@pytest.mark.parametrize("n", [2, 7, 50, 6001])
+def test_interpolation_gives_the_values_of_a_schedule(case: Case, n: int) -> None:
+    """At all grid points, both ends included, wherever the knots lie between them."""
+    powers = np.random.default_rng(n).uniform(case.p_min, case.p_max, (n, len(case.generators)))
+    schedule, grid = Schedule(np.linspace(0.0, 60.0, n), powers), np.arange(6001) * 0.01
+    found = Interpolation(schedule.t, grid)(schedule.p)
+    np.testing.assert_allclose(found, schedule.at(grid), rtol=0, atol=1e-15)

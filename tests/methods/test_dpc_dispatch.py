@@ -14,7 +14,7 @@ from ded_bench.methods.dpc import ded_dpc_train
 from ded_bench.methods.dpc.ded_dpc import CHUNK, METHOD, N_KNOTS, SETTINGS, DispatchPolicy, prepare
 from ded_bench.methods.dpc.ded_dpc_train import Loss, Pool, train
 from ded_bench.methods.dpc.follower import follow
-from ded_bench.methods.dpc.inference import NumpyStages
+from ded_bench.methods.dpc.inference import CompiledStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.network import StagedNetwork
@@ -132,13 +132,13 @@ def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case)
         assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) <= 1e-12
 
 
-def test_numpy_twin_equals_the_torch_network(case: Case) -> None:
+def test_compiled_twin_equals_the_torch_network(case: Case) -> None:
     network = random_network(case)
     channels = channels_of(case, Inputs.of(case, some_instances(case, 9)))
     with torch.no_grad():
         expected = network(*tensors(channels)).numpy()
     state = {name: value.numpy() for name, value in network.state_dict().items()}
-    twin = NumpyStages(case, response_of(case), state, network.dilations)
+    twin = CompiledStages(case, response_of(case), state, network.dilations)
     np.testing.assert_allclose(twin(channels), expected, rtol=1e-4, atol=1e-4)
     assert np.abs(expected - channels.start).max() > 0.05
 

@@ -9,7 +9,7 @@ import pytest
 
 from ded_bench.problem import schedule as module
 from ded_bench.problem.errors import InputError
-from ded_bench.problem.schedule import Interpolation, Schedule
+from ded_bench.problem.schedule import Schedule
 
 
 def knots(case, n: int, horizon: float = 60.0) -> Schedule:
@@ -24,14 +24,6 @@ def test_schedules_are_linear_between_rows():
     schedule = Schedule(t=np.array([0.0, 1.0, 4.0]), p=np.array([[0.0, 5.0], [1.0, 4.0], [-2.0, 4.0]]))
     got = schedule.at(np.array([0.0, 0.25, 1.0, 2.5, 4.0]))
     np.testing.assert_allclose(got, [[0, 5], [0.25, 4.75], [1, 4], [-0.5, 4], [-2, 4]], rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("n", [2, 7, 50, 6001])
-def test_interpolation_gives_the_values_of_a_schedule(case, n):
-    """At all grid points, both ends included, wherever the knots lie between them."""
-    schedule, grid = knots(case, n), np.arange(6001) * 0.01
-    found = Interpolation(schedule.t, grid, len(case.generators))(schedule.p)
-    np.testing.assert_allclose(found, schedule.at(grid), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz"])

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ded_bench.methods.dpc.answer import method
-from ded_bench.methods.dpc.inference import NumpyStages
+from ded_bench.methods.dpc.inference import CompiledStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.loss import knot_times
 from ded_bench.methods.dpc.network import StagedNetwork
@@ -63,9 +63,9 @@ class DispatchPolicy:
         return Response.make(self.scope.case, knot_times(self.scope.horizon_s, N_KNOTS))
 
     @functools.cached_property
-    def _numpy(self) -> NumpyStages:
+    def _compiled(self) -> CompiledStages:
         state = {name: value.numpy() for name, value in self.network.state_dict().items()}
-        return NumpyStages(self.scope.case, self.response, state, self.network.dilations)
+        return CompiledStages(self.scope.case, self.response, state, self.network.dilations)
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -82,7 +82,7 @@ class DispatchPolicy:
     def powers(self, inputs: Inputs, threads: int = 1) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
         if len(inputs) <= CHUNK:
-            return self._numpy(self.channels(inputs))
+            return self._compiled(self.channels(inputs))
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
         if threads == 1:
             return np.concatenate([self.powers(part) for part in parts])

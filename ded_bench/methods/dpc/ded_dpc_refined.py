@@ -6,6 +6,7 @@ import hashlib
 import time
 from typing import Any
 
+import numba
 import numpy as np
 
 from ded_bench.koopman.store import find_model
@@ -53,7 +54,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         schedule = Schedule(policy.knots, refiner(inputs, policy.powers(inputs), steps)[0])
         schedule.at(instance.grid)
         elapsed = time.perf_counter() - started
-        version = f"numpy {np.__version__}"
+        version = f"numba {numba.__version__}, numpy {np.__version__}"
         return Solution(Status.POLICY, schedule, steps, solve_s=elapsed, solver_version=version)
 
     return solve

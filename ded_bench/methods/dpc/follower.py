@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,26 +30,20 @@ def follow(targets: Array, p_initial: Array, step: float) -> Array:
     Returns:
         Shape (batch, n_knots, n_gen), pu.
     """
-    batch, n, n_gen = targets.shape
-    if batch == 1:  # plain floats: NumPy's overhead on a few numbers would be ten times the work
-        columns = zip(targets[0].T.tolist(), p_initial[0].tolist(), strict=True)
-        return np.array([[_follow_one(column, start, step)] for column, start in columns]).T.swapaxes(0, 1)
-    p = np.empty((n + 1, n_gen, batch))  # a knot's numbers side by side
-    p[0] = p_initial.T
-    wanted = np.ascontiguousarray(targets.transpose(1, 2, 0))
-    for before, after, target in zip(p, p[1:], wanted, strict=False):
-        np.minimum(before + step, target, out=after)
-        np.maximum(before - step, after, out=after)
-    return p.transpose(2, 0, 1)
+    p_gen = np.concatenate([p_initial[:, None], targets], axis=1)
+    for powers in p_gen:
+        track(powers.T, step, powers.T)
+    return p_gen
 
 
-def _follow_one(targets: list[float], p: float, step: float) -> list[float]:
-    out = [p]
-    for target in targets:
-        below, above = p - step, p + step
-        p = below if target < below else above if target > above else target
-        out.append(p)
-    return out
+@numba.njit(cache=True, nogil=True)
+def track(targets: Array, step: float, p_gen: Array) -> None:
+    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0."""
+    for g in range(len(targets)):
+        p = p_gen[g, 0] = targets[g, 0]
+        for j in range(1, targets.shape[1]):
+            p = min(max(targets[g, j], p - step), p + step)
+            p_gen[g, j] = p
 
 
 class Follow(torch.autograd.Function):

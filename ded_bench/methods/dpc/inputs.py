@@ -8,16 +8,19 @@ frequency and slack power is in `response`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
-from ded_bench.methods.dpc.follower import follow
+from ded_bench.methods.dpc.follower import track
 from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+
+#: Costs whose sum is smaller are as good as free.
+SMALLEST_SUM = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +64,7 @@ class Inputs:
 class Channels:
     """What the network reads of instances, not yet normalised, and the schedule that it corrects first.
 
-    In memory the batch comes last and the channel first: NumPy's loops then run over whole channels.
+    In memory the channel comes before the knot.
     """
 
     sequence: Array  # (batch, n_knots, n_sequence), see `sequence_groups`
@@ -76,26 +79,18 @@ class Channels:
         The first schedule follows the static dispatch of the loads at each knot, or, without
         `dispatch`, the middle of the generators' range.
         """
-        knots, n_load, n_gen = response.knots, len(case.loads), len(case.generators)
-        cost = inputs.cost.T
-        p_load, bend = _loads_and_bends(inputs, response.nodes)
-        at_knots = p_load[:, ::2]
-        demand = -at_knots.sum(axis=0)
-        static = _dispatch(case, cost, demand)
-        sequence = np.empty((2 * n_load + n_gen + 1, *demand.shape))
-        sequence[:n_load], sequence[n_load : 2 * n_load] = at_knots, bend
-        sequence[2 * n_load : -1], sequence[-1] = static, demand - static.sum(axis=0)
-        above, below = _cost_ratios(n_gen)
-        ratios = (above @ cost) / np.maximum(below @ cost, 1e-9)
-        targets = (
-            static if dispatch else np.broadcast_to(_column(0.5 * (case.p_min + case.p_max)), static.shape)
-        )
-        return Channels(
-            sequence.T,
-            np.concatenate([ratios, inputs.p_initial.T, inputs.omega.T]).T,
-            follow(targets.T[:, 1:], inputs.p_initial, float(case.ramp_pu_per_s * (knots[1] - knots[0]))),
-            response.undriven(inputs.omega, p_load.T),
-        )
+        knots, nodes, batch = response.knots, response.nodes, len(inputs)
+        n_sequence, n_constants = n_channels(case)
+        p_load = np.empty((batch, len(case.loads), len(nodes)))
+        sequence = np.empty((batch, n_sequence, len(knots)))
+        constants = np.empty((batch, n_constants))
+        start = np.empty((batch, len(case.generators), len(knots)))
+        step = float(case.ramp_pu_per_s * (knots[1] - knots[0]))
+        given = inputs.ramps, inputs.cost, inputs.p_initial, inputs.omega
+        limits = case.p_min, case.p_max, step
+        _fill(*given, nodes, *limits, dispatch, p_load, sequence, constants, start)
+        undriven = response.undriven(inputs.omega, p_load.swapaxes(1, 2))
+        return Channels(sequence.swapaxes(1, 2), constants, start.swapaxes(1, 2), undriven)
 
     def static_cost(self, inputs: Inputs) -> Array:
         """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""
@@ -121,73 +116,106 @@ def sequence_groups(case: Case) -> dict[str, slice]:
     }
 
 
-def _loads_and_bends(inputs: Inputs, nodes: Array) -> tuple[Array, Array]:
-    """Loads at the nodes, and how far their mean between two knots is off the chord; pu.
+@numba.njit(cache=True, nogil=True)
+def _fill(
+    ramps: Array,
+    cost: Array,
+    p_initial: Array,
+    omega: Array,
+    nodes: Array,
+    p_min: Array,
+    p_max: Array,
+    step: float,
+    dispatch: bool,
+    p_load: Array,
+    sequence: Array,
+    constants: Array,
+    start: Array,
+) -> None:
+    """Compute the last four, instance by instance; see `Inputs` and `Channels`."""
+    n_gen, n_load = len(p_min), p_load.shape[1]
+    for b in range(len(ramps)):
+        for i in range(n_load):
+            _loads_and_bends(ramps[b, i], nodes, p_load[b, i], sequence[b, i], sequence[b, n_load + i])
+        static = sequence[b, 2 * n_load :]
+        _dispatch(sequence[b, :n_load], cost[b], p_min, p_max, static)
+        _constants(cost[b], p_initial[b], omega[b], constants[b])
+        for g in range(n_gen):
+            for j in range(1, start.shape[2]):
+                start[b, g, j] = static[g, j] if dispatch else 0.5 * (p_min[g] + p_max[g])
+            start[b, g, 0] = p_initial[b, g]
+        track(start[b], step, start[b])
 
-    Every second node is a knot. The bend tells where between two knots a ramp starts or ends; shapes
-    (n_load, n_nodes, batch) and (n_load, n_knots, batch).
+
+@numba.njit(cache=True, nogil=True)
+def _loads_and_bends(ramp: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
+    """A load at the nodes and at the knots, and how far its mean between two knots is off the chord; pu.
+
+    Every second node is a knot. The bend tells where between two knots a ramp starts or ends.
     """
-    initial, start, duration, rate = inputs.ramps.T[:, :, None]
-    since = nodes[:, None] - start
-    np.maximum(since, 0.0, out=since)
-    into = np.minimum(since, duration)
-    half = 0.5 * into[:, ::2]
-    area = since[:, ::2] - half
-    area *= into[:, ::2]  # ∫ into dt
-    bend = np.zeros_like(half)
-    np.subtract(area[:, 1:], area[:, :-1], out=bend[:, 1:])
-    bend[:, 1:] *= 1.0 / (nodes[2] - nodes[0])
-    bend[:, 1:] -= half[:, 1:]
-    bend[:, 1:] -= half[:, :-1]
-    bend *= rate
-    into *= rate
-    into += initial
-    return into, bend
+    initial, begin, duration, rate = ramp
+    spacing = nodes[2] - nodes[0]
+    last_area = last_half = 0.0
+    for k in range(len(nodes)):
+        since = max(nodes[k] - begin, 0.0)
+        into = min(since, duration)
+        p_load[k] = initial + rate * into
+        if k % 2 == 0:
+            half = 0.5 * into
+            area = into * (since - half)  # ∫ into dt
+            at_knots[k // 2] = p_load[k]
+            bends[k // 2] = rate * ((area - last_area) / spacing - half - last_half) if k else 0.0
+            last_area, last_half = area, half
 
 
-def _dispatch(case: Case, cost: Array, demand: Array) -> Array:
-    """`problem.dispatch.merit_order` for costs that are the same at all knots.
+@numba.njit(cache=True, nogil=True)
+def _dispatch(p_load: Array, cost: Array, p_min: Array, p_max: Array, static: Array) -> None:
+    """`problem.dispatch.merit_order` at each knot, then the slack's power; pu.
 
     Args:
-        cost: (slack, generators), shape (1 + n_gen, batch).
-        demand: shape (n_knots, batch), pu.
-
-    Returns:
-        Shape (n_gen, n_knots, batch), pu.
+        p_load: loads at the knots, (n_load, n_knots).
+        cost: (slack, generators), (1 + n_gen,).
+        static: receives the powers, (n_gen + 1, n_knots).
     """
-    cost_gen, cost_slack = cost[1:], cost[:1]
-    room = (cost_gen < cost_slack) * _column(case.p_max - case.p_min)[:, 0]
-    # what generators that come earlier in the merit order can deliver; ties go by position
-    others, own = cost_gen, cost_gen[:, None]
-    earlier = np.where(_before(len(room))[:, :, None], others <= own, others < own)
-    below = (earlier * room).sum(axis=1) + case.p_min.sum()
-    raised: Array = demand - below[:, None]
-    np.maximum(raised, 0.0, out=raised)
-    np.minimum(raised, room[:, None], out=raised)
-    raised += _column(case.p_min)
-    return raised
+    (n_load, n), n_gen = p_load.shape, len(p_min)
+    for j in range(n):
+        static[n_gen, j] = 0.0
+        for i in range(n_load):
+            static[n_gen, j] -= p_load[i, j]
+    for g in range(n_gen):
+        own, below = cost[1 + g], 0.0  # below: what all must deliver, and those that come earlier can
+        for i in range(n_gen):
+            below += p_min[i]
+            other = cost[1 + i]
+            if other < cost[0] and (other < own or (other == own and i < g)):
+                below += p_max[i] - p_min[i]
+        room = p_max[g] - p_min[g] if own < cost[0] else 0.0
+        for j in range(n):
+            static[g, j] = p_min[g] + min(max(static[n_gen, j] - below, 0.0), room)
+    for g in range(n_gen):
+        for j in range(n):
+            static[n_gen, j] -= static[g, j]
 
 
-def _column(values: Array) -> Array:
-    """One value per generator, for arrays over (generators, knots, batch)."""
-    return values[:, None, None]
-
-
-@functools.cache
-def _cost_ratios(n_gen: int) -> tuple[Array, Array]:
-    """Numerators and denominators of ratios of costs, as matrices to multiply (slack, generators) by.
+@numba.njit(cache=True, nogil=True)
+def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) -> None:
+    """Ratios of costs, then P_0 and ω(0).
 
     Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
     difference in the sum.
     """
-    unit = np.eye(1 + n_gen)
-    slack, generators = unit[:, :1], unit[:, 1:]
-    first, second = np.triu_indices(n_gen, 1)
-    above = [unit, generators, generators[:, first] - generators[:, second]]
-    below = [np.ones_like(unit), generators + slack, generators[:, first] + generators[:, second]]
-    return np.hstack(above).T.copy(), np.hstack(below).T.copy()
-
-
-@functools.cache
-def _before(n_gen: int) -> np.ndarray:
-    return np.tri(n_gen, k=-1, dtype=bool)
+    n_gen, k, total = len(p_initial), 0, 0.0
+    for i in range(1 + n_gen):
+        total += cost[i]
+    for i in range(1 + n_gen):
+        constants[k] = cost[i] / max(total, SMALLEST_SUM)
+        k += 1
+    for i in range(1, 1 + n_gen):
+        constants[k] = cost[i] / max(cost[i] + cost[0], SMALLEST_SUM)
+        k += 1
+    for i in range(1, 1 + n_gen):
+        for j in range(i + 1, 1 + n_gen):
+            constants[k] = (cost[i] - cost[j]) / max(cost[i] + cost[j], SMALLEST_SUM)
+            k += 1
+    for g in range(n_gen):
+        constants[k + g], constants[k + n_gen + g] = p_initial[g], omega[g]

@@ -46,7 +46,7 @@ class StagedNetwork(nn.Module):
         self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
         self.step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
         n_knots = len(response.knots)
-        by_knot = response.of_power.reshape(response.n_outputs, n_knots, n_gen, n_knots).transpose(3, 2, 1, 0)
+        by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
         of_power = by_knot.reshape(n_knots * n_gen, -1)
         for name, value in (("of_power", of_power), ("low", case.p_min), ("high", case.p_max)):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)

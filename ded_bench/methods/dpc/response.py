@@ -30,10 +30,9 @@ class Response:
     knots: Array  # (n_knots,), s
     nodes: Array  # the knots and the points halfway between them, (2 n_knots - 1,), s
     n_outputs: int  # per knot: n_gen + 1 at the knot, as many halfway before it
-    # rows: outputs, then knots; columns: inputs, then nodes or knots
-    of_omega: Array32  # (n_outputs n_knots, n_gen)
-    of_load: Array32  # (n_outputs n_knots, n_load n_nodes)
-    of_power: Array32  # (n_outputs n_knots, n_gen n_knots)
+    of_omega: Array32  # (n_gen, n_outputs n_knots)
+    of_load: Array32  # (n_load n_nodes, n_outputs n_knots)
+    of_power: Array32  # (n_gen n_knots, n_outputs n_knots)
 
     @staticmethod
     def make(case: Case, knots: Array) -> Response:
@@ -54,9 +53,9 @@ class Response:
         outputs = model.rollout(psi, inputs)[:, :, : n_gen + 1]
         before = np.concatenate([outputs[:1], outputs[1::2]])
         seen = np.stack([outputs[::2], before])  # (2, n_knots, units, n_gen + 1)
-        matrix = seen.transpose(0, 3, 1, 2).reshape(-1, seen.shape[2]).astype(np.float32)
-        parts = np.split(matrix, [n_omega, n_omega + n_loads], axis=1)
-        return Response(knots, nodes, 2 * (n_gen + 1), *map(np.ascontiguousarray, parts))
+        matrix = seen.transpose(2, 0, 3, 1).reshape(seen.shape[2], -1).astype(np.float32)
+        parts = np.split(matrix, [n_omega, n_omega + n_loads])
+        return Response(knots, nodes, 2 * (n_gen + 1), *parts)
 
     def undriven(self, omega: Array, p_load: Array) -> Array32:
         """What ω(0) and the loads would do without generators, (batch, n_knots, n_outputs).
@@ -65,9 +64,9 @@ class Response:
             omega: ω(0), (batch, n_gen), rad/s.
             p_load: load injections at the nodes, (batch, n_nodes, n_load), pu.
         """
-        outputs = self.of_omega @ omega.T.astype(np.float32)
-        outputs += self.of_load @ _stacked(p_load)
-        return self._by_instance(outputs)
+        outputs = omega.astype(np.float32) @ self.of_omega
+        outputs += _by_column(p_load) @ self.of_load
+        return self._by_knot(outputs)
 
     def __call__(self, undriven: Array32, p_gen: Array) -> Array32:
         """ω (rad/s) and P_s (pu) at each knot, then halfway before it, (batch, n_knots, n_outputs).
@@ -76,13 +75,13 @@ class Response:
             undriven: see there.
             p_gen: powers at the knots, (batch, n_knots, n_gen), pu.
         """
-        return undriven + self._by_instance(self.of_power @ _stacked(p_gen))
+        return undriven + self._by_knot(_by_column(p_gen) @ self.of_power)
 
-    def _by_instance(self, outputs: Array32) -> Array32:
-        """From (n_outputs n_knots, batch) to (batch, n_knots, n_outputs)."""
-        return outputs.reshape(self.n_outputs, len(self.knots), -1).T
+    def _by_knot(self, outputs: Array32) -> Array32:
+        """From (batch, n_outputs n_knots) to (batch, n_knots, n_outputs)."""
+        return outputs.reshape(len(outputs), self.n_outputs, -1).swapaxes(1, 2)
 
 
-def _stacked(values: Array) -> Array32:
-    """From (batch, n, n_columns) to (n_columns n, batch), in float32."""
-    return values.T.reshape(-1, len(values)).astype(np.float32)
+def _by_column(values: Array) -> Array32:
+    """From (batch, n, n_columns) to (batch, n_columns n), in float32."""
+    return values.swapaxes(1, 2).reshape(len(values), -1).astype(np.float32)

@@ -111,8 +111,9 @@ def bends(*inputs: Array) -> list[int]:
     bent = np.ones(len(inputs[0]), dtype=bool)
     bent[1:-1] = False
     for values in inputs:
-        bend = np.abs(np.diff(values, n=2, axis=0))
-        bent[1:-1] |= bend.max(axis=tuple(range(1, bend.ndim)), initial=0.0) > ROUND_OFF
+        with np.errstate(over="ignore", invalid="ignore"):  # what is beyond all measure is no line
+            straight = np.abs(np.diff(values, n=2, axis=0)) <= ROUND_OFF
+        bent[1:-1] |= ~straight.all(axis=tuple(range(1, straight.ndim)))
     return [int(k) for k in np.flatnonzero(bent)]
 
 

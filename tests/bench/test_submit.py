@@ -110,7 +110,9 @@ def test_only_what_changed_is_scored_again(chosen, results, tmp_path, monkeypatc
     assert gone[1].status == "Failed"
     assert not results.schedule_path(gone[1].key).exists()  # no stale schedule for a figure to draw
     put(folder, b=text(0.6))
-    assert submit(chosen, folder, "mine", ["NO"], results).rows[1].objective == first[1].objective
+    back = submit(chosen, folder, "mine", ["NO"], results).rows[1].objective
+    # alone this time; side by side, neighbours decide where steps end
+    assert back == pytest.approx(first[1].objective, rel=1e-12)
 
 
 def test_two_files_for_one_schedule_are_a_question(chosen, results, tmp_path) -> None:

@@ -63,7 +63,7 @@ def random_network(case: Case, size: float = 1.0, horizon: float = HORIZON) -> S
     for stage in network.stages:
         torch.nn.init.normal_(stage.last.weight, std=size)
     inputs = Inputs.of(case, some_instances(case, 20, horizon=horizon))
-    network.normalise(Channels.of(case, inputs, response), response)
+    network.normalise(Channels.of(case, inputs, response))
     return network.eval()
 
 

@@ -57,10 +57,10 @@ class DispatchPolicy:
         """Knot times, shape (n_knots,), s."""
         return self.response.knots
 
-    @functools.cached_property
+    @property
     def response(self) -> Response:
         """What the network looks at."""
-        return Response.make(self.scope.case, knot_times(self.scope.horizon_s, N_KNOTS))
+        return self.network.response
 
     @functools.cached_property
     def _compiled(self) -> CompiledStages:

@@ -179,7 +179,7 @@ def train(
         torch.manual_seed(seed)
         network = StagedNetwork(case, response, chosen.stages, chosen.width, chosen.dilations)
     if chosen.normalise:
-        network.normalise(channels[0], response)
+        network.normalise(channels[0])
     network.hide(chosen.blind)
     network.to(device)
     run = _Run(network, loss, generator, chosen, out.with_suffix(".checkpoint.pt"), len(data))

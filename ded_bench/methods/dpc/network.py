@@ -42,7 +42,7 @@ class StagedNetwork(nn.Module):
         self.groups = {"response": slice(n_gen, n_seen)}
         for name, part in sequence_groups(case).items():
             self.groups[name] = slice(n_seen + part.start, n_seen + part.stop)
-        self.dilations = dilations
+        self.response, self.dilations = response, dilations
         self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
         self.step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
         n_knots = len(response.knots)
@@ -55,9 +55,9 @@ class StagedNetwork(nn.Module):
     low: Tensor
     high: Tensor
 
-    def normalise(self, channels: Channels, response: Response) -> None:
+    def normalise(self, channels: Channels) -> None:
         """Set the affine input normalisation of all stages from training data."""
-        seen = response(channels.undriven, channels.start)
+        seen = self.response(channels.undriven, channels.start)
         sequence = np.concatenate([channels.start, seen, channels.sequence], axis=-1)
         for stage in self.stages:
             cast(ResidualNetwork, stage).normalise(sequence, channels.constants)

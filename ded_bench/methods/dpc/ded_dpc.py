@@ -40,8 +40,8 @@ from ded_bench.problem.strict import write_atomically
 
 METHOD = "ded-dpc"
 N_KNOTS = 50
-#: Instances worked on at once: more would not stay in a core's cache, fewer would pay more per call.
-CHUNK = 100
+#: Instances that one thread takes at a time.
+CHUNK = 50
 
 
 @dataclass(frozen=True, eq=False)

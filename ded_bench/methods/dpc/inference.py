@@ -125,35 +125,38 @@ def _answer(
             for i in range(len(bias)):
                 bias[i] += embed_bias[s, i]
             # what the stage sees: the schedule so far, its response, the instance
-            for g in range(n_gen):
-                for j in range(n):
-                    p32[g * n + j] = inputs[g, 1 + j] = p_gen[b, g, j]
-            np.dot(p32, of_power, driven)
             for i in range(n_in):
                 inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
+            for g in range(n_gen):
+                _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
+                _copy(p_gen[b, g], inputs[g, 1 : n + 1])
+            np.dot(p32, of_power, driven)
             for i in range(n_gen, n_seen):
+                row, own, due = inputs[i, 1 : n + 1], undriven[b, i - n_gen], driven[(i - n_gen) * n :]
                 for j in range(n):
-                    inputs[i, 1 + j] = undriven[b, i - n_gen, j] + driven[(i - n_gen) * n + j]
+                    row[j] = own[j] + due[j]
             for i in range(n_seen, n_in):
-                for j in range(n):
-                    inputs[i, 1 + j] = sequence[b, i - n_seen, j]
+                _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
             # its corrections
             _gather(inputs, 1, input_columns)
             np.dot(first[s], input_columns, change)
             for o in range(width):
+                row = hidden[o, margin : margin + n]
                 for j in range(n):
-                    hidden[o, margin + j] = change[o, j] + bias[o]
+                    row[j] = change[o, j] + bias[o]
             for i in range(len(dilations)):
                 _gather(hidden, dilations[i], columns)
                 np.dot(spread[s, i], columns, inner)
                 _add_and_cut(inner, bias[(1 + i) * width : (2 + i) * width])
                 np.dot(mix[s, i], inner, change)
                 for o in range(width):
+                    row = hidden[o, margin : margin + n]
                     for j in range(n):
-                        hidden[o, margin + j] += change[o, j] + mix_bias[s, i, o]
+                        row[j] += change[o, j] + mix_bias[s, i, o]
             for o in range(width):
+                row = hidden[o, margin : margin + n]
                 for j in range(n):
-                    inner[o, j] = max(hidden[o, margin + j], np.float32(0.0))
+                    inner[o, j] = max(row[j], np.float32(0.0))
             np.dot(last[s], inner, corrections)
             for g in range(n_gen):
                 for j in range(1, n):
@@ -162,20 +165,31 @@ def _answer(
             track(p_gen[b], step, p_gen[b])
 
 
+# Loops run over views of one row: of elements by two indices Numba makes no vector instructions.
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy(values: Array | Array32, out: Array32) -> None:
+    """From one row to another; in float32."""
+    for j in range(len(out)):
+        out[j] = values[j]
+
+
 @numba.njit(cache=True, nogil=True)
 def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
     """What a convolution sees at each knot: those `dilation` before, themselves, those after."""
     n_channels, n = len(padded), columns.shape[1]
     first = (padded.shape[1] - n) // 2 - dilation
     for tap in range(3):
+        at = first + tap * dilation
         for i in range(n_channels):
-            for j in range(n):
-                columns[tap * n_channels + i, j] = padded[i, first + tap * dilation + j]
+            _copy(padded[i, at : at + n], columns[tap * n_channels + i])
 
 
 @numba.njit(cache=True, nogil=True)
 def _add_and_cut(values: Array32, bias: Array32) -> None:
     """ReLU(values + bias), in place."""
     for o in range(len(values)):
-        for j in range(values.shape[1]):
-            values[o, j] = max(values[o, j] + bias[o], np.float32(0.0))
+        row, own = values[o], bias[o]
+        for j in range(len(row)):
+            row[j] = max(row[j] + own, np.float32(0.0))

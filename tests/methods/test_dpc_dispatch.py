@@ -284,6 +284,15 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
     assert resumed.training["steps"] == whole.training["steps"]
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+def test_training_on_a_gpu_gives_the_same_losses(threebus: Case, tmp_path: Path) -> None:
+    histories = []
+    for device in ("cpu", "cuda"):
+        short_training(threebus, tmp_path / f"{device}.safetensors", device=device, epochs=3)
+        histories.append(pd.read_csv(tmp_path / f"{device}.history.csv")["held out"])
+    np.testing.assert_allclose(histories[0], histories[1], rtol=1e-4)
+
+
 def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path) -> None:
     """What was trained is what the file answers with, without the prior and blind to the dispatch."""
     path = tmp_path / "v.safetensors"

@@ -290,6 +290,8 @@ def worst_figure(case: Case, regime: str, heading: str, columns: Sequence[Worst]
                 (line,) = top.plot(*thin(t, powers), color=BLACK, dashes=(4, 2), linewidth=0.9)
                 handles["DED"] = line
             handles["bound"] = bounds(bottom, limit, -limit)
+            for ax in (top, bottom):
+                ax.locator_params(nbins=4)  # ticks take longer than lines
             top.set_title(column.reason, fontsize=8)
             bottom.set_xlabel("time (s)")
             bottom.set_xlim(t[0], t[-1])

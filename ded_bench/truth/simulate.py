@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -220,5 +219,11 @@ def _between(values: Array, cell: int, inside: float) -> Array:
 
 def _extrapolated(values: Mapping[float, Array], t: float) -> Array:
     """The polynomial through values at other times, at t: so near that Newton mostly needs one step."""
-    weights = (math.prod((t - b) / (a - b) for b in values if b != a) for a in values)
-    return np.asarray(sum(w * value for w, value in zip(weights, values.values(), strict=True)))
+    total: Array | float = 0.0
+    for a, value in values.items():
+        weight = 1.0
+        for b in values:
+            if b != a:
+                weight *= (t - b) / (a - b)
+        total = total + weight * value
+    return np.array(total)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
+from ded_bench.methods.dpc import kernels
 from ded_bench.methods.dpc.follower import Clip, Follow, follow
 
 
@@ -42,3 +44,16 @@ def test_clip_lets_descent_lead_back_inside() -> None:
     (clipped * torch.tensor([1.0, -1.0, 2.0, 1.0, -1.0])).sum().backward()
     torch.testing.assert_close(clipped.detach(), torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0]))
     torch.testing.assert_close(value.grad, torch.tensor([0.0, -1.0, 2.0, 1.0, 0.0]))
+
+
+def test_functions_are_compiled_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba refuses to cache if neither the package's folder nor the user's can be written."""
+    monkeypatch.setattr("numba.core.caching.CacheImpl._locator_classes", [])
+
+    def double(values: np.ndarray) -> None:
+        for i in range(len(values)):
+            values[i] *= 2.0
+
+    values = np.ones(3)
+    kernels.compiled(double)(values)
+    assert values.tolist() == [2.0, 2.0, 2.0]

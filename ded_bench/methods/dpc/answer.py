@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ded_bench.methods.dpc.kernels import compiled
 from ded_bench.methods.solution import Solution, Solver, Status
 from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
@@ -48,7 +49,7 @@ class Interpolation:
         return found
 
 
-@numba.njit(cache=True)
+@compiled
 def _interpolate(p: Array, ends: Indices, width: Array, since: Array, found: Array) -> None:
     """Fill in the points of one interval after another; those of interval j end before `ends[j]`."""
     for g in range(p.shape[1]):

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from ded_bench.methods.dpc.kernels import track
 from ded_bench.problem.case import Array
 
 
@@ -34,16 +34,6 @@ def follow(targets: Array, p_initial: Array, step: float) -> Array:
     for powers in p_gen:
         track(powers.T, step, powers.T)
     return p_gen
-
-
-@numba.njit(cache=True, nogil=True)
-def track(targets: Array, step: float, p_gen: Array) -> None:
-    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0."""
-    for g in range(len(targets)):
-        p = p_gen[g, 0] = targets[g, 0]
-        for j in range(1, targets.shape[1]):
-            p = min(max(targets[g, j], p - step), p + step)
-            p_gen[g, j] = p
 
 
 class Follow(torch.autograd.Function):

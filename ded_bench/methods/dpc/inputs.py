@@ -11,16 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
-from ded_bench.methods.dpc.follower import track
+from ded_bench.methods.dpc.kernels import fill
 from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-
-#: Costs whose sum is smaller are as good as free.
-SMALLEST_SUM = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +84,7 @@ class Channels:
         step = float(case.ramp_pu_per_s * (knots[1] - knots[0]))
         given = inputs.ramps, inputs.cost, inputs.p_initial, inputs.omega
         limits = case.p_min, case.p_max, step
-        _fill(*given, nodes, *limits, dispatch, p_load, sequence, constants, start)
+        fill(*given, nodes, *limits, dispatch, p_load, sequence, constants, start)
         undriven = response.undriven(inputs.omega, p_load.swapaxes(1, 2))
         return Channels(sequence.swapaxes(1, 2), constants, start.swapaxes(1, 2), undriven)
 
@@ -114,108 +110,3 @@ def sequence_groups(case: Case) -> dict[str, slice]:
         "bends": slice(n_load, 2 * n_load),
         "dispatch": slice(2 * n_load, 2 * n_load + n_gen + 1),
     }
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill(
-    ramps: Array,
-    cost: Array,
-    p_initial: Array,
-    omega: Array,
-    nodes: Array,
-    p_min: Array,
-    p_max: Array,
-    step: float,
-    dispatch: bool,
-    p_load: Array,
-    sequence: Array,
-    constants: Array,
-    start: Array,
-) -> None:
-    """Compute the last four, instance by instance; see `Inputs` and `Channels`."""
-    n_gen, n_load = len(p_min), p_load.shape[1]
-    for b in range(len(ramps)):
-        for i in range(n_load):
-            _loads_and_bends(ramps[b, i], nodes, p_load[b, i], sequence[b, i], sequence[b, n_load + i])
-        static = sequence[b, 2 * n_load :]
-        _dispatch(sequence[b, :n_load], cost[b], p_min, p_max, static)
-        _constants(cost[b], p_initial[b], omega[b], constants[b])
-        for g in range(n_gen):
-            for j in range(1, start.shape[2]):
-                start[b, g, j] = static[g, j] if dispatch else 0.5 * (p_min[g] + p_max[g])
-            start[b, g, 0] = p_initial[b, g]
-        track(start[b], step, start[b])
-
-
-@numba.njit(cache=True, nogil=True)
-def _loads_and_bends(ramp: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
-    """A load at the nodes and at the knots, and how far its mean between two knots is off the chord; pu.
-
-    Every second node is a knot. The bend tells where between two knots a ramp starts or ends.
-    """
-    initial, begin, duration, rate = ramp
-    spacing = nodes[2] - nodes[0]
-    last_area = last_half = 0.0
-    for k in range(len(nodes)):
-        since = max(nodes[k] - begin, 0.0)
-        into = min(since, duration)
-        p_load[k] = initial + rate * into
-        if k % 2 == 0:
-            half = 0.5 * into
-            area = into * (since - half)  # ∫ into dt
-            at_knots[k // 2] = p_load[k]
-            bends[k // 2] = rate * ((area - last_area) / spacing - half - last_half) if k else 0.0
-            last_area, last_half = area, half
-
-
-@numba.njit(cache=True, nogil=True)
-def _dispatch(p_load: Array, cost: Array, p_min: Array, p_max: Array, static: Array) -> None:
-    """`problem.dispatch.merit_order` at each knot, then the slack's power; pu.
-
-    Args:
-        p_load: loads at the knots, (n_load, n_knots).
-        cost: (slack, generators), (1 + n_gen,).
-        static: receives the powers, (n_gen + 1, n_knots).
-    """
-    (n_load, n), n_gen = p_load.shape, len(p_min)
-    for j in range(n):
-        static[n_gen, j] = 0.0
-        for i in range(n_load):
-            static[n_gen, j] -= p_load[i, j]
-    for g in range(n_gen):
-        own, below = cost[1 + g], 0.0  # below: what all must deliver, and those that come earlier can
-        for i in range(n_gen):
-            below += p_min[i]
-            other = cost[1 + i]
-            if other < cost[0] and (other < own or (other == own and i < g)):
-                below += p_max[i] - p_min[i]
-        room = p_max[g] - p_min[g] if own < cost[0] else 0.0
-        for j in range(n):
-            static[g, j] = p_min[g] + min(max(static[n_gen, j] - below, 0.0), room)
-    for g in range(n_gen):
-        for j in range(n):
-            static[n_gen, j] -= static[g, j]
-
-
-@numba.njit(cache=True, nogil=True)
-def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) -> None:
-    """Ratios of costs, then P_0 and ω(0).
-
-    Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
-    difference in the sum.
-    """
-    n_gen, k, total = len(p_initial), 0, 0.0
-    for i in range(1 + n_gen):
-        total += cost[i]
-    for i in range(1 + n_gen):
-        constants[k] = cost[i] / max(total, SMALLEST_SUM)
-        k += 1
-    for i in range(1, 1 + n_gen):
-        constants[k] = cost[i] / max(cost[i] + cost[0], SMALLEST_SUM)
-        k += 1
-    for i in range(1, 1 + n_gen):
-        for j in range(i + 1, 1 + n_gen):
-            constants[k] = (cost[i] - cost[j]) / max(cost[i] + cost[j], SMALLEST_SUM)
-            k += 1
-    for g in range(n_gen):
-        constants[k + g], constants[k + n_gen + g] = p_initial[g], omega[g]

@@ -1,0 +1,260 @@
+"""All that Numba compiles for `ded-dpc`, in one file.
+
+Its cache on disk notices that a function's own file changed, not that a function which it calls did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numba
+import numpy as np
+
+from ded_bench.methods.dpc.response import Array32
+from ded_bench.problem.case import Array
+
+#: Costs whose sum is smaller are as good as free.
+SMALLEST_SUM = 1e-9
+
+
+def compiled(function: Callable[..., None]) -> Callable[..., None]:
+    """Compile when first called; kept on disk, if the package's or the user's folder can be written."""
+    try:
+        return numba.njit(cache=True, nogil=True)(function)
+    except RuntimeError:  # there is no such folder
+        return numba.njit(nogil=True)(function)
+
+
+@compiled
+def track(targets: Array, step: float, p_gen: Array) -> None:
+    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0."""
+    for g in range(len(targets)):
+        p = p_gen[g, 0] = targets[g, 0]
+        for j in range(1, targets.shape[1]):
+            p = min(max(targets[g, j], p - step), p + step)
+            p_gen[g, j] = p
+
+
+@compiled
+def fill(
+    ramps: Array,
+    cost: Array,
+    p_initial: Array,
+    omega: Array,
+    nodes: Array,
+    p_min: Array,
+    p_max: Array,
+    step: float,
+    dispatch: bool,
+    p_load: Array,
+    sequence: Array,
+    constants: Array,
+    start: Array,
+) -> None:
+    """Compute the last four, instance by instance; see `inputs.Inputs` and `inputs.Channels`."""
+    n_gen, n_load = len(p_min), p_load.shape[1]
+    for b in range(len(ramps)):
+        for i in range(n_load):
+            _loads_and_bends(ramps[b, i], nodes, p_load[b, i], sequence[b, i], sequence[b, n_load + i])
+        static = sequence[b, 2 * n_load :]
+        _dispatch(sequence[b, :n_load], cost[b], p_min, p_max, static)
+        _constants(cost[b], p_initial[b], omega[b], constants[b])
+        for g in range(n_gen):
+            for j in range(1, start.shape[2]):
+                start[b, g, j] = static[g, j] if dispatch else 0.5 * (p_min[g] + p_max[g])
+            start[b, g, 0] = p_initial[b, g]
+        track(start[b], step, start[b])
+
+
+@compiled
+def _loads_and_bends(ramp: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
+    """A load at the nodes and at the knots, and how far its mean between two knots is off the chord; pu.
+
+    Every second node is a knot. The bend tells where between two knots a ramp starts or ends.
+    """
+    initial, begin, duration, rate = ramp
+    spacing = nodes[2] - nodes[0]
+    last_area = last_half = 0.0
+    for k in range(len(nodes)):
+        since = max(nodes[k] - begin, 0.0)
+        into = min(since, duration)
+        p_load[k] = initial + rate * into
+        if k % 2 == 0:
+            half = 0.5 * into
+            area = into * (since - half)  # ∫ into dt
+            at_knots[k // 2] = p_load[k]
+            bends[k // 2] = rate * ((area - last_area) / spacing - half - last_half) if k else 0.0
+            last_area, last_half = area, half
+
+
+@compiled
+def _dispatch(p_load: Array, cost: Array, p_min: Array, p_max: Array, static: Array) -> None:
+    """`problem.dispatch.merit_order` at each knot, then the slack's power; pu.
+
+    Args:
+        p_load: loads at the knots, (n_load, n_knots).
+        cost: (slack, generators), (1 + n_gen,).
+        static: receives the powers, (n_gen + 1, n_knots).
+    """
+    (n_load, n), n_gen = p_load.shape, len(p_min)
+    for j in range(n):
+        static[n_gen, j] = 0.0
+        for i in range(n_load):
+            static[n_gen, j] -= p_load[i, j]
+    for g in range(n_gen):
+        own, below = cost[1 + g], 0.0  # below: what all must deliver, and those that come earlier can
+        for i in range(n_gen):
+            below += p_min[i]
+            other = cost[1 + i]
+            if other < cost[0] and (other < own or (other == own and i < g)):
+                below += p_max[i] - p_min[i]
+        room = p_max[g] - p_min[g] if own < cost[0] else 0.0
+        for j in range(n):
+            static[g, j] = p_min[g] + min(max(static[n_gen, j] - below, 0.0), room)
+    for g in range(n_gen):
+        for j in range(n):
+            static[n_gen, j] -= static[g, j]
+
+
+@compiled
+def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) -> None:
+    """Ratios of costs, then P_0 and ω(0).
+
+    Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
+    difference in the sum.
+    """
+    n_gen, k, total = len(p_initial), 0, 0.0
+    for i in range(1 + n_gen):
+        total += cost[i]
+    for i in range(1 + n_gen):
+        constants[k] = cost[i] / max(total, SMALLEST_SUM)
+        k += 1
+    for i in range(1, 1 + n_gen):
+        constants[k] = cost[i] / max(cost[i] + cost[0], SMALLEST_SUM)
+        k += 1
+    for i in range(1, 1 + n_gen):
+        for j in range(i + 1, 1 + n_gen):
+            constants[k] = (cost[i] - cost[j]) / max(cost[i] + cost[j], SMALLEST_SUM)
+            k += 1
+    for g in range(n_gen):
+        constants[k + g], constants[k + n_gen + g] = p_initial[g], omega[g]
+
+
+@compiled
+def answer(
+    p_gen: Array,
+    constants: Array32,
+    sequence: Array,
+    undriven: Array32,
+    of_power: Array32,
+    low: Array,
+    high: Array,
+    step: float,
+    dilations: Array,
+    mean: Array32,
+    enter: Array32,
+    enter_bias: Array32,
+    embed: Array32,
+    embed_bias: Array32,
+    first: Array32,
+    spread: Array32,
+    mix: Array32,
+    mix_bias: Array32,
+    last: Array32,
+    last_bias: Array32,
+) -> None:
+    """Turn the first schedules of a batch into answers, stage by stage.
+
+    Args:
+        p_gen: (batch, n_gen, n_knots), pu; receives the answers.
+        constants: and the next two, see `inputs.Channels`; here the channel comes before the knot.
+        of_power: see `response.Response`; `low`, `high`, `step`: see `follower.follow`.
+        mean: of the inputs, which stands beyond the first and the last knot; this and what follows
+            has the stage as its first axis.
+    """
+    _, n_gen, n = p_gen.shape
+    n_stages, width, n_in = len(first), first.shape[1], mean.shape[1]
+    n_seen, margin = n_gen + undriven.shape[1], dilations.max()
+    p32, driven = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
+    inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
+    input_columns, columns = np.empty((3 * n_in, n), np.float32), np.empty((3 * width, n), np.float32)
+    inner, change = np.empty((width, n), np.float32), np.empty((width, n), np.float32)
+    embedded, bias = np.empty(enter.shape[1], np.float32), np.empty(embed.shape[1], np.float32)
+    corrections = np.empty((n_gen, n), np.float32)
+    for b in range(len(p_gen)):
+        for s in range(n_stages):
+            np.dot(enter[s], constants[b], embedded)
+            for i in range(len(embedded)):
+                embedded[i] = max(embedded[i] + enter_bias[s, i], np.float32(0.0))
+            np.dot(embed[s], embedded, bias)
+            for i in range(len(bias)):
+                bias[i] += embed_bias[s, i]
+            # what the stage sees: the schedule so far, its response, the instance
+            for i in range(n_in):
+                inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
+            for g in range(n_gen):
+                _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
+                _copy(p_gen[b, g], inputs[g, 1 : n + 1])
+            np.dot(p32, of_power, driven)
+            for i in range(n_gen, n_seen):
+                row, own, due = inputs[i, 1 : n + 1], undriven[b, i - n_gen], driven[(i - n_gen) * n :]
+                for j in range(n):
+                    row[j] = own[j] + due[j]
+            for i in range(n_seen, n_in):
+                _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
+            # its corrections
+            _gather(inputs, 1, input_columns)
+            np.dot(first[s], input_columns, change)
+            for o in range(width):
+                row = hidden[o, margin : margin + n]
+                for j in range(n):
+                    row[j] = change[o, j] + bias[o]
+            for i in range(len(dilations)):
+                _gather(hidden, dilations[i], columns)
+                np.dot(spread[s, i], columns, inner)
+                _add_and_cut(inner, bias[(1 + i) * width : (2 + i) * width])
+                np.dot(mix[s, i], inner, change)
+                for o in range(width):
+                    row = hidden[o, margin : margin + n]
+                    for j in range(n):
+                        row[j] += change[o, j] + mix_bias[s, i, o]
+            for o in range(width):
+                row = hidden[o, margin : margin + n]
+                for j in range(n):
+                    inner[o, j] = max(row[j], np.float32(0.0))
+            np.dot(last[s], inner, corrections)
+            for g in range(n_gen):
+                for j in range(1, n):
+                    target = p_gen[b, g, j] + corrections[g, j] + last_bias[s, g]
+                    p_gen[b, g, j] = min(max(target, low[g]), high[g])
+            track(p_gen[b], step, p_gen[b])
+
+
+# Loops run over views of one row: of elements by two indices Numba makes no vector instructions.
+
+
+@compiled
+def _copy(values: Array | Array32, out: Array32) -> None:
+    """From one row to another; in float32."""
+    for j in range(len(out)):
+        out[j] = values[j]
+
+
+@compiled
+def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
+    """What a convolution sees at each knot: those `dilation` before, themselves, those after."""
+    n_channels, n = len(padded), columns.shape[1]
+    first = (padded.shape[1] - n) // 2 - dilation
+    for tap in range(3):
+        at = first + tap * dilation
+        for i in range(n_channels):
+            _copy(padded[i, at : at + n], columns[tap * n_channels + i])
+
+
+@compiled
+def _add_and_cut(values: Array32, bias: Array32) -> None:
+    """ReLU(values + bias), in place."""
+    for o in range(len(values)):
+        row, own = values[o], bias[o]
+        for j in range(len(row)):
+            row[j] = max(row[j] + own, np.float32(0.0))

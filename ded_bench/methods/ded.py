@@ -32,6 +32,9 @@ class Choice:
     start: str = ""  # one of STARTS; the state at t = 0, if empty
 
 
+#: One solution of the linear system per iteration, refined only where its residual asks for it: the
+#: iterates are the same, without a tenth of the time.
+_IPOPT_OPTIONS = {"min_refinement_steps": 0}
 #: By settings slug. IPOPT has its default tolerances in all of them.
 SETTINGS = {
     "default": Choice(),
@@ -103,7 +106,7 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
 @functools.lru_cache(maxsize=1)
 def _compiled(case: Case, steps: int, dt: float, solver: str) -> Compiled:
-    return compile_model(_built(case, steps, dt), solver)
+    return compile_model(_built(case, steps, dt), solver, _IPOPT_OPTIONS)
 
 
 @functools.lru_cache(maxsize=2)
@@ -139,6 +142,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m.p_slack_up = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     m.p_slack_down = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     pyo.TransformationFactory("dae.finite_difference").apply_to(m, nfe=steps, wrt=m.t, scheme="BACKWARD")
+    theta_rate, omega_rate = eliminated(m, m.dtheta), eliminated(m, m.domega)
     times = list(m.t)
     m.step = pyo.RangeSet(1, steps)
 
@@ -150,11 +154,11 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
         if t == 0:
             return pyo.Constraint.Skip  # the initial state is given; Euler starts at t_1
         machine = case.machines[g]
-        return machine.m * m.domega[g, t] + machine.d * m.omega[g, t] == m.p_gen[g, t] - injection(g, t)
+        return machine.m * omega_rate[g, t] + machine.d * m.omega[g, t] == m.p_gen[g, t] - injection(g, t)
 
     @m.Constraint(m.gen, m.t)
     def eq_angle(m: Any, g: str, t: float) -> Any:
-        return pyo.Constraint.Skip if t == 0 else m.dtheta[g, t] == m.omega[g, t]
+        return pyo.Constraint.Skip if t == 0 else theta_rate[g, t] == m.omega[g, t]
 
     @m.Constraint(m.algebraic, m.t)
     def eq_load(m: Any, bus: str, t: float) -> Any:
@@ -175,6 +179,18 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
         return generation + sum(m.cost_slack * (m.p_slack_up[t] + m.p_slack_down[t]) for t in times)
 
     return m
+
+
+def eliminated(m: pyo.ConcreteModel, derivative: dae.DerivativeVar) -> dict[Any, Any]:
+    """Take a discretised derivative out of a model; return the difference quotients that stand for it.
+
+    IPOPT takes the same iterates, on a linear system with a fifth fewer rows.
+    """
+    equations = m.component(f"{derivative.local_name}_disc_eq")
+    quotients = {index: equations[index].expr.args[1] for index in equations}
+    m.del_component(equations)
+    m.del_component(derivative)
+    return quotients
 
 
 def power_limits(case: Case) -> Callable[[Any, str, float], tuple[float, float]]:
@@ -220,7 +236,7 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     points = (len(times), 1)
     still = np.zeros((len(times), len(case.generators)))
     slack = np.tile(network.injections(angles)[network.slack], len(times))
-    _start(m, case, np.tile(angles, points), still, still, np.tile(p_initial, points), slack)
+    _start(m, case, np.tile(angles, points), still, np.tile(p_initial, points), slack)
     for j, g in enumerate(case.generators):
         fix(m.p_gen[g, 0], float(p_initial[j]))
         fix(m.omega[g, 0], float(omega_initial[j]))
@@ -234,18 +250,11 @@ def start_from(m: pyo.ConcreteModel, case: Case, instance: Instance, schedule: S
         SimulationError: the system loses synchronism under this schedule.
     """
     truth = simulate(case, instance, schedule)
-    acceleration = np.gradient(truth.omega, instance.dt_s, axis=0)
-    _start(m, case, truth.theta, truth.omega, acceleration, truth.p_gen, truth.p_slack)
+    _start(m, case, truth.theta, truth.omega, truth.p_gen, truth.p_slack)
 
 
 def _start(
-    m: pyo.ConcreteModel,
-    case: Case,
-    theta: Array,
-    omega: Array,
-    acceleration: Array,
-    p_gen: Array,
-    p_slack: Array,
+    m: pyo.ConcreteModel, case: Case, theta: Array, omega: Array, p_gen: Array, p_slack: Array
 ) -> None:
     """Set the values of all variables but the data; rows are points, columns buses or generators."""
     network = Network(case)
@@ -253,8 +262,6 @@ def _start(
     wanted = [
         *((m.theta, g, column) for g, column in zip(m.gen, theta[:, network.generators].T, strict=True)),
         *((m.omega, g, column) for g, column in zip(m.gen, omega.T, strict=True)),
-        *((m.dtheta, g, column) for g, column in zip(m.gen, omega.T, strict=True)),
-        *((m.domega, g, column) for g, column in zip(m.gen, acceleration.T, strict=True)),
         *((m.p_gen, g, column) for g, column in zip(m.gen, p_gen.T, strict=True)),
         *((m.angle, i, column) for i, column in zip(m.algebraic, theta[:, network.algebraic].T, strict=True)),
         (m.p_slack_up, None, slack[:, 0]),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,7 +99,12 @@ def paint(
 
 
 def draw(
-    case: Case, results: Results, frame: pd.DataFrame, timing: pd.DataFrame, problems: Path, workers: int = 1
+    case: Case,
+    results: Results,
+    frame: pd.DataFrame,
+    timing: pd.DataFrame,
+    problems: Path,
+    pool: Workers | None = None,
 ) -> Gallery:
     """Draw every figure that the folder has data for into `<results>/figures`.
 
@@ -108,30 +112,29 @@ def draw(
         frame: the rows that the report is about.
         timing: the timing rows of one host.
         problems: folder of the benchmark's instances.
-        workers: processes that draw; with one, this one does.
+        pool: processes that draw; this one does, if there are none.
     """
     gallery = Gallery(case, results)
     frame = frame[frame["regime"].isin(list(case.regimes))]
     _read_instances(gallery, problems)
     chosen = plan(frame, gallery.has)
     models = _models(gallery)
-    with Workers(workers) if workers > 1 else nullcontext() as pool:
-        before = (
-            _simulations(gallery, chosen),  # first, since it takes longest
-            _draw_training(gallery),
-            _draw_problem(gallery),
-            _draw_tradeoff(gallery, frame, timing),
-            _draw_eigenvalues(gallery, models),
-        )
-        for answer in _answers(pool, itertools.chain(*before)):
-            _keep(gallery, answer)
-        after = (
-            _draw_schedules(gallery, chosen),
-            _draw_tight(gallery, chosen, models),
-            _draw_models(gallery, models),
-            _draw_worst(gallery, chosen),
-        )
-        list(_answers(pool, itertools.chain(*after)))
+    before = (
+        _simulations(gallery, chosen),  # first, since it takes longest
+        _draw_training(gallery),
+        _draw_problem(gallery),
+        _draw_tradeoff(gallery, frame, timing),
+        _draw_eigenvalues(gallery, models),
+    )
+    for answer in _answers(pool, itertools.chain(*before)):
+        _keep(gallery, answer)
+    after = (
+        _draw_schedules(gallery, chosen),
+        _draw_tight(gallery, chosen, models),
+        _draw_models(gallery, models),
+        _draw_worst(gallery, chosen),
+    )
+    list(_answers(pool, itertools.chain(*after)))
     if not any(chosen.representative.values()):
         gallery.notes.append("No schedule of a scored row is in the folder, so no trajectory is drawn.")
     return gallery

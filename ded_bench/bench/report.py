@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import pandas as pd
@@ -49,6 +50,7 @@ from ded_bench.bench.page import (
     render_markdown,
 )
 from ded_bench.bench.paper import paper_numbers, table_v, table_vi
+from ded_bench.bench.pool import Workers
 from ded_bench.bench.results import Results
 from ded_bench.bench.selection import first_settings
 from ded_bench.bench.studies import ROLLOUTS, ablation_table, main_rows, model_table, training_table
@@ -75,15 +77,18 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     Raises:
         InputError: results.csv or timing.csv is wrong.
     """
-    results = Results(folder)
-    everything = results.frame()
-    everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
-    frame = judged_rows(everything)
-    timings = timing_frame(read_timing(folder / "timing.csv"))
-    timing = latest_host(timings[timings["case"] == case.id])
-    with ThreadPoolExecutor(1) as aside:  # meanwhile `draw` mostly waits for other processes
+    # Beside the processes that draw, one thread: this process mostly waits for them.
+    with ThreadPoolExecutor(1) as aside, Workers(workers) if workers > 1 else nullcontext() as pool:
+        if pool:
+            pool.warm(draw.__module__)
+        results = Results(folder)
+        everything = results.frame()
+        everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
+        frame = judged_rows(everything)
+        timings = timing_frame(read_timing(folder / "timing.csv"))
+        timing = latest_host(timings[timings["case"] == case.id])
         computed = aside.submit(_frames, case, folder, frame, everything, timing)
-        gallery = draw(case, results, frame, timing, problems, workers)
+        gallery = draw(case, results, frame, timing, problems, pool)
         frames = computed.result()
     rows_from = rows_caption(frame, everything)
     files = _write_tables(folder, frames, rows_from, timing)

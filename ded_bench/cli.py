@@ -7,11 +7,12 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.arguments import DEFAULT_CASE, parser
-from ded_bench.bench.pool import WorkersLostError
+from ded_bench.bench.pool import Workers, WorkersLostError
 from ded_bench.koopman.store import default_results, search_folders
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import Selection, problem_folder, select_files, select_split
@@ -219,11 +220,14 @@ def _rollouts(a: argparse.Namespace) -> int:
 
 
 def _report(a: argparse.Namespace) -> int:
-    from ded_bench.bench.report import write_report
+    with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
+        if pool:
+            pool.warm("ded_bench.bench.gallery")  # while this process imports it, too
+        from ded_bench.bench.report import write_report
 
-    case = Case.load(a.case)
-    folder = a.results or default_results(case)
-    written = write_report(case, folder, problem_folder(a.case, case), a.workers)
+        case = Case.load(a.case)
+        folder = a.results or default_results(case)
+        written = write_report(case, folder, problem_folder(a.case, case), pool)
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0
 

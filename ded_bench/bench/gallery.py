@@ -120,8 +120,8 @@ def draw(
     chosen = plan(frame, gallery.has)
     models = _models(gallery)
     before = (
-        _simulations(gallery, chosen),  # first, since it takes longest
-        _draw_training(gallery),
+        _draw_training(gallery),  # at once, while this process reads what the longest calls need
+        _simulations(gallery, chosen),
         _draw_problem(gallery),
         _draw_tradeoff(gallery, frame, timing),
         _draw_eigenvalues(gallery, models),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 
 import pandas as pd
@@ -61,7 +60,7 @@ from ded_bench.problem.errors import InputError
 from ded_bench.problem.strict import write_atomically
 
 
-def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> list[Path]:
+def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None = None) -> list[Path]:
     """Write tables, figures and the report of a results folder into it.
 
     Whatever is missing (times, policies, a method, all rows) is said in the report.
@@ -69,7 +68,7 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     Args:
         folder: the results folder.
         problems: folder of the case's instances, split and manifest.
-        workers: processes that draw figures.
+        pool: processes that draw the figures; this one does, if there are none.
 
     Returns:
         The files written.
@@ -77,16 +76,13 @@ def write_report(case: Case, folder: Path, problems: Path, workers: int = 1) -> 
     Raises:
         InputError: results.csv or timing.csv is wrong.
     """
-    # Beside the processes that draw, one thread: this process mostly waits for them.
-    with ThreadPoolExecutor(1) as aside, Workers(workers) if workers > 1 else nullcontext() as pool:
-        if pool:
-            pool.warm(draw.__module__)
-        results = Results(folder)
-        everything = results.frame()
-        everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
-        frame = judged_rows(everything)
-        timings = timing_frame(read_timing(folder / "timing.csv"))
-        timing = latest_host(timings[timings["case"] == case.id])
+    results = Results(folder)
+    everything = results.frame()
+    everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
+    frame = judged_rows(everything)
+    timings = timing_frame(read_timing(folder / "timing.csv"))
+    timing = latest_host(timings[timings["case"] == case.id])
+    with ThreadPoolExecutor(1) as aside:  # meanwhile `draw` mostly waits for other processes
         computed = aside.submit(_frames, case, folder, frame, everything, timing)
         gallery = draw(case, results, frame, timing, problems, pool)
         frames = computed.result()

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from ded_bench.bench.layout import GAPS, TABLE_V, TABLE_VI
+from ded_bench.bench.pool import Workers
 from ded_bench.bench.report import write_report
 from ded_bench.bench.results import Key, Results, Row
 from ded_bench.bench.run import scored_row
@@ -113,7 +114,8 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
         {"w": np.zeros(2)},
         {"training": {"seconds": 123.5, "epochs": 7, "seed": 42, "model": "koopman"}},
     )
-    return write_report(ninebus, finished, problems, workers=2)
+    with Workers(2) as pool:
+        return write_report(ninebus, finished, problems, pool)
 
 
 def copy(finished: Path, tmp_path: Path) -> Path:

@@ -1,6 +1,6 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick radau models ablation certify test clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick radau starts models ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
@@ -14,7 +14,7 @@ STAMP   := .venv/installed
 REGIMES := NO TO
 POLICIES := ded-dpc-paper ded-dpc
 MODELS := linear koopman-single koopman-paper
-STEPS  := steps25 steps50 steps100 steps1000
+STEPS  := steps25 steps100 steps1000
 STUDIES := study study-narrow study-wide study-near study-shallow study-one-stage study-three-stages \
   study-no-response study-no-dispatch study-no-bends study-no-prior study-raw study-constant \
   study-batch32 study-batch512 study-fresh4000
@@ -45,8 +45,12 @@ solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in
 	for every in 10s 1s; do $(DED) solve --method ed --settings $$every --regime NO,TO $(CHOICE) \
 	  --workers $(WORKERS) --out $(RESULTS) || exit 1; done
 
-radau: train-ko  ## full DED by Radau collocation: the accurate reference, slower than DED
+radau: train-ko  ## full DED by Radau collocation: the accurate reference
 	$(DED) solve --method ded-radau --regime NO,TO $(CHOICE) --workers $(WORKERS) --out $(RESULTS)
+
+starts: train-ko  ## ten instances of full DED from three other starting points: are its optima the same?
+	for start in ed ko random; do $(DED) solve --method ded --settings start-$$start --regime NO,TO \
+	  --case $(CASE) --split $(SPLIT) --limit 10 --workers $(WORKERS) --out $(RESULTS) || exit 1; done
 
 train-dpc: train-ko  ## train the DED-DPC policies on the training instances
 	@for method in $(POLICIES); do printf '%s\n' $(REGIMES) | xargs -P $(WORKERS) -I REGIME \

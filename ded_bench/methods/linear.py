@@ -98,11 +98,10 @@ class LinearProgram:
         return self.sense * (float(numbers.cost @ values) + numbers.constant)
 
 
-def bounds(columns: Sequence[Any]) -> tuple[Array, Array]:
-    """Lower and upper bounds of Pyomo variables; infinite where there are none."""
-    lower = np.array([-np.inf if v.lb is None else v.lb for v in columns], dtype=float)
-    upper = np.array([np.inf if v.ub is None else v.ub for v in columns], dtype=float)
-    return lower, upper
+def bounds(columns: Sequence[Any]) -> Array:
+    """Lower and upper bounds of Pyomo variables, shape (2, n); infinite where there are none."""
+    pairs = np.array([v.bounds for v in columns], dtype=float).reshape(-1, 2)  # None becomes NaN
+    return np.where(np.isnan(pairs), [-np.inf, np.inf], pairs).T.copy()
 
 
 def assign(columns: Sequence[Any], values: Array) -> None:

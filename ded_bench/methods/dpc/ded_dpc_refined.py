@@ -23,7 +23,6 @@ METHOD = "ded-dpc-refined"
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {"steps": STEPS},
     "steps25": {"steps": 25},
-    "steps50": {"steps": 50},
     "steps100": {"steps": 100},
     "steps1000": {"steps": 1000},
 }

@@ -293,6 +293,24 @@ def test_training_on_a_gpu_gives_the_same_losses(threebus: Case, tmp_path: Path)
     np.testing.assert_allclose(histories[0], histories[1], rtol=1e-4)
 
 
+def test_training_would_not_round_on_a_gpu(
+    threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TensorFloat-32, cuDNN's default, keeps ten bits: losses would differ by 1e-3 from the CPU's."""
+    rounds = []
+    validate = ded_dpc_train._Run._validate
+
+    def look(run: ded_dpc_train._Run, check: ded_dpc_train.Pool) -> dict[str, float]:
+        rounds.append(torch.backends.cudnn.allow_tf32)
+        return validate(run, check)
+
+    monkeypatch.setattr(ded_dpc_train._Run, "_validate", look)
+    short_training(threebus, tmp_path / "p.safetensors", epochs=1)
+    assert rounds
+    assert not any(rounds)
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path) -> None:
     """What was trained is what the file answers with, without the prior and blind to the dispatch."""
     path = tmp_path / "v.safetensors"

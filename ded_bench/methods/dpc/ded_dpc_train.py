@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.ded_dpc import METHOD, N_KNOTS, DispatchPolicy
 from ded_bench.methods.dpc.inputs import Channels, Inputs
-from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.loss import full_precision, knot_times
 from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.objective import Objective, coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.response import Response
@@ -121,6 +121,7 @@ class Loss:
         return cost, (omega.abs() / self.omega_bound - (1.0 - margin)).relu()
 
 
+@full_precision
 def train(
     case: Case,
     regime: str,

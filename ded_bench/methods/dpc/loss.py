@@ -13,6 +13,9 @@ from ded_bench.problem.case import Array, Case
 
 #: Weights of the penalty terms (paper, section on the implementation).
 Q_OMEGA, Q_RAMP, Q_INITIAL = 1e3, 1e2, 1e4
+#: For functions that train: a GPU convolves in single precision, as the CPU does (its default keeps ten
+#: bits), and the same way every time.
+full_precision = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)
 
 
 def knot_times(horizon_s: float, n_knots: int) -> Array:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.features import Features
-from ded_bench.methods.dpc.loss import Condensed, knot_times, loss_terms
+from ded_bench.methods.dpc.loss import Condensed, full_precision, knot_times, loss_terms
 from ded_bench.methods.dpc.policy import METHOD, N_KNOTS, PaperNetwork, Policy, n_channels
 from ded_bench.methods.dpc.store import reading_checkpoint
 from ded_bench.problem.case import Case
@@ -87,6 +87,7 @@ def policy_loss(
     return {name: value.mean() for name, value in terms.items()}
 
 
+@full_precision
 def train(
     case: Case,
     regime: str,

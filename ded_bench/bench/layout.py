@@ -101,6 +101,16 @@ WORST = (
     Column("initial_violation", "initial (pu)"),
     Column("excess", "× tolerance"),
 )
+STARTS = (
+    Column("regime", "Regime"),
+    Column("start", "starting point"),
+    Column("n", "n"),
+    Column("same", "the same optimum"),
+    Column("lowest_percent", "lowest change (%)"),
+    Column("highest_percent", "highest change (%)"),
+    Column("iterations", "iterations, median"),
+    Column("iterations_cold", "of the cold start"),
+)
 TRAINING = (
     Column("policy", "Policy"),
     Column("seconds", "seconds"),

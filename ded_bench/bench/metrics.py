@@ -25,6 +25,10 @@ HEAD = [*GROUP, "title"]
 SUCCESS = (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)
 #: Settings whose name starts so are short trainings, to be compared with each other only.
 STUDY = "study"
+#: Settings whose name starts so solve full DED from another starting point.
+START = "start-"
+#: Optima whose objectives differ by less are the same; relative. IPOPT's tolerance leaves 1e-8.
+SAME = 1e-6
 #: Shift of the shifted geometric mean, s: times far below it count as equal.
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
@@ -39,13 +43,18 @@ def title(method: str, settings: str = "default") -> str:
 
 
 def is_study(slug: str) -> bool:
-    """Whether settings are those of an ablation study, whose rows have a table of their own."""
+    """Whether settings are those of an ablation study."""
     return slug == STUDY or slug.startswith(f"{STUDY}-")
 
 
+def is_apart(slug: str) -> bool:
+    """Whether rows with these settings stand in a table of their own alone."""
+    return is_study(slug) or slug.startswith(START)
+
+
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that the tables are about: the test instances if there are any, else all; no study."""
-    frame = frame[~frame["settings"].map(is_study).astype(bool)]
+    """The rows that the tables are about: the test instances if there are any, else all."""
+    frame = frame[~frame["settings"].map(is_apart).astype(bool)]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
 

@@ -20,6 +20,7 @@ from ded_bench.bench.layout import (
     LOADED_TIMES,
     MODELS,
     RATES,
+    STARTS,
     TABLE_V,
     TABLE_VI,
     TIMING,
@@ -28,6 +29,7 @@ from ded_bench.bench.layout import (
     WORST,
 )
 from ded_bench.bench.metrics import (
+    SAME,
     TIME_SHIFT_S,
     claims,
     groups,
@@ -52,7 +54,14 @@ from ded_bench.bench.paper import paper_numbers, table_v, table_vi
 from ded_bench.bench.pool import Workers
 from ded_bench.bench.results import Results
 from ded_bench.bench.selection import first_settings
-from ded_bench.bench.studies import ROLLOUTS, ablation_table, main_rows, model_table, training_table
+from ded_bench.bench.studies import (
+    ROLLOUTS,
+    ablation_table,
+    main_rows,
+    model_table,
+    starts_table,
+    training_table,
+)
 from ded_bench.bench.tables import Column, to_latex, to_markdown
 from ded_bench.bench.timing import latest_host, read_timing, timing_frame
 from ded_bench.problem.case import Case
@@ -117,6 +126,7 @@ def _frames(
         "training": training_table(folder, [c.name for c in TRAINING[1:-1]]),
         "models": model_table(overview),
         "ablation": ablation_table(overall, folder),
+        "starts": starts_table(everything),
     }
     if len(everything) > len(frame):
         frames["summary_all"] = overall
@@ -161,6 +171,7 @@ PRINTED: dict[str, Sequence[Column]] = {
     "training": TRAINING,
     "models": MODELS,
     "ablation": ABLATION,
+    "starts": STARTS,
 }
 
 
@@ -235,6 +246,12 @@ def _details(
     if "summary_all" in frames:
         all_rows = frames["summary_all"]
         blocks += [Table(all_rows, GAPS, "Gap to DED, %, over all rows, training instances included")]
+    if len(frames["starts"]):
+        caption = (
+            "Full DED from other starting points: the optimum that IPOPT claims against that from the cold "
+            f"start (the same: within {SAME:g} of its objective)"
+        )
+        blocks.append(Table(frames["starts"], STARTS, caption))
     blocks += [Heading("Times")]
     if len(timing):
         ordered = pd.concat([rows for *_, rows in groups(timing)])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.bench.metrics import GROUP, REFERENCE, STUDY, is_study, title
+from ded_bench.bench.metrics import GROUP, REFERENCE, SAME, START, STUDY, is_study, title
 from ded_bench.bench.results import Key, Results
 from ded_bench.koopman.data import trajectories
 from ded_bench.koopman.fit import rollout_table
@@ -72,6 +72,37 @@ def ablation_table(overview: pd.DataFrame, folder: Path) -> pd.DataFrame:
     )
 
 
+def starts_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Full DED from other starting points against its cold start: are the optima that IPOPT claims the same?
+
+    Differences are of the solver's objectives, which the scorer's errors do not blur.
+    """
+    rows = frame[frame["method"] == REFERENCE[0]].dropna(subset=["solver_objective"])
+    cold = rows[rows["settings"] == REFERENCE[1]]
+    table = []
+    others = rows[rows["settings"].str.startswith(START)]
+    for (regime, settings), group in others.groupby(["regime", "settings"], sort=False):
+        pairs = group.merge(cold, on=["regime", "instance"], suffixes=("", "_cold"))
+        change = pairs["solver_objective"] / pairs["solver_objective_cold"] - 1.0
+        table.append(
+            {
+                "regime": regime,
+                "start": str(settings).removeprefix(START),
+                "n": len(pairs),
+                "same": int((change.abs() <= SAME).sum()),
+                "lowest_percent": 100.0 * change.min(),
+                "highest_percent": 100.0 * change.max(),
+                "iterations": pairs["iterations"].median(),
+                "iterations_cold": pairs["iterations_cold"].median(),
+            }
+        )
+    return pd.DataFrame(table, columns=STARTS)
+
+
+STARTS = (
+    *("regime", "start", "n", "same", "lowest_percent", "highest_percent"),
+    *("iterations", "iterations_cold"),
+)
 SHOWN = (
     "n",
     *(f"gap_percent_{part}" for part in ("mean", "p95", "max")),

@@ -23,7 +23,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from ded_bench.bench.environment import host, now, version
-from ded_bench.bench.metrics import is_study, quartiles
+from ded_bench.bench.metrics import is_apart, quartiles
 from ded_bench.bench.pool import Workers
 from ded_bench.bench.results import LARGEST, Key, read_table
 from ded_bench.bench.tasks import failed
@@ -193,7 +193,7 @@ def runs_of(
         found.setdefault((key.method, key.settings), set()).add(key.regime)
     runs = []
     for method in methods:
-        for slug in sorted(slug for name, slug in found if name == method and not is_study(slug)):
+        for slug in sorted(slug for name, slug in found if name == method and not is_apart(slug)):
             known = methods[method].settings
             choices = [
                 dataclasses.replace(settings, name=name, model=model) for name in known for model in MODELS

@@ -28,7 +28,7 @@ from ded_bench.bench.figures import (
     worst_figure,
 )
 from ded_bench.bench.gallery import rollout
-from ded_bench.bench.metrics import GROUP, is_study, title
+from ded_bench.bench.metrics import GROUP, is_apart, title
 from ded_bench.koopman.physics import linear_model
 from ded_bench.methods import METHODS
 from ded_bench.problem.case import Case
@@ -195,7 +195,7 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
 def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
     """Every method with every setting it has: one entry each in the legend, which covers nothing."""
     keys = [(name, settings) for name, method in METHODS.items() for settings in method.settings]
-    keys = [key for key in keys if not is_study(key[1])]
+    keys = [key for key in keys if not is_apart(key[1])]
     points = pd.DataFrame(
         [
             (regime, *key, title(*key), 100, 1.0, 0.01 * i, 10.0 ** (-i / 4), True)

@@ -17,6 +17,7 @@ from ded_bench.bench.studies import (
     model_table,
     rollout_errors,
     split_slug,
+    starts_table,
     training_table,
 )
 from ded_bench.koopman.physics import linear_model
@@ -83,6 +84,38 @@ def test_ablation_says_what_differs_and_what_it_cost(table: pd.DataFrame, tmp_pa
     assert rows["seconds"].to_list()[:2] == [7.0, 10.0]
     assert rows["seconds"].isna().to_list() == [False, False, True]  # no such policy in the folder
     assert not len(ablation_table(summary(frame_of(row("a", "ded", 1.0))), tmp_path))
+
+
+def test_starting_points_are_compared_by_what_the_solver_says() -> None:
+    """Instance a: the same optimum; b: a better one; c: none from this start; d: none from the cold one."""
+    frame = frame_of(
+        row("a", "ded", 9.0, solver_objective=100.0, iterations=40),
+        row("b", "ded", 9.0, solver_objective=100.0, iterations=60),
+        row("c", "ded", 9.0, solver_objective=100.0, iterations=50),
+        row("a", "ded", 9.0, settings="start-ed", solver_objective=100.00001, iterations=30),
+        row("b", "ded", 9.0, settings="start-ed", solver_objective=99.0, iterations=20),
+        row("c", "ded", settings="start-ed"),
+        row("d", "ded", 9.0, settings="start-ed", solver_objective=50.0),
+        row("a", "ded", 9.0, settings="accelerated", solver_objective=100.0),
+        row("a", "ded-ko", 9.0, solver_objective=100.0),
+    )
+    found = starts_table(frame).to_dict("records")
+    assert len(found) == 1
+    assert found[0] | {"lowest_percent": 0, "highest_percent": 0} == {
+        "regime": "TO",
+        "start": "ed",
+        "n": 2,
+        "same": 1,
+        "lowest_percent": 0,
+        "highest_percent": 0,
+        "iterations": 25.0,
+        "iterations_cold": 50.0,
+    }
+    assert found[0]["lowest_percent"] == pytest.approx(-1.0)
+    assert found[0]["highest_percent"] == pytest.approx(1e-5)
+    assert set(judged_rows(frame)["settings"]) == {"default", "accelerated"}
+    assert not len(starts_table(frame_of()))
+    assert not len(starts_table(frame_of(row("a", "ded-ko", 1.0))))
 
 
 def test_training_table_names_files_that_cannot_be_read(tmp_path: Path) -> None:

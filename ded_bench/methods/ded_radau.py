@@ -27,7 +27,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.swing import Network
 
 #: Mean length of an element in s, by settings slug.
-SETTINGS = {"default": 0.25, "1s": 1.0, "500ms": 0.5, "100ms": 0.1}
+SETTINGS = {"default": 0.2, "1s": 1.0, "500ms": 0.5, "100ms": 0.1}
 #: Collocation points of the Radau IIA method with three stages, as fractions of an element, and the
 #: weights of its quadrature (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.5).
 POINTS = (0.4 - 6**0.5 / 10, 0.4 + 6**0.5 / 10, 1.0)

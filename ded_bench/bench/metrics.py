@@ -27,8 +27,6 @@ SUCCESS = (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)
 STUDY = "study"
 #: Settings whose name starts so solve full DED from another starting point.
 START = "start-"
-#: Optima whose objectives differ by less are the same; relative. IPOPT's tolerance leaves 1e-8.
-SAME = 1e-6
 #: Shift of the shifted geometric mean, s: times far below it count as equal.
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")

@@ -29,7 +29,6 @@ from ded_bench.bench.layout import (
     WORST,
 )
 from ded_bench.bench.metrics import (
-    SAME,
     TIME_SHIFT_S,
     claims,
     groups,
@@ -56,6 +55,7 @@ from ded_bench.bench.results import Results
 from ded_bench.bench.selection import first_settings
 from ded_bench.bench.studies import (
     ROLLOUTS,
+    SAME,
     ablation_table,
     main_rows,
     model_table,

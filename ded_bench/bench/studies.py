@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.bench.metrics import GROUP, REFERENCE, SAME, START, STUDY, is_study, title
+from ded_bench.bench.metrics import GROUP, REFERENCE, START, STUDY, is_study, title
 from ded_bench.bench.results import Key, Results
 from ded_bench.koopman.data import trajectories
 from ded_bench.koopman.fit import rollout_table
@@ -26,6 +26,8 @@ from ded_bench.problem.strict import write_atomically
 
 #: Beside the models: their errors under the schedules of full DED.
 ROLLOUTS = "ded.errors.csv"
+#: Optima whose objectives differ by less are the same; relative. IPOPT's tolerance leaves 1e-8.
+SAME = 1e-6
 
 
 def split_slug(slug: str) -> tuple[str, str]:

@@ -58,7 +58,7 @@ class Network:
     def __init__(self, case: Case) -> None:
         index = {bus.id: i for i, bus in enumerate(case.buses)}
         voltage = np.array([bus.v for bus in case.buses])
-        ends = np.array([[index[line.from_bus], index[line.to_bus]] for line in case.lines])
+        self.ends = ends = np.array([[index[line.from_bus], index[line.to_bus]] for line in case.lines])
         impedance = np.array([abs(complex(line.r, line.x)) for line in case.lines])
         self.case = case
         self.n_bus = len(case.buses)

@@ -31,7 +31,7 @@ from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.truth.swing import Network, PowerFlowError
 
 HORIZON = 4.0
 
@@ -117,6 +117,20 @@ def sequential_loss(case, model, instance, knots, bound, ramp):
             psi = k @ (psi - b @ now) + b @ now + g @ (following - now)
     total[5] = Q_INITIAL * (powers[0] - torch.as_tensor(instance.p_initial(case))).square().sum()
     return total
+
+
+def test_features_hold_the_power_flow_or_say_that_there_is_none(case: Case) -> None:
+    """The compiled one is Newton's method with the same tolerance: 1e-12 pu, some 1e-12 rad."""
+    network, knots = Network(case), knot_times(HORIZON, N_KNOTS)
+    instances = [sample_instance(case, 5, i) for i in range(50)]
+    features = Features.of(network, instances, knots)
+    theta = network.power_flow(features.p_initial, features.p_load[:, 0])[:, network.unknown]
+    np.testing.assert_allclose(features.state[:, : theta.shape[1]], theta, rtol=0, atol=1e-11)
+    power = {bus: 40.0 for bus in case.generators}
+    initial = instances[1].initial.model_copy(update={"power": power})
+    instances[1] = instances[1].model_copy(update={"initial": initial})
+    with pytest.raises(PowerFlowError, match="no solution"):
+        Features.of(network, instances, knots)
 
 
 def test_condensed_loss_equals_the_sequential_one_in_values_and_gradients(case: Case) -> None:

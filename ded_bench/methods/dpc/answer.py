@@ -7,15 +7,12 @@ from typing import Protocol
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from ded_bench.methods.dpc.kernels import compiled
+from ded_bench.methods.dpc.kernels import Indices, compiled
 from ded_bench.methods.solution import Solution, Solver, Status
 from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-
-Indices = NDArray[np.int64]
 
 
 class KnotPolicy(Protocol):

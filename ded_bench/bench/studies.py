@@ -98,7 +98,7 @@ def starts_table(frame: pd.DataFrame) -> pd.DataFrame:
                 "iterations_cold": pairs["iterations_cold"].median(),
             }
         )
-    return pd.DataFrame(table, columns=STARTS)
+    return pd.DataFrame(table, columns=STARTS).sort_values("regime", kind="stable", ignore_index=True)
 
 
 STARTS = (

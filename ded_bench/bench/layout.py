@@ -45,6 +45,14 @@ RATES = (
     Column("correct_rate", "feasible (verified)", ".1%"),
     Column("strict_rate", "strictly feasible (verified)", ".1%"),
 )
+COVERAGE = (
+    *RATES,
+    Column("failures", "failures"),
+    Column("gap_percent_mean", "gap mean (%)"),
+    Column("gap_percent_max", "gap max (%)"),
+    Column("freq_violation_hz_mean", "frequency mean (Hz)"),
+    Column("freq_violation_hz_max", "frequency max (Hz)"),
+)
 VIOLATIONS = (
     *_HEAD,
     *(Column(f"freq_violation_hz_{part}", f"frequency {heading} (Hz)") for part, heading in _SPREAD),

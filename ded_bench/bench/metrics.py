@@ -57,6 +57,14 @@ def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
     return test if len(test) else frame
 
 
+def beyond(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a summary of everything whose methods have more rows than the summary of the judged rows."""
+    judged = overview.set_index(GROUP)["rows"]
+    told = judged.reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0).to_numpy()
+    apart = overall["settings"].map(is_apart).to_numpy(dtype=bool)
+    return overall[(overall["rows"].to_numpy() > told) & ~apart].reset_index(drop=True)
+
+
 def gaps(frame: pd.DataFrame) -> pd.DataFrame:
     """Signed gap of every row to DED, both re-simulated.
 

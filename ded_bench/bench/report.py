@@ -15,6 +15,7 @@ from ded_bench.bench.layout import (
     ABLATION,
     CERTIFICATE,
     CLAIMS,
+    COVERAGE,
     EXPLANATION,
     GAPS,
     LOADED_TIMES,
@@ -30,6 +31,7 @@ from ded_bench.bench.layout import (
 )
 from ded_bench.bench.metrics import (
     TIME_SHIFT_S,
+    beyond,
     claims,
     groups,
     judged_rows,
@@ -128,9 +130,7 @@ def _frames(
         "ablation": ablation_table(overall, folder),
         "starts": starts_table(everything),
     }
-    if len(everything) > len(frame):
-        frames["summary_all"] = overall
-    return frames
+    return frames | {"coverage": beyond(overall, overview)}
 
 
 def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
@@ -172,6 +172,7 @@ PRINTED: dict[str, Sequence[Column]] = {
     "models": MODELS,
     "ablation": ABLATION,
     "starts": STARTS,
+    "coverage": COVERAGE,
 }
 
 
@@ -243,9 +244,9 @@ def _details(
         Table(frames["claims"], CLAIMS, "Solver status against the scorer's verdict, rows"),
         Table(frames["summary"], VIOLATIONS, "Largest violation of each schedule"),
     ]
-    if "summary_all" in frames:
-        all_rows = frames["summary_all"]
-        blocks += [Table(all_rows, GAPS, "Gap to DED, %, over all rows, training instances included")]
+    if len(frames["coverage"]):
+        caption = "Methods that were run on training instances too: all their rows"
+        blocks.append(Table(frames["coverage"], COVERAGE, caption))
     if len(frames["starts"]):
         caption = (
             "Full DED from other starting points: the optimum that IPOPT claims against that from the cold "

@@ -11,6 +11,7 @@ import pytest
 
 from ded_bench.bench.metrics import (
     TIME_SHIFT_S,
+    beyond,
     claims,
     gaps,
     groups,
@@ -179,6 +180,25 @@ def test_only_test_rows_count_if_there_are_any() -> None:
     assert judged_rows(mixed)["instance"].to_list() == ["a"]
     others = mixed[mixed["split"] != "test"]
     assert len(judged_rows(others)) == 2
+
+
+def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
+    everything = frame_of(
+        row("a", "ded", 1.0),
+        row("b", "ded", 2.0, split="train", freq_violation_hz=3e-4, feasible=False),
+        row("c", "ded", split="train"),
+        row("a", "ed", 3.0),
+        row("b", "ded", 2.0, split="train", settings="start-ed"),
+    )
+    judged = judged_rows(everything)
+    covered = beyond(summary(everything), summary(judged))
+    assert covered[["method", "settings", "rows", "failures"]].to_numpy().tolist() == [
+        ["ded", "default", 3, 1]
+    ]
+    assert covered["correct_rate"].item() == pytest.approx(1 / 3)
+    assert covered["freq_violation_hz_max"].item() == 3e-4
+    assert not len(beyond(summary(judged), summary(judged)))
+    assert not len(beyond(summary(everything.iloc[:0]), summary(everything.iloc[:0])))
 
 
 def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:

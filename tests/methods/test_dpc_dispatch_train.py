@@ -15,6 +15,7 @@ from ded_bench.methods.dpc.ded_dpc import SETTINGS, DispatchPolicy
 from ded_bench.methods.dpc.ded_dpc_train import train
 from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs, sequence_groups
+from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.problem.case import Case
 from tests.methods.test_dpc_dispatch import some_instances, tensors
 
@@ -24,6 +25,12 @@ def short_training(case: Case, out: Path, **options: object) -> DispatchPolicy:
     defaults = {"seed": 3, "epochs": 6, "fresh": 300}
     regime = next(iter(case.regimes))
     return train(case, regime, some_instances(case, 10), linear_model(case), out, **(defaults | options))
+
+
+def history_of(case: Case, out: Path, **options: object) -> pd.Series:
+    """Held-out losses of a training of three epochs."""
+    short_training(case, out, epochs=3, **options)
+    return pd.read_csv(out.with_suffix(".history.csv"))["held out"]
 
 
 def test_training_beats_the_static_dispatch_and_repeats(threebus: Case, tmp_path: Path) -> None:
@@ -66,10 +73,26 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 def test_training_on_a_gpu_gives_the_same_losses(threebus: Case, tmp_path: Path) -> None:
-    histories = []
-    for device in ("cpu", "cuda"):
-        short_training(threebus, tmp_path / f"{device}.safetensors", device=device, epochs=3)
-        histories.append(pd.read_csv(tmp_path / f"{device}.history.csv")["held out"])
+    histories = [
+        history_of(threebus, tmp_path / f"{device}.safetensors", device=device) for device in ("cpu", "cuda")
+    ]
+    np.testing.assert_allclose(histories[0], histories[1], rtol=1e-4)
+
+
+def test_rounding_otherwise_leaves_the_losses_the_same(
+    threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What another device's order of summation does, some float32 epsilons, must not grow in training."""
+    histories = [history_of(threebus, tmp_path / "a.safetensors")]
+    powers, noise = ded_dpc_train.Loss.powers, torch.Generator().manual_seed(1)
+
+    def rounded(self: ded_dpc_train.Loss, network: StagedNetwork, pool: ded_dpc_train.Pool) -> torch.Tensor:
+        exact = powers(self, network, pool)
+        return exact * (1.0 + 1e-6 * torch.randn(exact.shape, generator=noise))
+
+    monkeypatch.setattr(ded_dpc_train.Loss, "powers", rounded)
+    histories.append(history_of(threebus, tmp_path / "b.safetensors"))
+    assert not histories[0].equals(histories[1])
     np.testing.assert_allclose(histories[0], histories[1], rtol=1e-4)
 
 

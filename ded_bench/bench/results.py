@@ -76,6 +76,11 @@ class Row:
         """The scorer has spoken, or has failed and said why."""
         return self.objective is not None or bool(self.error)
 
+    @functools.cached_property
+    def line(self) -> str:
+        """The row as a line of CSV, kept: the whole table is written whenever a row is added."""
+        return _line([_format(value) for value in _cells(self)])
+
 
 #: No number of the table is larger unless the file is damaged; sums and ratios then stay finite.
 LARGEST = 1e15
@@ -154,13 +159,7 @@ class Results:
 
 def format_rows(rows: Iterable[Row]) -> str:
     """Rows as CSV text; floats keep every digit, missing values are empty."""
-    return _line(COLUMNS) + "".join(map(_row_line, rows))
-
-
-@functools.lru_cache(maxsize=1 << 16)
-def _row_line(row: Row) -> str:
-    """A row's line, kept: the whole table is written whenever a row is added."""
-    return _line([_format(getattr(row, name)) for name in COLUMNS])
+    return _line(COLUMNS) + "".join(row.line for row in rows)
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -19,6 +19,7 @@ from ded_bench.methods import get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.score import Score
 
 #: Schedules scored side by side in one task; more gains little, fewer costs overhead.
@@ -122,10 +123,11 @@ def _score(
     case: Case, tasks: Sequence[Task], results: Results, pool: Workers, on_row: Callable[[Row], None]
 ) -> None:
     batches = list(_batches(tasks))
-    calls = []
-    for batch in batches:
-        schedules = [results.schedule(task.key, case, task.instance) for task in batch]
-        calls.append((score_tasks, (case, batch, schedules)))
+
+    def schedules(batch: Sequence[Task]) -> list[Schedule]:
+        return [results.schedule(task.key, case, task.instance) for task in batch]
+
+    calls = ((score_tasks, (case, batch, schedules(batch))) for batch in batches)  # read as they are needed
     with tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
             rows = []

@@ -16,7 +16,7 @@ import pyomo.environ as pyo
 from ded_bench.methods.ded_sequential import SequentialDed
 from ded_bench.methods.ded_start import STARTS
 from ded_bench.methods.solution import Settings, Solution, Solver, Status
-from ded_bench.methods.solvers import Compiled, Outcome, compile_model
+from ded_bench.methods.solvers import Compiled, Outcome, compile_model, fix
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -271,18 +271,6 @@ def _start(
     for variable, bus, column in wanted:
         for t, value in zip(times, column.tolist(), strict=True):
             variable[t if bus is None else (bus, t)].set_value(value, skip_validation=True)
-
-
-def fix(variable: pyo.Var, value: float) -> None:
-    """Make a variable data: fixed by equal bounds."""
-    reset(variable, value, value, value)
-
-
-def reset(variable: pyo.Var, value: float, lower: float | None = None, upper: float | None = None) -> None:
-    """Set a variable's value and bounds."""
-    variable.setlb(lower)
-    variable.setub(upper)
-    variable.set_value(value, skip_validation=True)
 
 
 def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:

@@ -14,7 +14,7 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.store import find_model
 from ded_bench.methods.ipopt import LINEAR_OPTIONS
 from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solvers import Compiled, compile_model
+from ded_bench.methods.solvers import Compiled, compile_model, fix, reset
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
@@ -158,33 +158,23 @@ def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: I
     psi = koopman.initial(Network(case), [instance])[0].tolist()
     bound = case.omega_bound(regime)
     n_gen = len(case.generators)
-    _fix(m.cost_slack, instance.cost_slack(case))
+    fix(m.cost_slack, instance.cost_slack(case))
     for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
         for k, value in enumerate(column):
-            _fix(m.p_load[bus, k], value)
+            fix(m.p_load[bus, k], value)
     for i, value in enumerate(psi):
         limit = bound if i < n_gen else None
         for k in m.point:
-            _reset(m.psi[i, k], value, None if limit is None else -limit, limit)
-        _fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies
+            reset(m.psi[i, k], value, None if limit is None else -limit, limit)
+        fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies
     for g, value in zip(case.generators, instance.p_initial(case).tolist(), strict=True):
-        _fix(m.cost[g], instance.cost[g])
+        fix(m.cost[g], instance.cost[g])
         for k in m.point:
-            _reset(m.p_gen[g, k], value, case.machines[g].p_min, case.machines[g].p_max)
-        _fix(m.p_gen[g, 0], value)
+            reset(m.p_gen[g, k], value, case.machines[g].p_min, case.machines[g].p_max)
+        fix(m.p_gen[g, 0], value)
     for k in m.point:
         m.p_slack_up[k].set_value(max(psi[n_gen], 0.0), skip_validation=True)
         m.p_slack_down[k].set_value(max(-psi[n_gen], 0.0), skip_validation=True)
-
-
-def _fix(variable: pyo.Var, value: float) -> None:
-    _reset(variable, value, value, value)
-
-
-def _reset(variable: pyo.Var, value: float, lower: float | None, upper: float | None) -> None:
-    variable.setlb(lower)
-    variable.setub(upper)
-    variable.set_value(value, skip_validation=True)
 
 
 def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:

@@ -18,9 +18,9 @@ import pyomo.dae as dae
 import pyomo.environ as pyo
 from numpy.typing import NDArray
 
-from ded_bench.methods.ded import answer, fix, injections, power_limits, reset
+from ded_bench.methods.ded import answer, injections, power_limits
 from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solvers import Compiled, compile_model
+from ded_bench.methods.solvers import Compiled, compile_model, fix, reset
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

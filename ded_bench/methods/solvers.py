@@ -36,6 +36,8 @@ __all__ = [
     "GrowingProgram",
     "Outcome",
     "compile_model",
+    "fix",
+    "reset",
     "solve_form",
 ]
 
@@ -53,6 +55,18 @@ _HIGHS_STATUS = {
     highspy.HighsModelStatus.kInfeasible: Status.INFEASIBLE,
     highspy.HighsModelStatus.kTimeLimit: Status.TIME_LIMIT,
 }
+
+
+def fix(variable: pyo.Var, value: float) -> None:
+    """Make a variable data: fixed by equal bounds."""
+    reset(variable, value, value, value)
+
+
+def reset(variable: pyo.Var, value: float, lower: float | None = None, upper: float | None = None) -> None:
+    """Set a variable's value and bounds."""
+    variable.setlb(lower)
+    variable.setub(upper)
+    variable.set_value(value, skip_validation=True)
 
 
 class Piqp:

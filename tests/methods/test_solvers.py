@@ -13,15 +13,10 @@ from pyomo.opt import TerminationCondition
 
 from ded_bench.methods.linear import read_linear
 from ded_bench.methods.solution import Status
-from ded_bench.methods.solvers import SOLVERS, compile_model
+from ded_bench.methods.solvers import SOLVERS, compile_model, fix
 from ded_bench.problem.errors import InputError
 
 LINEAR = ("ipopt", "piqp", "highs")
-
-
-def fix(variable: pyo.Var, value: float) -> None:
-    variable.setlb(value)
-    variable.setub(value)
 
 
 def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.ConcreteModel:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
-from scipy.integrate import cumulative_simpson, solve_ivp
+from scipy.integrate import OdeSolver, cumulative_simpson, solve_ivp
 from scipy.linalg import expm
 
 from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import sample_instance, sample_instances
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.simulate import SimulationError, bends, simulate, simulate_many
+from ded_bench.truth.simulate import SimulationError, _Run, bends, simulate, simulate_many
 from ded_bench.truth.swing import Network
 
 
@@ -292,6 +294,21 @@ def test_simulating_twice_gives_the_same_bits(case, alter):
 
 
 # Refusals.
+
+
+@pytest.mark.parametrize("every", [1, 100])
+def test_a_simulation_leaves_no_garbage(threebus, every):
+    """Arrays of a whole batch would stay until a collection, which is rare beside a large model."""
+    instance = sample_instance(threebus, 3, 0)
+    knots = instance.grid[::every]  # short steps between all grid points, or long ones
+    p = threebus.p_nominal + 1e-3 * np.sin(knots)[:, None]
+    gc.collect()
+    gc.disable()
+    try:
+        simulate(threebus, instance, Schedule(knots, p))
+        assert not [o for o in gc.get_objects() if issubclass(type(o), _Run | OdeSolver)]
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize("power", [20.0, -20.0, 1e6, 1e308])

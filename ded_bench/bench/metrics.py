@@ -62,7 +62,8 @@ def beyond(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
     judged = overview.set_index(GROUP)["rows"]
     told = judged.reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0).to_numpy()
     apart = overall["settings"].map(is_apart).to_numpy(dtype=bool)
-    return overall[(overall["rows"].to_numpy() > told) & ~apart].reset_index(drop=True)
+    more: pd.DataFrame = overall[(overall["rows"].to_numpy() > told) & ~apart]
+    return more.reset_index(drop=True)
 
 
 def gaps(frame: pd.DataFrame) -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -114,7 +115,7 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
         assert row.objective > 0
         assert 0 < row.solve_s < 5
         cheaper = {"method": "ded", "objective": row.objective / 1.02}
-        results.add([type(row)(**(vars(row) | cheaper))])
+        results.add([dataclasses.replace(row, **cheaper)])
     monkeypatch.syspath_prepend(site)
     bench = (
         "bench",

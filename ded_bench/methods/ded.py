@@ -15,6 +15,7 @@ import pyomo.environ as pyo
 
 from ded_bench.methods.ded_sequential import SequentialDed
 from ded_bench.methods.ded_start import STARTS
+from ded_bench.methods.linear import assign
 from ded_bench.methods.solution import Settings, Solution, Solver, Status
 from ded_bench.methods.solvers import Compiled, Outcome, compile_model, fix
 from ded_bench.problem.case import Array, Case
@@ -222,20 +223,22 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     network = Network(case)
     angles = network.initial_angles(instance)
     p_initial, omega_initial = instance.p_initial(case), instance.omega_initial(case)
-    bound, times = case.omega_bound(regime), list(m.t)
+    bound, along = case.omega_bound(regime), _along_time(m)
     for g in case.generators:
         fix(m.cost[g], instance.cost[g])
     fix(m.cost_slack, instance.cost_slack(case))
-    for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
-        for t, value in zip(times, column, strict=True):
-            fix(m.p_load[bus, t], value)
-    for g in case.generators:
-        for t in times:
-            m.omega[g, t].setlb(-bound)
-            m.omega[g, t].setub(bound)
-    points = (len(times), 1)
-    still = np.zeros((len(times), len(case.generators)))
-    slack = np.tile(network.injections(angles)[network.slack], len(times))
+    p_load = instance.p_load(case)
+    for variables, column in zip(along["p_load"], p_load.T.tolist(), strict=True):
+        for variable, value in zip(variables, column, strict=True):
+            fix(variable, value)
+    for variables in along["omega"]:
+        if variables[-1].ub != bound:
+            for variable in variables:
+                variable.setlb(-bound)
+                variable.setub(bound)
+    points = (len(p_load), 1)
+    still = np.zeros((len(p_load), len(case.generators)))
+    slack = np.tile(network.injections(angles)[network.slack], len(p_load))
     _start(m, case, np.tile(angles, points), still, np.tile(p_initial, points), slack)
     for j, g in enumerate(case.generators):
         fix(m.p_gen[g, 0], float(p_initial[j]))
@@ -257,23 +260,33 @@ def _start(
     m: pyo.ConcreteModel, case: Case, theta: Array, omega: Array, p_gen: Array, p_slack: Array
 ) -> None:
     """Set the values of all variables but the data; rows are points, columns buses or generators."""
-    network = Network(case)
-    slack = np.column_stack([np.maximum(p_slack, 0.0), np.maximum(-p_slack, 0.0)])
-    wanted = [
-        *((m.theta, g, column) for g, column in zip(m.gen, theta[:, network.generators].T, strict=True)),
-        *((m.omega, g, column) for g, column in zip(m.gen, omega.T, strict=True)),
-        *((m.p_gen, g, column) for g, column in zip(m.gen, p_gen.T, strict=True)),
-        *((m.angle, i, column) for i, column in zip(m.algebraic, theta[:, network.algebraic].T, strict=True)),
-        (m.p_slack_up, None, slack[:, 0]),
-        (m.p_slack_down, None, slack[:, 1]),
-    ]
-    times = list(m.t)
-    for variable, bus, column in wanted:
-        for t, value in zip(times, column.tolist(), strict=True):
-            variable[t if bus is None else (bus, t)].set_value(value, skip_validation=True)
+    network, along = Network(case), _along_time(m)
+    wanted = {
+        "theta": theta[:, network.generators],
+        "omega": omega,
+        "p_gen": p_gen,
+        "angle": theta[:, network.algebraic],
+        "p_slack_up": np.maximum(p_slack, 0.0)[:, None],
+        "p_slack_down": np.maximum(-p_slack, 0.0)[:, None],
+    }
+    for name, columns in wanted.items():
+        for variables, column in zip(along[name], columns.T, strict=True):
+            assign(variables, column)
+
+
+@functools.lru_cache(maxsize=1)
+def _along_time(m: pyo.ConcreteModel) -> dict[str, list[list[Any]]]:
+    """The variables of every bus in the order of time: to look one up takes longer than to set it."""
+    times, buses = list(m.t), {"p_load": m.load_bus, "angle": m.algebraic}
+    along = {
+        name: [[m.component(name)[bus, t] for t in times] for bus in buses.get(name, m.gen)]
+        for name in ("p_load", "theta", "omega", "p_gen", "angle")
+    }
+    slack = {name: [[m.component(name)[t] for t in times]] for name in ("p_slack_up", "p_slack_down")}
+    return along | slack
 
 
 def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:
     """Read the generator powers of a solved model as a schedule on the instance's grid."""
-    values: Array = np.array([[m.p_gen[g, t].value for g in case.generators] for t in m.t])
-    return Schedule(t=instance.grid, p=values)
+    values: Array = np.array([[v.value for v in variables] for variables in _along_time(m)["p_gen"]])
+    return Schedule(t=instance.grid, p=values.T)

@@ -100,8 +100,8 @@ class LinearProgram:
 
 def bounds(columns: Sequence[Any]) -> Array:
     """Lower and upper bounds of Pyomo variables, shape (2, n); infinite where there are none."""
-    pairs = np.array([v.bounds for v in columns], dtype=float).reshape(-1, 2)  # None becomes NaN
-    return np.where(np.isnan(pairs), [-np.inf, np.inf], pairs).T.copy()
+    both = np.array([[v.lb for v in columns], [v.ub for v in columns]], dtype=float)  # None becomes NaN
+    return np.where(np.isnan(both), [[-np.inf], [np.inf]], both)
 
 
 def assign(columns: Sequence[Any], values: Array) -> None:

@@ -232,7 +232,7 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
         for variable, value in zip(variables, column, strict=True):
             fix(variable, value)
     for variables in along["omega"]:
-        if variables[-1].ub != bound:
+        if variables[-1].ub != bound:  # the model was set to another regime before
             for variable in variables:
                 variable.setlb(-bound)
                 variable.setub(bound)

@@ -181,9 +181,8 @@ class _Run:
         self._theta[last] = self._ends[-1][1]
         self.omega[last] = solver.y.reshape(2, *self.omega.shape[1:])[1]
         self._whole[last] = True
-        vars(
-            solver
-        ).clear()  # it refers to itself, and would keep this run's arrays until garbage is collected
+        # It refers to itself, and would keep this run's arrays until Python collects garbage.
+        vars(solver).clear()
 
     def _keep(self, points: slice, states: Callable[[Array], Array]) -> None:
         """Keep what a dense output says at grid points; the loads' angles are solved for in the end."""

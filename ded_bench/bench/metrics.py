@@ -57,7 +57,7 @@ def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
     return test if len(test) else frame
 
 
-def beyond(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
+def coverage(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
     """Rows of a summary of everything whose methods have more rows than the summary of the judged rows."""
     judged = overview.set_index(GROUP)["rows"]
     told = judged.reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0).to_numpy()

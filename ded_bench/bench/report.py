@@ -31,8 +31,8 @@ from ded_bench.bench.layout import (
 )
 from ded_bench.bench.metrics import (
     TIME_SHIFT_S,
-    beyond,
     claims,
+    coverage,
     groups,
     judged_rows,
     summary,
@@ -130,7 +130,7 @@ def _frames(
         "ablation": ablation_table(overall, folder),
         "starts": starts_table(everything),
     }
-    return frames | {"coverage": beyond(overall, overview)}
+    return frames | {"coverage": coverage(overall, overview)}
 
 
 def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:

@@ -44,10 +44,12 @@ class Schedule:
 
     def write(self, path: Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""
+        text = io.StringIO()
         header = ",".join(["t", *(f"P_{g}" for g in generators)])
-        line = ",".join(["%.15g"] * (1 + len(generators))) + "\n"
-        numbers = np.column_stack([self.t, self.p]).ravel().tolist()
-        data = f"{header}\n{line * len(self.t) % tuple(numbers)}".encode()
+        np.savetxt(
+            text, np.column_stack([self.t, self.p]), fmt="%.15g", delimiter=",", header=header, comments=""
+        )
+        data = text.getvalue().encode()
         write_atomically(path, gzip.compress(data, 3, mtime=0) if path.suffix == ".gz" else data)
 
     @staticmethod

@@ -11,8 +11,8 @@ import pytest
 
 from ded_bench.bench.metrics import (
     TIME_SHIFT_S,
-    beyond,
     claims,
+    coverage,
     gaps,
     groups,
     judged_rows,
@@ -191,14 +191,14 @@ def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
         row("b", "ded", 2.0, split="train", settings="start-ed"),
     )
     judged = judged_rows(everything)
-    covered = beyond(summary(everything), summary(judged))
+    covered = coverage(summary(everything), summary(judged))
     assert covered[["method", "settings", "rows", "failures"]].to_numpy().tolist() == [
         ["ded", "default", 3, 1]
     ]
     assert covered["correct_rate"].item() == pytest.approx(1 / 3)
     assert covered["freq_violation_hz_max"].item() == 3e-4
-    assert not len(beyond(summary(judged), summary(judged)))
-    assert not len(beyond(summary(everything.iloc[:0]), summary(everything.iloc[:0])))
+    assert not len(coverage(summary(judged), summary(judged)))
+    assert not len(coverage(summary(everything.iloc[:0]), summary(everything.iloc[:0])))
 
 
 def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ded_bench.methods.solution import Settings, Solution, Solver, Status
+    from ded_bench.files.errors import InputError
+    from ded_bench.methods.solution import Settings, Solution, Solver
     from ded_bench.problem.benchmark import SplitName
     from ded_bench.problem.case import Case
-    from ded_bench.problem.errors import InputError
     from ded_bench.problem.instance import Instance
     from ded_bench.problem.schedule import Schedule
+    from ded_bench.solvers.status import Status
     from ded_bench.truth.score import Score
     from ded_bench.truth.simulate import SimulationError, Trajectory
 
@@ -43,14 +44,14 @@ __all__ = [
 
 _HOMES = {
     "Case": "ded_bench.problem.case",
-    "InputError": "ded_bench.problem.errors",
+    "InputError": "ded_bench.files.errors",
     "Instance": "ded_bench.problem.instance",
     "Schedule": "ded_bench.problem.schedule",
     "Score": "ded_bench.truth.score",
     "Settings": "ded_bench.methods.solution",
     "SimulationError": "ded_bench.truth.simulate",
     "Solution": "ded_bench.methods.solution",
-    "Status": "ded_bench.methods.solution",
+    "Status": "ded_bench.solvers.status",
     "Trajectory": "ded_bench.truth.simulate",
 }
 
@@ -110,7 +111,7 @@ def solve(
     Raises:
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
-    from ded_bench.koopman.store import search_folders
+    from ded_bench.koopman.surrogates import search_folders
     from ded_bench.methods.solution import Settings
 
     own = _case_of(instance, case)
@@ -144,8 +145,8 @@ def score(instance: Instance, schedule: Schedule, regime: str, case: Case | None
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:
+    from ded_bench.files.errors import InputError
     from ded_bench.problem.case import SHIPPED_CASES
-    from ded_bench.problem.errors import InputError
 
     if case is not None:
         return case
@@ -163,6 +164,6 @@ def _shipped(name: str) -> Case:
 
 @functools.lru_cache(maxsize=8)
 def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    from ded_bench.methods import get_method
+    from ded_bench.methods.registry import get_method
 
     return get_method(method).prepare(case, regime, settings)

@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
+from ded_bench.files.strict import Record, parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.strict import Record, parse_record
 
 #: Generic properties are tested on every case here: the shipped one, and a chain
 #: slack - load - generator whose power flow, load angle and modes have closed forms.

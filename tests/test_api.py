@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import ded_bench
-from ded_bench.methods.solution import Settings, Status
+from ded_bench.files.errors import InputError
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import write_benchmark
+from ded_bench.solvers.status import Status
 from ded_bench.truth import score, simulate
 
 HEAVY = ("casadi", "matplotlib", "pandas", "pyomo", "scipy", "torch")

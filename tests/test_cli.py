@@ -14,13 +14,13 @@ import numpy as np
 import psutil
 import pytest
 
-from ded_bench.bench.results import Results
 from ded_bench.cli import main
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from tests.bench.test_pool import runs, wait_until
+from ded_bench.run.results import Results
 from tests.conftest import CASE_FILES
+from tests.run.test_pool import runs, wait_until
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ded_bench.arguments import parser
-from ded_bench.methods import METHODS
+from ded_bench.cli.commands import parser
+from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import REPOSITORY
 
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]

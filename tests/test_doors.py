@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.bench.metrics import summary
-from ded_bench.bench.paper import table_v, table_vi
-from ded_bench.bench.results import Results
-from ded_bench.bench.timing import read_timing, timing_frame
 from ded_bench.cli import main
+from ded_bench.evaluate.summary import summary
+from ded_bench.evaluate.timing import read_timing, timing_frame
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import write_benchmark
+from ded_bench.report.paper import table_v, table_vi
+from ded_bench.run.results import Results
 
 PYPROJECT = """\
 [project]

@@ -23,22 +23,23 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench import cli
-from ded_bench.bench import run as runner
-from ded_bench.bench.metrics import claims, summary, table_times, worst
-from ded_bench.bench.results import Results, Row, format_rows, read_rows
-from ded_bench.bench.timing import TimingRow, format_timing, read_timing
-from ded_bench.koopman.physics import linear_model
-from ded_bench.methods.dpc import ded_dpc, policy
-from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.cli import commands
+from ded_bench.evaluate.summary import claims, summary, table_times, worst
+from ded_bench.evaluate.timing import TimingRow, format_timing, read_timing
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_record
+from ded_bench.koopman.linear import linear_model
+from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc.store import Scope
+from ded_bench.methods.dpc_paper import paper_policy
+from ded_bench.methods.dpc_paper.paper_loss import knot_times
+from ded_bench.methods.policy_file import Scope
 from ded_bench.problem.case import Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import Manifest, Split
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.strict import write_record
+from ded_bench.run import runner
+from ded_bench.run.results import Results, Row, format_rows, read_rows
 from ded_bench.truth import score as scorer
 from tests.damage import (
     Mutant,
@@ -65,7 +66,7 @@ COUNTS = {
 }
 #: Longer valid instances are read, but not simulated.
 FEW_STEPS = 20
-PARSER = functools.cache(cli.parser)  # making one takes longer than most of these commands
+PARSER = functools.cache(commands.parser)  # making one takes longer than most of these commands
 
 Damaged = Sequence[Callable[[random.Random], Mutant]]
 
@@ -97,11 +98,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     scope = Scope(case, "TO", instance.horizon_s)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        plain = policy.PaperNetwork(policy.n_channels(case), case.p_min, case.p_max)
-        response = Response.make(case, knot_times(instance.horizon_s, ded_dpc.N_KNOTS))
+        plain = paper_policy.PaperNetwork(paper_policy.n_channels(case), case.p_min, case.p_max)
+        response = Response.make(case, knot_times(instance.horizon_s, dpc_policy.N_KNOTS))
         network = StagedNetwork(case, response, 2, 4, (1, 2))
-    policy.Policy(case, "TO", 0.05, plain, {"seed": 0}).save(folder / "paper.safetensors")
-    ded_dpc.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
+    paper_policy.Policy(case, "TO", 0.05, plain, {"seed": 0}).save(folder / "paper.safetensors")
+    dpc_policy.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
     return folder
 
 
@@ -121,7 +122,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     def short(case: Case, instance: Any, schedule: Schedule, regime: str) -> scorer.Score:
         return real(case, instance, schedule, regime) if instance.steps <= FEW_STEPS else nothing
 
-    monkeypatch.setattr(cli, "parser", PARSER)
+    monkeypatch.setattr(commands, "parser", PARSER)
     monkeypatch.setattr(scorer, "score", short)
     monkeypatch.setattr(runner, "run", lambda *_: [])
 
@@ -130,7 +131,7 @@ def end_of(arguments: Sequence[object]) -> tuple[int, str]:
     """Exit code and standard error of a command."""
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
-        code = cli.main([str(argument) for argument in arguments])
+        code = commands.main([str(argument) for argument in arguments])
     return code, errors.getvalue()
 
 

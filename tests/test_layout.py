@@ -14,7 +14,7 @@ import ded_bench
 from ded_bench.problem.case import Case
 
 PACKAGE = Path(ded_bench.__file__).parent
-FLOORS = ("problem", "truth", "koopman", "methods", "bench", "arguments", "cli")
+FLOORS = ("files", "problem", "truth", "koopman", "solvers", "methods", "run", "evaluate", "report", "cli")
 MAX_LINES = 400
 #: What the ground floors may use besides Python's own library: no solver, no model builder, no torch.
 GROUND_LIBRARIES = {"ded_bench", "numpy", "scipy", "pandas", "pydantic", "safetensors"}
@@ -90,13 +90,13 @@ def test_imports_point_down(module):
     ("source", "found"),
     [
         ("import ded_bench.methods.ded", ["ded_bench.methods.ded"]),
-        ("from ded_bench import bench", ["ded_bench.bench"]),
+        ("from ded_bench import run", ["ded_bench.run"]),
         ("from ded_bench.koopman.model import Koopman", ["ded_bench.koopman.model"]),
         ("from ..koopman import model", ["ded_bench.koopman"]),
         ("from .. import cli", ["ded_bench.cli"]),
         ("from ded_bench import score", ["ded_bench.score"]),
         ("def late():\n    from ded_bench.cli import main", ["ded_bench.cli"]),
-        ("from . import swing\nfrom ..problem.case import Case\nimport numpy", []),
+        ("from . import network\nfrom ..problem.case import Case\nimport numpy", []),
         ("from ded_bench.problem import case\nfrom ded_bench import __version__", []),
     ],
 )
@@ -126,7 +126,7 @@ def test_modules_do_not_import_in_circles():
 def test_ground_floors_use_no_solver():
     """The scorer shares nothing with the methods: neither their modules nor their libraries."""
     for name, path in MODULES.items():
-        if floor_of(name) in (FLOORS.index("problem"), FLOORS.index("truth")):
+        if floor_of(name) in map(FLOORS.index, ("files", "problem", "truth")):
             roots = {
                 used.partition(".")[0] for used in imports(ast.parse(path.read_text("utf-8")), name, False)
             }
@@ -178,7 +178,7 @@ def test_nothing_knows_the_nine_buses(module, ninebus: Case):
     """A new grid is one case.json; only the command line may name the shipped case, as a default."""
     source = MODULES[module].read_text(encoding="utf-8")
     found = particular(source, {bus.id for bus in ninebus.buses})
-    if module == "ded_bench.arguments":
+    if module == "ded_bench.cli.arguments":
         found = [text for text in found if "9bus" not in text]
     assert found == []
 

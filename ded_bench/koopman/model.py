@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.problem.arrays import read_arrays, write_arrays
+from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
-from ded_bench.truth.swing import Network
+from ded_bench.truth.network import Network
 
 SCHEMA = "ded-bench/koopman/1"
 #: Numbers in a block of steps of the rollout; larger blocks cost more products than they save turns.

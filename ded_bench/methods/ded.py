@@ -15,14 +15,15 @@ import pyomo.environ as pyo
 
 from ded_bench.methods.ded_sequential import SequentialDed
 from ded_bench.methods.ded_start import STARTS
-from ded_bench.methods.linear import assign
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
-from ded_bench.methods.solvers import Compiled, Outcome, compile_model, fix
+from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.compile import Compiled, Outcome, compile_model, fix
+from ded_bench.solvers.linear_program import assign
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import simulate
-from ded_bench.truth.swing import Network
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pyomo.environ as pyo
 
+from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
-from ded_bench.koopman.store import find_model
-from ded_bench.methods.ipopt import LINEAR_OPTIONS
+from ded_bench.koopman.surrogates import find_model
 from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solvers import Compiled, compile_model, fix, reset
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.solvers.compile import Compiled, compile_model, fix, reset
+from ded_bench.solvers.ipopt import LINEAR_OPTIONS
+from ded_bench.truth.network import Network
 
 #: Solver and its options by settings slug; the default is the fastest of those tried.
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -17,14 +17,15 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ded_bench.koopman.model import Koopman, hat_functions
-from ded_bench.koopman.store import find_model
+from ded_bench.koopman.surrogates import find_model
 from ded_bench.methods.ded_ko import check_step
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
-from ded_bench.methods.solvers import GrowingProgram
+from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.solvers.compile import GrowingProgram
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 
 Indices = NDArray[np.intp]
 

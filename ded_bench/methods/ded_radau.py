@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from ded_bench.methods.ded import answer, injections, power_limits
 from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solvers import Compiled, compile_model, fix, reset
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.solvers.compile import Compiled, compile_model, fix, reset
+from ded_bench.truth.network import Network
 
 #: Mean length of an element in s, by settings slug.
 SETTINGS = {"default": 0.2, "1s": 1.0, "500ms": 0.5, "100ms": 0.1}

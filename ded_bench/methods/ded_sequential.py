@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.linear import FreeForm
-from ded_bench.methods.outcome import Outcome
-from ded_bench.methods.solution import Status
-from ded_bench.methods.solvers import solve_form
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network, PowerFlowError
+from ded_bench.solvers.compile import solve_form
+from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.solvers.outcome import Outcome
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network, PowerFlowError
 
 #: Mismatch of the nonlinear equations that ends the sequence, pu: IPOPT's tolerance for the same ones.
 TOLERANCE = 1e-8

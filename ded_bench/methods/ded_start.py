@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ded_bench.koopman.physics import linear_model
+from ded_bench.koopman.linear import linear_model
 from ded_bench.methods import ded_ko, ed
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case

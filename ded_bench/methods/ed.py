@@ -11,11 +11,12 @@ import time
 
 import numpy as np
 
-from ded_bench.methods.solution import Settings, Solution, Solver, Status
+from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
 
 #: Seconds from one dispatch to the next by settings slug; by default one serves a whole minute.
 SETTINGS = {"default": 60.0, "10s": 10.0, "1s": 1.0}

@@ -1,39 +1,16 @@
-"""What a method answers: a frozen Solution with a Status that a person understands."""
+"""What a method answers: a frozen Solution, and the settings under which it was found."""
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
 
 DEFAULT_MODEL = "koopman"
-
-
-class Status(enum.StrEnum):
-    """What the solver claims; the scorer's verdict stands in other columns."""
-
-    OPTIMAL = "Optimal"
-    FEASIBLE = "Feasible"
-    INFEASIBLE = "Infeasible"
-    TIME_LIMIT = "TimeLimit"
-    FAILED = "Failed"
-    POLICY = "Policy"
-
-    @property
-    def sentence(self) -> str:
-        """The status in words."""
-        return {
-            Status.OPTIMAL: "the solver reports an optimum within its tolerances",
-            Status.FEASIBLE: "the method gives a schedule without a claim of optimality",
-            Status.INFEASIBLE: "the solver reports that no schedule meets every constraint",
-            Status.TIME_LIMIT: "the time limit passed before the solver finished",
-            Status.FAILED: "the method ended without a schedule",
-            Status.POLICY: "a trained policy was evaluated; no solver ran",
-        }[self]
 
 
 @dataclass(frozen=True)

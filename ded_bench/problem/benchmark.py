@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.sampling import load_manifest, load_split
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from ded_bench.problem.errors import InputError
-from ded_bench.problem.strict import Record, read_record
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record
 
 Array = NDArray[np.float64]
 #: Numbers beyond these are typing errors or in other units; within them no product overflows.

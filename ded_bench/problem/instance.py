@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record
 from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
-from ded_bench.problem.errors import InputError
-from ded_bench.problem.strict import Record, read_record
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,11 +10,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record, write_atomically, write_record
 from ded_bench.problem.case import Array, Case, Name, Range
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Initial, Instance, LoadRamp
-from ded_bench.problem.strict import Record, read_record, write_atomically, write_record
 
 #: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 5).
 POLICY_SEED, CERTIFICATE_SEED, KOOPMAN_SEED = 1_000_000, 2_000_000, 3_000_000

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_atomically
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.errors import InputError
-from ded_bench.problem.strict import write_atomically
 
 #: How far a schedule's last time may lie from the horizon, s.
 HORIZON_TOLERANCE = 1e-9

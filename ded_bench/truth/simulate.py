@@ -13,7 +13,7 @@ from scipy.integrate import DOP853, RK45
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network, PowerFlowError
+from ded_bench.truth.network import Network, PowerFlowError
 
 if TYPE_CHECKING:
     import pandas as pd

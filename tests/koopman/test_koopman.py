@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from ded_bench.files.errors import InputError
 from ded_bench.koopman.data import KINDS, load_ramps, random_knots, sample_trajectories, trajectories
-from ded_bench.koopman.fit import (
+from ded_bench.koopman.identify import (
     held_out,
     identify,
     make_model,
@@ -19,8 +20,7 @@ from ded_bench.koopman.fit import (
     rollout_table,
     unpack,
 )
-from ded_bench.koopman.model import Koopman, hat_functions
-from ded_bench.koopman.physics import (
+from ded_bench.koopman.linear import (
     EPSILON,
     energy_form,
     injection_lift,
@@ -28,12 +28,12 @@ from ded_bench.koopman.physics import (
     single_sample,
     steady_state,
 )
-from ded_bench.koopman.store import find_model, model_file
+from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.surrogates import find_model, model_file
 from ded_bench.problem.case import Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.truth.network import Network
 
 KNOTS = 7
 
@@ -226,7 +226,7 @@ def test_model_files_are_checked(ninebus: Case, threebus: Case, tmp_path: Path) 
 
 
 def test_paper_identification_is_stable_exact_at_equilibria_and_learns(case: Case) -> None:
-    from ded_bench.koopman.paper import PaperKoopman, identify_paper
+    from ded_bench.koopman.identify_paper import PaperKoopman, identify_paper
 
     model = identify_paper(case, seed=1, count=4, steps=300)
     assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0

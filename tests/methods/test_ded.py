@@ -9,15 +9,16 @@ import pytest
 from ded_bench.methods.ded import SETTINGS, build_ded, prepare, schedule_of, set_instance, start_from
 from ded_bench.methods.ded_sequential import SequentialDed, injections_along
 from ded_bench.methods.ded_start import STARTS
-from ded_bench.methods.solution import Settings, Status
-from ded_bench.methods.solvers import CasadiIpopt
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
+from ded_bench.solvers.compile import CasadiIpopt
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 from ded_bench.truth.score import score
 from ded_bench.truth.simulate import simulate
-from ded_bench.truth.swing import Network
 
 HORIZON = 2.0
 

@@ -10,18 +10,19 @@ import pyomo.environ as pyo
 import pytest
 from scipy.optimize import linprog
 
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.linear import injection_lift, linear_model
 from ded_bench.koopman.model import Koopman, hat_functions
-from ded_bench.koopman.physics import injection_lift, linear_model
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
-from ded_bench.methods.solution import Settings, Solution, Status
-from ded_bench.methods.solvers import compile_model
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
+from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 
 HORIZON = 3.0
 METHODS = (ded_ko, ded_ko_knots)

@@ -6,7 +6,6 @@ import numpy as np
 import pyomo.environ as pyo
 import pytest
 
-from ded_bench.methods import get_method
 from ded_bench.methods.ded_radau import (
     BETWEEN,
     POINTS,
@@ -21,13 +20,15 @@ from ded_bench.methods.ded_radau import (
     schedule_of,
     set_instance,
 )
-from ded_bench.methods.solution import Settings, Status
-from ded_bench.methods.solvers import CasadiIpopt
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.compile import CasadiIpopt
+from ded_bench.solvers.status import Status
 from ded_bench.truth.score import score
 from ded_bench.truth.simulate import simulate
 

@@ -9,23 +9,24 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
+from ded_bench.koopman.linear import linear_model
 from ded_bench.koopman.model import hat_functions
-from ded_bench.koopman.physics import linear_model
-from ded_bench.methods.dpc import refine
-from ded_bench.methods.dpc.ded_dpc import N_KNOTS, DispatchPolicy
-from ded_bench.methods.dpc.ded_dpc_refined import SETTINGS, artifact, prepare
+from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.methods.dpc.loss import knot_times
+from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import StagedNetwork
-from ded_bench.methods.dpc.objective import coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.refine import Refiner
+from ded_bench.methods.dpc.policy import N_KNOTS, DispatchPolicy
+from ded_bench.methods.dpc.refined import SETTINGS, artifact, prepare
+from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc.store import Scope, policy_file
-from ded_bench.methods.solution import Settings, Status
+from ded_bench.methods.dpc_paper.paper_loss import knot_times
+from ded_bench.methods.policy_file import Scope, policy_file
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
-from ded_bench.truth.swing import Network
+from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 
 
 def some_instances(case: Case, count: int) -> list[Instance]:
@@ -48,13 +49,13 @@ def optimum(case: Case, regime: str, instance: Instance) -> float:
     """The condensed problem's optimum, written as a linear program for another solver."""
     model, n_gen = linear_model(case), len(case.generators)
     knots = knot_times(instance.horizon_s, N_KNOTS)
-    stride = coarse_stride(instance.dt_s, instance.steps, refine.SPACING_S)
+    stride = coarse_stride(instance.dt_s, instance.steps, refinement.SPACING_S)
     inputs = Inputs.of(case, [instance])
     free = coarse_free_response(Network(case), model, inputs, instance.grid, stride)[0]
     gamma = model.condense(n_gen, instance.grid, knots)[::stride].reshape(-1, n_gen + 1, N_KNOTS * n_gen)
     n = len(gamma)
     slack, omega = gamma[:, n_gen], gamma[:, :n_gen].transpose(1, 0, 2).reshape(n * n_gen, -1)
-    bound = case.omega_bound(regime) * (1.0 - refine.MARGIN)
+    bound = case.omega_bound(regime) * (1.0 - refinement.MARGIN)
     unit = np.eye(N_KNOTS * n_gen)
     change = unit[n_gen:] - unit[:-n_gen]
     weights = hat_functions(instance.grid, instance.grid[::stride]).sum(axis=0)
@@ -129,7 +130,7 @@ def test_what_is_not_better_is_not_taken(case: Case, monkeypatch: pytest.MonkeyP
     inputs = Inputs.of(case, instances)
     refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
     good = refiner(inputs, policy.powers(inputs), 1000)
-    monkeypatch.setattr(refine, "DUAL_STEP", 50.0)  # diverges
+    monkeypatch.setattr(refinement, "DUAL_STEP", 50.0)  # diverges
     np.testing.assert_array_equal(refiner(inputs, good, 20), good)
 
 
@@ -140,7 +141,7 @@ def test_it_serves_as_a_method(threebus: Case, tmp_path: Path) -> None:
     settings = {name: Settings(name=name, model="linear", search=(tmp_path,)) for name in SETTINGS}
     answers = {name: prepare(threebus, regime, settings[name])(instance) for name in ("default", "steps25")}
     assert {a.status for a in answers.values()} == {Status.POLICY}
-    assert answers["default"].iterations == refine.STEPS
+    assert answers["default"].iterations == refinement.STEPS
     assert answers["steps25"].iterations == 25
     assert answers["default"].solve_s > 0
     assert not np.array_equal(answers["default"].schedule.p, answers["steps25"].schedule.p)

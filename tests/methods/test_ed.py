@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ded_bench.methods import get_method
+from ded_bench.files.errors import InputError
 from ded_bench.methods.ed import SETTINGS, dispatch, prepare
-from ded_bench.methods.solution import Settings, Status
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import sample_instance
+from ded_bench.solvers.status import Status
 from ded_bench.truth.score import score_many
 
 RAMP = 0.05  # pu/s, both cases

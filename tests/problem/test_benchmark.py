@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem.benchmark import select_files, select_split
 from ded_bench.problem.case import Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import load_split, write_benchmark
 
 

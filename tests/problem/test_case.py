@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.sampling import sample_instance
-from ded_bench.problem.strict import parse_record
 
 
 def test_ninebus_holds_the_papers_tables(ninebus):

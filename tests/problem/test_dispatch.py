@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.strict import parse_record
 
 
 def linear_program(p_min, p_max, cost_gen, cost_slack, demand) -> tuple[float, np.ndarray]:

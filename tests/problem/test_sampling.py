@@ -12,8 +12,8 @@ import pytest
 from scipy.optimize import linprog
 from scipy.stats import binom, kstest
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem.case import SHIPPED_CASES
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.instance import load_instances
 from ded_bench.problem.sampling import (
     CERTIFICATE_SEED,

@@ -7,8 +7,8 @@ import gzip
 import numpy as np
 import pytest
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem import schedule as module
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.schedule import Schedule
 
 

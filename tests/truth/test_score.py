@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.errors import InputError
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.score import Score, judge, score, score_many
 from ded_bench.truth.simulate import SimulationError, Trajectory, simulate

@@ -9,11 +9,11 @@ import pytest
 from scipy.integrate import OdeSolver, cumulative_simpson, solve_ivp
 from scipy.linalg import expm
 
-from ded_bench.problem.errors import InputError
+from ded_bench.files.errors import InputError
 from ded_bench.problem.sampling import sample_instance, sample_instances
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import SimulationError, _Run, bends, simulate, simulate_many
-from ded_bench.truth.swing import Network
 
 
 def pushed(case, omega: float) -> dict:

@@ -16,11 +16,11 @@ import numpy as np
 from scipy.optimize import root
 from sksundae.ida import IDA
 
+from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.strict import parse_record
 from ded_bench.truth.simulate import simulate_many
 
 RTOL, ATOL = 1e-10, 1e-12

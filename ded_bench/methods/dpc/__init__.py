@@ -1,1 +1,1 @@
-"""Learned dispatch policies: the paper's recipe (policy, features, loss, train) and ours (ded_dpc)."""
+"""Our learned dispatch policy: network, training, inference and refinement."""

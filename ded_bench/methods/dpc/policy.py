@@ -1,26 +1,30 @@
-"""DED-DPC: a trained policy that answers with a schedule in less than a millisecond.
+"""DED-DPC (`ded-dpc`): a network looks at what a schedule would do and corrects it, in stages.
 
-`ded-dpc-paper` is the paper's architecture: three Conv1d layers over 50 knots, tanh to the generator
-bounds, linear interpolation. Policy files are safetensors: arrays and a JSON header.
+Bounds, ramps and P_0 hold for any weights.
 """
 
 from __future__ import annotations
 
 import functools
+import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from ded_bench.methods.dpc.answer import method
-from ded_bench.methods.dpc.features import Features
-from ded_bench.methods.dpc.loss import knot_times
-from ded_bench.methods.dpc.store import (
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_atomically
+from ded_bench.methods.dpc.inference import CompiledStages
+from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
+from ded_bench.methods.dpc.network import StagedNetwork
+from ded_bench.methods.dpc.response import Response
+from ded_bench.methods.dpc.variants import SETTINGS as SETTINGS
+from ded_bench.methods.dpc_paper.paper_loss import knot_times
+from ded_bench.methods.policy_file import (
     Scope,
     find_policy_file,
     load_weights,
@@ -28,122 +32,40 @@ from ded_bench.methods.dpc.store import (
     weights_fingerprint,
     write_policy,
 )
-from ded_bench.methods.dpc.store import policy_file as policy_file
+from ded_bench.methods.policy_solver import method
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.swing import Network
 
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
-METHOD = "ded-dpc-paper"
-N_KNOTS, FILTERS, WINDOWS = 50, 30, (5, 10, 5)
-ZERO = np.float32(0.0)
-
-
-class PaperNetwork(nn.Module):
-    """The paper's control policy: channels over the knots in, generator powers at the knots out."""
-
-    def __init__(self, n_channels: int, p_min: Array, p_max: Array) -> None:
-        super().__init__()
-        first, middle, last = WINDOWS
-        self.layers = nn.Sequential(
-            _same_padding(first),
-            nn.Conv1d(n_channels, FILTERS, first),
-            nn.ReLU(),
-            _same_padding(middle),
-            nn.Conv1d(FILTERS, FILTERS, middle),
-            nn.ReLU(),
-            _same_padding(last),
-            nn.Conv1d(FILTERS, len(p_min), last),
-        )
-        self.register_buffer("mean", torch.zeros(n_channels, 1))
-        self.register_buffer("scale", torch.ones(n_channels, 1))
-        self.register_buffer("p_min", torch.as_tensor(p_min, dtype=torch.float32)[:, None])
-        self.register_buffer("p_max", torch.as_tensor(p_max, dtype=torch.float32)[:, None])
-
-    mean: Tensor
-    scale: Tensor
-    p_min: Tensor
-    p_max: Tensor
-
-    def normalise(self, channels: Tensor) -> None:
-        """Set the affine input normalisation from training data, (batch, n_channels, n_knots)."""
-        self.mean.copy_(channels.mean(dim=(0, 2))[:, None])
-        self.scale.copy_(channels.std(dim=(0, 2))[:, None].clamp_min(1e-6))
-
-    def forward(self, channels: Tensor) -> Tensor:
-        """Map (batch, n_channels, n_knots) to powers, (batch, n_knots, n_gen), pu, within bounds."""
-        out = self.layers((channels - self.mean) / self.scale)
-        power = self.p_min + 0.5 * (1.0 + torch.tanh(out)) * (self.p_max - self.p_min)
-        return power.transpose(1, 2)
-
-
-def _same_padding(window: int) -> nn.Module:
-    """Zeros on both sides, so that a convolution with this window keeps the length."""
-    return nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)
-
-
-class NumpyPaperNetwork:
-    """The same function as a PaperNetwork: for one instance torch's overhead would be most of the time."""
-
-    def __init__(self, network: PaperNetwork) -> None:
-        state = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
-        self._mean, self._scale = state["mean"], 1.0 / state["scale"]
-        self._low, self._half = state["p_min"], 0.5 * (state["p_max"] - state["p_min"])
-        weights = [value for name, value in state.items() if name.endswith(".weight")]  # (out, in, window)
-        matrices = [w.transpose(0, 2, 1).reshape(len(w), -1) for w in weights]
-        biases = [value[:, None] for name, value in state.items() if name.endswith(".bias")]
-        self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
-
-    def __call__(self, channels: Array) -> Array:
-        """See `PaperNetwork.forward`."""
-        h = (channels.astype(np.float32) - self._mean) * self._scale
-        for i, (window, weight, bias) in enumerate(self._layers):
-            if i:
-                np.maximum(h, ZERO, out=h)
-            h = np.matmul(weight, _windows(h, window))
-            h += bias
-        np.tanh(h, out=h)
-        h += 1.0
-        power = self._low + self._half * h
-        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
-
-
-def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
-    batch, width, n = x.shape
-    padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
-    before = (window - 1) // 2
-    padded[:, :, before : before + n] = x
-    per_instance, per_channel, per_knot = padded.strides
-    strides = per_instance, per_knot, per_channel, per_knot
-    seen = np.ndarray((batch, window, width, n), np.float32, padded, strides=strides)
-    return seen.reshape(batch, -1, n)
+METHOD = "ded-dpc"
+N_KNOTS = 50
+#: Instances that one thread takes at a time.
+CHUNK = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Policy:
-    """A trained network with all that is needed to apply it, for one case, regime and horizon."""
+class DispatchPolicy:
+    """A trained network with all that is needed to apply it."""
 
-    case: Case
-    regime: str
-    horizon_s: float
-    network: PaperNetwork
+    scope: Scope
+    network: StagedNetwork
     training: dict[str, Any]
 
-    @functools.cached_property
+    @property
     def knots(self) -> Array:
         """Knot times, shape (n_knots,), s."""
-        return knot_times(self.horizon_s, N_KNOTS)
+        return self.response.knots
+
+    @property
+    def response(self) -> Response:
+        """What the network looks at."""
+        return self.network.response
 
     @functools.cached_property
-    def _grid(self) -> Network:
-        return Network(self.case)
-
-    @functools.cached_property
-    def _numpy(self) -> NumpyPaperNetwork:
-        return NumpyPaperNetwork(self.network)
+    def _compiled(self) -> CompiledStages:
+        state = {name: value.numpy() for name, value in self.network.state_dict().items()}
+        return CompiledStages(self.scope.case, self.response, state, self.network.dilations)
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -152,26 +74,61 @@ class Policy:
             InputError: an instance belongs to another case or horizon.
         """
         batch = [instances] if isinstance(instances, Instance) else list(instances)
-        self._scope.check(batch)
-        powers = self._numpy(Features.of(self._grid, batch, self.knots).channels())
-        powers = np.minimum(np.maximum(powers, self.case.p_min), self.case.p_max)  # again, in float64
-        return [Schedule(self.knots, p) for p in powers]
+        self.scope.check(batch)
+        if not batch:
+            return []
+        return [Schedule(self.knots, p) for p in self.powers(Inputs.of(self.scope.case, batch))]
 
-    @property
-    def _scope(self) -> Scope:
-        return Scope(self.case, self.regime, self.horizon_s)
+    def powers(self, inputs: Inputs, threads: int = 1) -> Array:
+        """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
+        if len(inputs) <= CHUNK:
+            return self._compiled(self.channels(inputs))
+        parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
+        if threads == 1:
+            return np.concatenate([self.powers(part) for part in parts])
+        with ThreadPoolExecutor(threads) as pool:
+            return np.concatenate(list(pool.map(self.powers, parts)))
+
+    def channels(self, inputs: Inputs) -> Channels:
+        """What the network reads of instances."""
+        return Channels.of(self.scope.case, inputs, self.response, self.training.get("prior", True))
 
     def save(self, path: Path) -> None:
         """Write weights, normalisation and header."""
-        write_policy(path, METHOD, self._scope, self.network, self.training)
+        write_policy(path, METHOD, self.scope, self.network, self.training | self.network.shape)
+
+    def export(self, path: Path) -> None:
+        """Write the network (channels in, powers at the knots out) for runtimes that know `torch.export`."""
+        case = self.scope.case
+        n_sequence, n_constants = n_channels(case)
+        n_gen, n_outputs = len(case.generators), self.response.n_outputs
+        widths = (n_gen, n_outputs, n_sequence)
+        example = (*(torch.zeros(2, N_KNOTS, n) for n in widths), torch.zeros(2, n_constants))
+        batch = {0: torch.export.Dim("batch")}
+        program = torch.export.export(self.network, example, dynamic_shapes=(batch,) * 4)
+        buffer = io.BytesIO()
+        torch.export.save(program, buffer)
+        write_atomically(path, buffer.getvalue())
 
     @staticmethod
-    def load(path: str | Path, case: Case, regime: str) -> Policy:
+    def load(path: str | Path, case: Case, regime: str) -> DispatchPolicy:
         """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
         arrays, scope, training = read_policy(path, METHOD, case, regime)
-        network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
+        stages, width, dilations = (training.get(name) for name in ("stages", "width", "dilations"))
+        if not (isinstance(stages, int) and isinstance(width, int) and isinstance(dilations, list)):
+            raise InputError(path, "training", "lacks the network's stages, width and dilations")
+        if not all(isinstance(d, int) and 0 < d < N_KNOTS for d in dilations):
+            raise InputError(path, "training", "has dilations that are no numbers of knots")
+        layers = {name for name in arrays if ".mix." in name and name.endswith(".bias")}
+        widths = {arrays[name].shape for name in layers} | {(width,)}
+        if len(layers) != stages * len(dilations) or len(widths) != 1 or not layers:
+            raise InputError(path, "training", "has another width or depth than the weights")
+        if not isinstance(training.get("prior", True), bool):
+            raise InputError(path, "training", "has a prior that is neither true nor false")
+        response = Response.make(case, knot_times(scope.horizon_s, N_KNOTS))
+        network = StagedNetwork(case, response, stages, width, tuple(dilations))
         load_weights(network, arrays, path)
-        return Policy(case, regime, scope.horizon_s, network.eval(), training)
+        return DispatchPolicy(scope, network.eval(), training)
 
     @property
     def fingerprint(self) -> str:
@@ -179,18 +136,14 @@ class Policy:
         return weights_fingerprint(self.network)
 
 
-def n_channels(case: Case) -> int:
-    """Channels of `Features`: loads, costs, x_0 and P_0."""
-    return len(case.loads) + (1 + len(case.generators)) + len(case.buses) + 2 * len(case.generators)
-
-
-def find_policy(case: Case, regime: str, settings: Settings) -> Policy:
+def find_policy(case: Case, regime: str, settings: Settings) -> DispatchPolicy:
     """Return the policy given in the settings, else the first one in the folders to search.
 
     Raises:
         InputError: there is none (names the command that trains one), or it does not fit.
     """
-    return Policy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
+    path = find_policy_file(METHOD, case, regime, settings, settings.name)
+    return DispatchPolicy.load(path, case, regime)
 
 
 def artifact(case: Case, regime: str, settings: Settings) -> str:

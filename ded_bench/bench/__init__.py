@@ -1,1 +1,0 @@
-"""What a benchmark does with methods: run, time, tabulate, report."""

@@ -1,0 +1,85 @@
+"""What the `ded-bench` commands accept: options, defaults, help."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, NoReturn
+
+from ded_bench.koopman.surrogates import MODELS
+from ded_bench.methods.registry import METHODS
+
+#: The shipped case that is meant where none is named.
+DEFAULT_CASE = "9bus"
+KNOWN = ", ".join(METHODS)
+MODEL_HELP = f"{', '.join(MODELS)}, or a file"
+
+
+#: Under the list of commands, which must fit a terminal of 24 lines and 80 columns.
+ROAD = (
+    "The road: instances, train-ko, solve, train-dpc, solve, bench, report; `make report` walks it. "
+    "`ded-bench COMMAND --help` lists the options of one."
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one-line errors."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with code 2."""
+        self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists what there is)\n")
+
+
+class OneLinePerCommand(argparse.HelpFormatter):
+    """Help with a line per command."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=16, width=79)
+        self._action_max_length = 14  # argparse forgets that commands are indented once more
+
+
+def command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command; `text` is its line in the list of commands."""
+    made: argparse.ArgumentParser = commands.add_parser(
+        name, help=text, description=f"{text[:1].upper()}{text[1:]}."
+    )
+    return made
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Read names separated by commas, each once."""
+    found = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not found:
+        raise argparse.ArgumentTypeError("names nothing")
+    return tuple(dict.fromkeys(found))
+
+
+def natural(text: str) -> int:
+    """Read a whole number of at least 0."""
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number")
+    return int(text)
+
+
+def positive(text: str) -> int:
+    """Read a whole number of at least 1."""
+    if (value := natural(text)) < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a finite number of at least 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
+    return value
+
+
+def positive_number(text: str) -> float:
+    """Read a finite number above 0."""
+    if (value := not_negative(text)) == 0:
+        raise argparse.ArgumentTypeError("must be above 0")
+    return value

@@ -1,0 +1,45 @@
+"""The `ded-bench` commands: parse, call, print; exit code 0, 1 (work failed) or 2 (bad input)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from ded_bench.cli import evaluation_commands, problem_commands, solve_commands, training_commands
+from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser
+from ded_bench.files.errors import InputError
+from ded_bench.run.pool import WorkersLostError
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands; `run` is the function of the one chosen."""
+    top = Parser(
+        prog="ded-bench",
+        description="Benchmark suite for the dynamics-aware economic dispatch (DED) problem.",
+        epilog=ROAD,
+        formatter_class=OneLinePerCommand,
+    )
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
+    for group in (problem_commands, solve_commands, training_commands, evaluation_commands):
+        group.add_commands(commands)
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    arguments = parser().parse_args(argv)
+    try:
+        code: int = arguments.run(arguments)
+        return code
+    except InputError as error:
+        print(f"ded-bench: {error}", file=sys.stderr)
+        return 2
+    except WorkersLostError as error:
+        print(f"ded-bench: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        return 1
+    except KeyboardInterrupt:
+        print("ded-bench: interrupted; what was finished is saved, run again to continue", file=sys.stderr)
+        return 130

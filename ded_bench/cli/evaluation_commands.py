@@ -1,0 +1,157 @@
+"""Commands that tell what results mean: bench, certify, compare, report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ded_bench.cli.arguments import (
+    DEFAULT_CASE,
+    MODEL_HELP,
+    command,
+    names,
+    natural,
+    not_negative,
+    positive,
+    positive_number,
+)
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.surrogates import default_results, search_folders
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.benchmark import problem_folder, select_split
+from ded_bench.problem.case import Case
+from ded_bench.run.pool import Workers
+
+if TYPE_CHECKING:
+    pass
+
+
+def add_commands(commands: Any) -> None:
+    """Declare these commands and their options."""
+    p = command(commands, "bench", "time methods, each alone on the machine, one thread")
+    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
+    p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
+    p.add_argument("--repeats", type=positive, help="solves of each; default: by the method's speed")
+    p.add_argument("--force", action="store_true", help="time again what timing.csv holds")
+    p.add_argument("--results", type=Path, help="results folder")
+    p.set_defaults(run=_bench)
+
+    p = command(commands, "certify", "certify a policy on fresh instances")
+    p.add_argument("--method", default="ded-dpc")
+    p.add_argument("--regime", type=names, default=("NO", "TO"), metavar="R[,R]")
+    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--settings", default="default")
+    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
+    p.add_argument("--count", type=positive, default=10_000, metavar="M", help="how many fresh instances")
+    p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--gap", type=positive_number, default=1.0, metavar="PERCENT", help="over ded-ko-knots")
+    p.add_argument("--tolerance", type=positive_number, default=1e-6, metavar="HZ", help="of the frequency")
+    p.add_argument("--delta", type=positive_number, default=0.01, help="1 - confidence")
+    p.add_argument("--workers", type=positive, default=1)
+    p.add_argument("--results", type=Path, help="results folder")
+    p.set_defaults(run=_certify)
+
+    p = command(commands, "compare", "what changed between two results folders")
+    p.add_argument("a", type=Path, metavar="A", help="the results folder that sets the standard")
+    p.add_argument("b", type=Path, metavar="B")
+    p.add_argument("--tolerance", type=not_negative, default=1e-6, metavar="X", help="objective, relative")
+    p.add_argument("--tolerance-hz", type=not_negative, default=1e-6, metavar="HZ", help="violations")
+    p.add_argument("--tolerance-pu", type=not_negative, default=1e-8, metavar="PU", help="violations")
+    p.add_argument("--common", action="store_true", help="rows that only one has are no difference")
+    p.add_argument("--json", action="store_true", help="one JSON object instead of lines")
+    p.set_defaults(run=_compare)
+
+    p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
+    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that draw figures")
+    p.add_argument("--results", type=Path, help="results folder")
+    p.set_defaults(run=_report)
+
+
+def _bench(a: argparse.Namespace) -> int:
+    from ded_bench.evaluate.timing import bench_folder, choose_sample, runs_of
+    from ded_bench.methods.registry import get_method, registered
+    from ded_bench.run.results import Results
+
+    chosen = select_split(a.case)
+    case = chosen.case
+    folder = a.results or default_results(case)
+    rows = Results(folder).rows
+    methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
+    runs = runs_of(rows, Settings(search=search_folders(case, folder)), methods)
+    if not a.method:
+        for name in sorted({key.method for key in rows} - set(methods)):
+            print(f"ded-bench: {name}: not timed, since no method has this name", file=sys.stderr)
+    if not runs:
+        raise InputError(folder, "", "holds no rows of these methods to time; run `ded-bench solve` first")
+    failures = 0
+    for method, regimes, settings in runs:
+        for row in bench_folder(
+            folder,
+            case,
+            choose_sample([instance for instance, _ in chosen.instances], a.instances),
+            [method],
+            regimes,
+            settings,
+            repeats=a.repeats,
+            force=a.force,
+            problems_version=chosen.version,
+        ):
+            median = f"{row.solve_s:.6f} s" if row.solve_s is not None else row.error
+            print(f"{row.method:<16} {row.settings:<12} {row.regime:<4} {median}", flush=True)
+            failures += row.solve_s is None
+    return 1 if failures else 0
+
+
+def _certify(a: argparse.Namespace) -> int:
+    from ded_bench.evaluate.certificate import certify, rows_file, save_certificate
+
+    case = Case.load(a.case)
+    case.check_regimes(a.regime)
+    folder = a.results or default_results(case)
+    settings = Settings(a.settings, a.model, a.policy, search=search_folders(case, folder))
+    for regime in a.regime:
+        certificate = certify(
+            case,
+            a.method,
+            regime,
+            settings,
+            rows_file(folder, a.method, regime, settings),
+            count=a.count,
+            seed=a.seed,
+            gap_percent=a.gap,
+            tolerance_hz=a.tolerance,
+            delta=a.delta,
+            workers=a.workers,
+        )
+        save_certificate(folder, certificate)
+        print(certificate.sentence)
+    return 0
+
+
+def _compare(a: argparse.Namespace) -> int:
+    from ded_bench.report.compare import Tolerance, compare, to_json, to_text
+
+    limits = Tolerance(a.tolerance, a.tolerance_hz, a.tolerance_pu)
+    found = compare(a.a, a.b, limits, common_only=a.common)
+    print(to_json(found) if a.json else to_text(found), end="\n" if a.json else "")
+    return 0 if found.same else 1
+
+
+def _report(a: argparse.Namespace) -> int:
+    with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
+        if pool:
+            pool.warm("ded_bench.report.gallery")  # while this process imports it, too
+        from ded_bench.report.report import write_report
+
+        case = Case.load(a.case)
+        folder = a.results or default_results(case)
+        written = write_report(case, folder, problem_folder(a.case, case), pool)
+    print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
+    return 0

@@ -1,0 +1,1 @@
+"""What rows mean: summary, timing, certificate, comparison, ablation."""

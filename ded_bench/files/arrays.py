@@ -1,0 +1,48 @@
+"""Named arrays with a JSON header in one safetensors file; reading one executes no code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_atomically
+
+#: What the readers of safetensors and JSON raise on a damaged file, beside their own errors.
+_UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError, MemoryError)
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]) -> None:
+    """Write arrays and a header; floats in the header keep their digits."""
+    metadata = {key: json.dumps(value) for key, value in header.items()}
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    write_atomically(path, safetensors.numpy.save(contiguous, metadata))
+
+
+def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read arrays and header.
+
+    Raises:
+        InputError: the file cannot be read, is no safetensors file, or holds non-finite numbers.
+    """
+    try:
+        with safetensors.safe_open(str(path), framework="np") as file:
+            header = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None
+    except (safetensors.SafetensorError, *_UNREADABLE) as error:
+        raise InputError(path, "", f"is not a model or policy file ({_one_line(error)})") from None
+    for name, array in arrays.items():
+        if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
+            raise InputError(path, name, "must hold finite numbers")
+    return arrays, header
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:100]

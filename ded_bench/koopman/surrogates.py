@@ -1,0 +1,51 @@
+"""Where trained models lie and which names they answer to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.linear import linear_model, single_sample
+from ded_bench.koopman.model import Koopman
+from ded_bench.problem.case import REPOSITORY, Case
+
+#: Models that `ded-bench train-ko` identifies.
+TRAINED = ("koopman", "koopman-paper")
+#: All models by name; those not trained follow from the case or from `koopman`.
+MODELS = (*TRAINED, "koopman-single", "linear")
+
+
+def default_results(case: Case) -> Path:
+    """Where results of a case lie unless told otherwise, below the working directory."""
+    return Path("results") / case.id
+
+
+def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
+    """Where trained models and policies are looked for: `first`, default results, reference run."""
+    return (*first, default_results(case), REPOSITORY / "results" / f"{case.id}-reference")
+
+
+def model_file(results: Path, kind: str) -> Path:
+    """Where a results folder keeps a model."""
+    return results / "koopman" / f"{kind}.safetensors"
+
+
+def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
+    """Return a model by its kind, from the first folder that has it, or by its file's path.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it), or its file is wrong.
+    """
+    if name == "linear":
+        return linear_model(case)
+    if name == "koopman-single":
+        return single_sample(find_model(case, "koopman", search), case)
+    if name in TRAINED:
+        for folder in search:
+            if model_file(folder, name).is_file():
+                return Koopman.load(model_file(folder, name), case)
+        raise InputError("--model", name, f"not identified yet; run `ded-bench train-ko --case {case.id}`")
+    if Path(name).is_file():
+        return Koopman.load(name, case)
+    raise InputError("--model", name, f"no such file and no such model (known: {', '.join(MODELS)})")

@@ -1,0 +1,65 @@
+"""DED-DPC, refined (`ded-dpc-refined`): the policy's answer after a fixed number of first-order steps."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import Any
+
+import numba
+import numpy as np
+
+from ded_bench.koopman.surrogates import find_model
+from ded_bench.methods.dpc import policy as dpc_policy
+from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.methods.dpc.refinement import STEPS, Refiner
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+
+METHOD = "ded-dpc-refined"
+#: Number of steps, by slug.
+SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {"steps": STEPS},
+    "steps25": {"steps": 25},
+    "steps100": {"steps": 100},
+    "steps1000": {"steps": 1000},
+}
+
+
+def artifact(case: Case, regime: str, settings: Settings) -> str:
+    """Fingerprint of the policy and the model that `prepare` would use."""
+    policy = _policy(case, regime, settings).fingerprint
+    model = find_model(case, settings.model, settings.search).fingerprint
+    return hashlib.sha256(f"{policy} {model}".encode()).hexdigest()[:12]
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return the refined policy as a method; condensing and factorising are done once, here."""
+    policy = _policy(case, regime, settings)
+    model = find_model(case, settings.model, settings.search)
+    steps: int = SETTINGS[settings.name]["steps"]
+    refiners: dict[tuple[float, int], Refiner] = {}
+
+    def solve(instance: Instance) -> Solution:
+        policy.scope.check([instance])
+        grid = instance.dt_s, instance.steps
+        if grid not in refiners:
+            refiners[grid] = Refiner.make(case, model, regime, instance.grid, policy.knots)
+        refiner = refiners[grid]
+        started = time.perf_counter()
+        inputs = Inputs.of(case, [instance])
+        schedule = Schedule(policy.knots, refiner(inputs, policy.powers(inputs), steps)[0])
+        schedule.at(instance.grid)
+        elapsed = time.perf_counter() - started
+        version = f"numba {numba.__version__}, numpy {np.__version__}"
+        return Solution(Status.POLICY, schedule, steps, solve_s=elapsed, solver_version=version)
+
+    return solve
+
+
+def _policy(case: Case, regime: str, settings: Settings) -> dpc_policy.DispatchPolicy:
+    plain = Settings("default", settings.model, settings.policy, settings.time_limit_s, settings.search)
+    return dpc_policy.find_policy(case, regime, plain)

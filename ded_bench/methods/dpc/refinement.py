@@ -1,0 +1,165 @@
+"""A fixed number of first-order steps on the condensed problem, for many instances at once.
+
+The condensed problem is the linear program over the knots
+
+    min Σ c_i P_i + c_s |P_s|   with   y = A p + a = (P_s, ω / bound, ramps, powers)
+
+where A is the same for all instances. ADMM splits it into a least-squares step, whose matrix is
+factorised once, and a step that treats each component of y alone (Boyd et al. 2011). The last
+answer passes through the follower, so that bounds, ramps and P_0 hold after any number of steps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.methods.dpc.follower import follow
+from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
+from ded_bench.problem.case import Array, Case
+from ded_bench.truth.network import Network
+
+Array32 = NDArray[np.float32]
+STEPS = 200
+SPACING_S = 0.2
+#: Penalty weights of the split: P_s (pu), ω (in units of its bound), ramps and powers (pu).
+WEIGHTS = {"p_slack": 0.1, "omega": 0.003, "ramp": 1.0, "power": 1.0}
+#: Length of the dual step; ADMM converges below (1 + √5) / 2 (Fortin and Glowinski 1983).
+DUAL_STEP = 1.6
+#: The bound is tightened by this fraction: about the error of the model.
+MARGIN = 0.01
+#: How much worse an answer counts per relative unit of its largest excess of |ω|, relative to its cost.
+EXCESS_PRICE = 1.0
+CHUNK = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Refiner:
+    """The condensed problem of a case, regime and time grid, factorised."""
+
+    case: Case
+    network: Network
+    model: Koopman
+    grid: Array
+    stride: int
+    step: float  # largest change between two knots, pu
+    n_slack: int  # rows of y that are P_s
+    rows: Array32  # A, each row weighted, (n_rows, n_knots n_gen)
+    solve: Array32  # (AᵀA)⁻¹ for the knots after the first
+    low: Array32  # limits of the other rows, (n_rows - n_slack,)
+    high: Array32
+    held: Array  # Σ_k over the grid of each knot's hat function, (n_knots,)
+    stands_for: Array  # grid points that a coarse point stands for
+    omega_bound: float
+
+    @staticmethod
+    def make(case: Case, model: Koopman, regime: str, grid: Array, knots: Array) -> Refiner:
+        """Condense and factorise."""
+        n_gen, n_knots = len(case.generators), len(knots)
+        stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
+        gamma = np.moveaxis(model.condense(n_gen, grid, knots)[::stride], 1, 0).reshape(
+            n_gen + 1, -1, n_knots * n_gen
+        )
+        root = {name: math.sqrt(value) for name, value in WEIGHTS.items()}
+        bound, step = case.omega_bound(regime), case.ramp_pu_per_s * (knots[1] - knots[0])
+        unit = np.eye(n_knots * n_gen)
+        rows = np.concatenate(
+            [
+                gamma[n_gen] * root["p_slack"],
+                gamma[:n_gen].reshape(-1, n_knots * n_gen) / bound * root["omega"],
+                (unit[n_gen:] - unit[:-n_gen]) * root["ramp"],
+                unit[n_gen:] * root["power"],
+            ]
+        )
+        n_coarse, n_free = gamma.shape[1], (n_knots - 1) * n_gen
+        high = np.concatenate(
+            [
+                np.full(n_gen * n_coarse, (1.0 - MARGIN) * root["omega"]),
+                np.full(n_free, step * root["ramp"]),
+                np.tile(case.p_max, n_knots - 1) * root["power"],
+            ]
+        )
+        low = -high
+        low[-n_free:] = np.tile(case.p_min, n_knots - 1) * root["power"]
+        free = rows[:, n_gen:]
+        return Refiner(
+            case,
+            Network(case),
+            model,
+            grid,
+            stride,
+            float(step),
+            n_coarse,
+            rows.astype(np.float32),
+            np.linalg.inv(free.T @ free).astype(np.float32),
+            low.astype(np.float32),
+            high.astype(np.float32),
+            hat_functions(grid, knots).sum(axis=0),
+            hat_functions(grid, grid[::stride]).sum(axis=0),
+            bound,
+        )
+
+    def __call__(self, inputs: Inputs, p_gen: Array, steps: int = STEPS) -> Array:
+        """Improve schedules.
+
+        Args:
+            inputs: the instances.
+            p_gen: powers at the knots to start from, (batch, n_knots, n_gen), pu.
+            steps: how many.
+
+        Returns:
+            As `p_gen`; an instance whose steps led to nothing better keeps what it had.
+        """
+        parts = [slice(start, start + CHUNK) for start in range(0, len(inputs), CHUNK)]
+        return np.concatenate([self._refine(inputs[part], p_gen[part], steps) for part in parts])
+
+    def _refine(self, inputs: Inputs, p_gen: Array, steps: int) -> Array:
+        batch, n_knots, n_gen = p_gen.shape
+        n, n_rows = self.n_slack, len(self.rows)
+        free = coarse_free_response(self.network, self.model, inputs, self.grid, self.stride)
+        slack_unit = math.sqrt(WEIGHTS["p_slack"])
+        fixed = np.zeros((batch, n_rows), dtype=np.float32)
+        fixed[:, :n] = free[:, n_gen] * slack_unit
+        fixed[:, n : n * (1 + n_gen)] = free[:, :n_gen].reshape(batch, -1) * (
+            math.sqrt(WEIGHTS["omega"]) / self.omega_bound
+        )
+        fixed += p_gen[:, 0].astype(np.float32) @ self.rows[:, :n_gen].T
+        rows = self.rows[:, n_gen:]
+        # costs per grid point, relative to the instance's own: the scale the weights are chosen for
+        unit = 1.0 / (np.maximum(inputs.cost.sum(axis=1), 1e-9) * len(self.grid))
+        cost = (self.held[1:, None] * inputs.cost[:, None, 1:]).reshape(batch, -1) * unit[:, None]
+        pull = cost.astype(np.float32) @ self.solve
+        shrink = (inputs.cost[:, :1] * self.stands_for * (unit[:, None] / slack_unit)).astype(np.float32)
+        project = rows @ self.solve
+        x = p_gen[:, 1:].reshape(batch, -1).astype(np.float32)
+        y = x @ rows.T + fixed
+        z, dual = y.copy(), np.zeros_like(y)
+        for _ in range(steps):
+            q = y + dual
+            z[:, :n] = q[:, :n] - np.clip(q[:, :n], -shrink, shrink)
+            np.clip(q[:, n:], self.low, self.high, out=z[:, n:])
+            x = (z - dual - fixed) @ project - pull
+            y = x @ rows.T + fixed
+            dual += DUAL_STEP * (y - z)
+        refined = np.concatenate([p_gen[:, :1], x.reshape(batch, n_knots - 1, n_gen)], axis=1)
+        targets = np.minimum(np.maximum(refined[:, 1:], self.case.p_min), self.case.p_max)
+        refined = follow(targets, p_gen[:, 0], self.step)
+        better = self._merit(inputs, fixed, refined) < self._merit(inputs, fixed, p_gen)
+        return np.where(better[:, None, None], refined, p_gen)
+
+    def _merit(self, inputs: Inputs, fixed: Array32, p_gen: Array) -> Array:
+        """Cost, raised in proportion to the largest excess of |ω| over its bound, shape (batch,)."""
+        batch, _, n_gen = p_gen.shape
+        n = self.n_slack
+        free = p_gen[:, 1:].reshape(batch, -1).astype(np.float32)
+        y = free @ self.rows[: n * (1 + n_gen), n_gen:].T + fixed[:, : n * (1 + n_gen)]
+        p_slack = y[:, :n] / math.sqrt(WEIGHTS["p_slack"])
+        omega = np.abs(y[:, n:]).max(axis=1) / math.sqrt(WEIGHTS["omega"])
+        generators = (np.einsum("bkg,k->bg", p_gen, self.held) * inputs.cost[:, 1:]).sum(axis=1)
+        cost = generators + inputs.cost[:, 0] * (np.abs(p_slack) @ self.stands_for)
+        return np.asarray(cost * (1.0 + EXCESS_PRICE * np.maximum(omega - (1.0 - 0.5 * MARGIN), 0.0)))

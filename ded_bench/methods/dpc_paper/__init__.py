@@ -1,0 +1,1 @@
+"""The policy of the paper: its network, features, loss and training."""

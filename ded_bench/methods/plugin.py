@@ -1,0 +1,261 @@
+"""Methods of others: a function in anyone's module, made to look like a module of ours.
+
+A function is named `module:function`, on the command line or by an entry point of the group
+`ded_bench.methods` in the package that brings it. It is either
+
+* `solve(instance, regime)` or `solve(instance, regime, case)`, which answers with a `Schedule`, or
+  with a `Solution` if it has more to say (status, iterations, times); or
+* `prepare(case, regime, settings)` - the first parameter is called `case` - which returns a function
+  from an instance to a `Schedule` or `Solution`, as our own methods do. Its module may offer
+  `SETTINGS`, slugs of settings in a mapping.
+
+Either module may offer `artifact(case, regime, settings) -> str`, a fingerprint of data that the
+answers depend on; that of the sources is added here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib
+import importlib.machinery
+import importlib.metadata
+import inspect
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.problem.case import LARGEST, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+
+#: Entry points of this group are methods: `name = "module:function"`.
+GROUP = "ded_bench.methods"
+#: What may name a method in the results: it is also the name of a folder.
+SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_TARGET = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """What the registry asks of a method's module, made from a function of another one."""
+
+    target: str
+    module: ModuleType
+    function: Callable[..., Any]
+
+    @property
+    def SETTINGS(self) -> Mapping[str, Any]:  # noqa: N802  (the name that our modules use)
+        """The settings that a `prepare` declares in its module, by slug; else the default alone."""
+        declared = getattr(self.module, "SETTINGS", None) if self._prepares else None
+        return declared if isinstance(declared, Mapping) else {"default": {}}
+
+    def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
+        """Return the function that solves one instance and checks what comes back.
+
+        Raises:
+            TypeError: a `prepare` returns something that cannot be called.
+        """
+        if self._prepares:
+            inner = self.function(case, regime, settings)
+            if not callable(inner):
+                raise TypeError(f"{self.target} returned {_kind(inner)}, not a function")
+            call: Callable[[Instance], Any] = inner
+        else:
+            extra = {"case": case} if "case" in _parameters(self.function) else {}
+            call = functools.partial(_swapped, self.function, regime, extra)
+
+        def solve(instance: Instance) -> Solution:
+            started = time.perf_counter()
+            answer = call(instance)
+            return accept(answer, case, instance, time.perf_counter() - started)
+
+        return solve
+
+    def artifact(self, case: Case, regime: str, settings: Settings) -> str:
+        """Hash of the sources of the function's package, after what the module itself says."""
+        own = getattr(self.module, "artifact", None)
+        said = str(own(case, regime, settings)) if callable(own) else ""
+        return said + _sources(self.module)
+
+    @property
+    def _prepares(self) -> bool:
+        return next(iter(_parameters(self.function)), "") == "case"
+
+
+def installed() -> dict[str, str]:
+    """Methods that installed packages bring: `module:function` by name.
+
+    Raises:
+        InputError: two packages bring different methods of the same name.
+    """
+    found: dict[str, str] = {}
+    for point in importlib.metadata.entry_points(group=GROUP):
+        target = point.value.partition("[")[0].replace(" ", "")
+        if found.setdefault(point.name, target) != target:
+            raise InputError(f"entry points {GROUP}", point.name, "two packages bring a method of this name")
+    return found
+
+
+def slug_of(target: str) -> str:
+    """The name that rows of `module:function` carry: `module.function`.
+
+    Raises:
+        InputError: this cannot be the name of a folder.
+    """
+    slug = target.replace(":", ".")
+    if not SLUG.fullmatch(slug):
+        raise InputError("--method", target, f"does not make a method's name (wanted: {SLUG.pattern})")
+    return slug
+
+
+def load(target: str) -> Foreign:
+    """Import `module:function`; modules in the working directory count.
+
+    Raises:
+        InputError: the target is not of this form, the module cannot be imported, it has no such
+            function, or this takes other arguments.
+    """
+    if not _TARGET.fullmatch(target):
+        raise InputError("--method", target, "is not of the form module:function")
+    module_name, _, name = target.partition(":")
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.append(str(Path.cwd()))  # last: nothing installed is shadowed
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # the command line's own output is rows
+            module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # anything may happen in someone's module
+        first = (str(error).strip().splitlines() or ["no message"])[0]
+        reason = f"{type(error).__name__}: {first}"[:200]
+        raise InputError("--method", target, f"{module_name} cannot be imported ({reason})") from None
+    function = getattr(module, name, None)
+    if not callable(function):
+        place = getattr(module, "__file__", None) or module_name
+        raise InputError("--method", target, f"{place} has no function {name!r}")
+    foreign = Foreign(target, module, function)
+    _check_signature(foreign)
+    return foreign
+
+
+def accept(answer: object, case: Case, instance: Instance, seconds: float) -> Solution:
+    """Turn what someone's function returned into a `Solution` that is sound.
+
+    Anything but a `Schedule` or a `Solution` whose schedule spans the horizon with finite numbers, one
+    column per generator, gives a failed `Solution` that says why.
+
+    Args:
+        seconds: wall time of the call, for answers that do not time themselves.
+    """
+    if isinstance(answer, Schedule):
+        answer = Solution(Status.FEASIBLE, answer)
+    if not isinstance(answer, Solution):
+        return _failed(f"returned {_kind(answer)}, not a Schedule or a Solution", seconds)
+    if str(answer.status) not in list(Status):
+        return _failed(f"returned the unknown status {str(answer.status)[:40]!r}", seconds)
+    status = Status(str(answer.status))
+    schedule: Schedule | None = None
+    if answer.schedule is not None:
+        try:
+            schedule = _sound(answer.schedule, case, instance)
+        except (InputError, TypeError, ValueError, AttributeError) as error:
+            return _failed(f"returned a wrong schedule: {error}", seconds)
+    elif status in (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY):
+        return _failed(f"claims {status} but returned no schedule", seconds)
+    solve_s, iterations = _number(answer.solve_s), _number(answer.iterations)
+    return Solution(
+        status=status,
+        schedule=schedule,
+        iterations=None if iterations is None else int(iterations),
+        build_s=_number(answer.build_s),
+        setup_s=_number(answer.setup_s),
+        solve_s=seconds if solve_s is None else solve_s,
+        solver_objective=_number(answer.solver_objective, -math.inf, math.inf),
+        solver_version=_line(answer.solver_version),
+        error=_line(answer.error),
+    )
+
+
+def _sound(schedule: Schedule, case: Case, instance: Instance) -> Schedule:
+    if np.iscomplexobj(schedule.t) or np.iscomplexobj(schedule.p):
+        raise InputError("schedule", "P", "values must be real numbers")
+    t, p = np.asarray(schedule.t, dtype=np.float64), np.asarray(schedule.p, dtype=np.float64)
+    if t.ndim != 1 or p.shape != (len(t), len(case.generators)):
+        wanted = f"t of shape (n,) and p of shape (n, {len(case.generators)})"
+        raise InputError("schedule", "P", f"shapes {t.shape} and {p.shape}, wanted {wanted}")
+    sound = Schedule(t, p)
+    sound.check(instance.horizon_s)
+    return sound
+
+
+def _failed(reason: str, seconds: float) -> Solution:
+    return Solution(Status.FAILED, solve_s=seconds, error=_line(reason))
+
+
+def _number(value: object, lowest: float = 0.0, highest: float = LARGEST) -> float | None:
+    """A finite number within these limits, or nothing."""
+    if isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value):
+        return float(value) if lowest <= value <= highest else None
+    return None
+
+
+def _line(text: object) -> str:
+    """One line that any file can hold."""
+    return " ".join(str(text).encode("utf-8", "replace").decode().split())[:300]
+
+
+def _kind(value: object) -> str:
+    return "nothing" if value is None else f"an object of type {type(value).__name__}"
+
+
+def _swapped(
+    function: Callable[..., Any], regime: str, extra: Mapping[str, Any], instance: Instance
+) -> object:
+    return function(instance, regime, **extra)
+
+
+def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters
+
+
+def _check_signature(foreign: Foreign) -> None:
+    wanted = "solve(instance, regime), solve(instance, regime, case) or prepare(case, regime, settings)"
+    try:
+        signature = inspect.signature(foreign.function)
+        names = list(signature.parameters)
+        if names[:1] == ["case"]:
+            signature.bind(None, None, None)
+        else:
+            signature.bind(None, None, **({"case": None} if "case" in names else {}))
+    except (TypeError, ValueError):  # other parameters, or a built-in without a signature
+        raise InputError("--method", foreign.target, f"takes other arguments than {wanted}") from None
+
+
+@functools.cache
+def _sources(module: ModuleType) -> str:
+    """Hash of the code a module comes from: its package, or its file if it is in none."""
+    root = sys.modules.get(module.__name__.partition(".")[0], module)
+    file = getattr(root, "__file__", None) or getattr(module, "__file__", None)
+    if file is None:
+        return ""
+    path = Path(file)
+    files = [path]
+    if hasattr(root, "__path__"):
+        suffixes = tuple(importlib.machinery.all_suffixes())
+        files = sorted(f for f in path.parent.rglob("*") if f.name.endswith(suffixes) and f.is_file())
+    digest = hashlib.sha256()
+    for f in files:
+        if "__pycache__" not in f.parts:
+            digest.update(str(f.relative_to(path.parent)).encode() + b"\0" + f.read_bytes())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,149 @@
+"""Policy files: weights and a JSON header in safetensors; their names, and what a policy refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.errors import InputError
+from ded_bench.methods.solution import DEFAULT_MODEL, Settings
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+
+if TYPE_CHECKING:
+    from torch import nn
+
+SCHEMA = "ded-bench/policy/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """What a policy was trained for: it answers nothing else."""
+
+    case: Case
+    regime: str
+    horizon_s: float
+
+    def check(self, instances: Sequence[Instance]) -> None:
+        """Raise InputError if an instance belongs to another case or horizon."""
+        for instance in instances:
+            if instance.case != self.case.id:
+                raise InputError(f"instance {instance.id}", "case", f"the policy is for case {self.case.id}")
+            if abs(instance.horizon_s - self.horizon_s) > 1e-9:
+                raise InputError(
+                    f"instance {instance.id}",
+                    "horizon_s",
+                    f"the policy is for a horizon of {self.horizon_s} s",
+                )
+
+
+def write_policy(path: Path, method: str, scope: Scope, network: nn.Module, training: dict[str, Any]) -> None:
+    """Write the weights and buffers of a network, with a header."""
+    header = {
+        "schema": SCHEMA,
+        "method": method,
+        "case": scope.case.id,
+        "case_fingerprint": scope.case.fingerprint,
+        "regime": scope.regime,
+        "horizon_s": scope.horizon_s,
+        "training": training,
+    }
+    arrays = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
+    write_arrays(path, arrays, header)
+
+
+def read_policy(
+    path: str | Path, method: str, case: Case, regime: str
+) -> tuple[dict[str, np.ndarray], Scope, dict[str, Any]]:
+    """Read weights, scope and training facts of a policy for a case and regime.
+
+    Raises:
+        InputError: the file is wrong, or the policy is for another case, its limits changed, or for
+            another regime or method.
+    """
+    arrays, header = read_arrays(path)
+    wanted = {
+        "schema": SCHEMA,
+        "method": method,
+        "case": case.id,
+        "case_fingerprint": case.fingerprint,
+        "regime": regime,
+    }
+    for name, value in wanted.items():
+        if header.get(name) != value:
+            raise InputError(path, name, f"is {str(header.get(name))[:60]!r}, but {value!r} is needed")
+    horizon, training = header.get("horizon_s"), header.get("training")
+    finite = isinstance(horizon, (int, float)) and 0 < horizon < float("inf")
+    if horizon is None or not finite or not isinstance(training, dict):
+        raise InputError(path, "horizon_s, training", "missing or mistyped")
+    return arrays, Scope(case, regime, float(horizon)), training
+
+
+def load_weights(network: nn.Module, arrays: dict[str, np.ndarray], path: str | Path) -> None:
+    """Fill a network with arrays of exactly its names and shapes; InputError otherwise."""
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    for name in expected.keys() | arrays.keys():
+        if name not in arrays or arrays[name].shape != expected.get(name):
+            raise InputError(path, name, "is missing, unknown or has the wrong shape")
+    import torch  # here only: who asks for a policy's name or header does without it
+
+    network.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
+
+
+@contextlib.contextmanager
+def reading_checkpoint(path: Path) -> Iterator[None]:
+    """Whatever fails inside, from opening the file to filling the networks, is the checkpoint's fault.
+
+    Raises:
+        InputError: it is no checkpoint, or one of another training.
+    """
+    try:
+        yield
+    except Exception:  # of pickle, zipfile and torch alike
+        problem = "is no checkpoint of this training; remove it, or train without --resume"
+        raise InputError(path, "", problem) from None
+
+
+def weights_fingerprint(network: nn.Module) -> str:
+    """Twelve hex digits that change when any weight does."""
+    values = [value.detach().cpu().numpy().tobytes() for value in network.state_dict().values()]
+    return hashlib.sha256(b"".join(values)).hexdigest()[:12]
+
+
+def policy_file(
+    results: Path, method: str, regime: str, model: str = DEFAULT_MODEL, settings: str = "default"
+) -> Path:
+    """Where a results folder keeps a policy; other settings or another Koopman model say so in its name."""
+    suffix = "" if settings == "default" else f"-{settings}"
+    suffix += "" if model == DEFAULT_MODEL else f"-{Path(model).stem}"
+    return results / "policies" / f"{method}-{regime}{suffix}.safetensors"
+
+
+def find_policy_file(
+    method: str, case: Case, regime: str, settings: Settings, trained: str = "default"
+) -> Path:
+    """Return the policy file given in the settings, else the first one in the folders to search.
+
+    Args:
+        trained: slug of the training settings.
+
+    Raises:
+        InputError: there is none; names the command that trains one.
+    """
+    if settings.policy:
+        return settings.policy
+    for folder in settings.search:
+        path = policy_file(folder, method, regime, settings.model, trained)
+        if path.is_file():
+            return path
+    command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.id}"
+    command += "" if trained == "default" else f" --settings {trained}"
+    command += "" if settings.model == DEFAULT_MODEL else f" --model {settings.model}"
+    raise InputError("--policy", "", f"no {method} policy for {regime} yet; run `{command}`")

@@ -1,0 +1,264 @@
+"""What changed between two results folders: a benchmark's regression test.
+
+Rows are compared by their key. Status, feasibility, objective and violations decide; gaps and times
+are told for information.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from ded_bench.evaluate.summary import GROUP, gaps, groups, table, title
+from ded_bench.evaluate.timing import latest_host, read_timing, timing_frame
+from ded_bench.files.errors import InputError
+from ded_bench.report.render import Column, to_markdown
+from ded_bench.run.results import Key, Results, Row
+
+#: Rows that a section of the printed comparison names; the rest are counted.
+SHOWN = 10
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Largest change that is none: of the objective relative, of violations absolute."""
+
+    objective: float = 1e-6
+    hz: float = 1e-6
+    pu: float = 1e-8
+
+
+@dataclass(frozen=True)
+class Change:
+    """One value of one row, before (in A) and after (in B); None is an empty cell."""
+
+    key: Key
+    column: str
+    before: str | float | bool | None
+    after: str | float | bool | None
+    size: float  # relative or absolute; infinite where there is no distance
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What tells two results folders apart."""
+
+    a: Path
+    b: Path
+    heads: tuple[str, str]
+    common: int
+    incomparable: str  # why nothing was compared; else empty
+    only_a: tuple[Key, ...]
+    only_b: tuple[Key, ...]
+    changes: tuple[Change, ...]
+    summary: pd.DataFrame  # SUMMARY_COLUMNS, for information
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing changed beyond the tolerances."""
+        return not (self.incomparable or self.only_a or self.only_b or self.changes)
+
+
+def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: bool = False) -> Comparison:
+    """Compare two results folders.
+
+    Args:
+        a: the folder that sets the standard.
+        b: the folder that is compared with it.
+        tolerance: changes up to this are none; None: the default ones.
+        common_only: rows that only one folder has count as no difference.
+
+    Raises:
+        InputError: a folder has no results table, or one that is wrong.
+    """
+    before, after = _read(a), _read(b)
+    shared = [key for key in before if key in after]
+    facts = (a, b, (_head(before), _head(after)), len(shared))
+    if reason := _incomparable(before, after, shared):
+        return Comparison(*facts, reason, (), (), (), table([], SUMMARY_COLUMNS))
+    only_a = () if common_only else tuple(key for key in before if key not in after)
+    only_b = () if common_only else tuple(key for key in after if key not in before)
+    limits = tolerance or Tolerance()
+    changes = [change for key in shared for change in _changes(before[key], after[key], limits)]
+    changes.sort(key=lambda change: (list(_limits(limits)).index(change.column), -change.size, change.key))
+    return Comparison(*facts, "", only_a, only_b, tuple(changes), _summary(a, b))
+
+
+def to_text(comparison: Comparison) -> str:
+    """The comparison for a terminal: a few lines for each kind of change, a table, one verdict."""
+    c = comparison
+    lines = [f"A  {c.a}: {c.heads[0]}", f"B  {c.b}: {c.heads[1]}"]
+    if c.incomparable:
+        return "\n".join([*lines, f"not comparable: {c.incomparable}"]) + "\n"
+    counts = []
+    for name, keys in (("only in A", c.only_a), ("only in B", c.only_b)):
+        if keys:
+            counts.append(f"{len(keys)} rows {name}")
+            lines += _section(f"{name}: {len(keys)} rows", [_name(key) for key in keys])
+    for column in dict.fromkeys(change.column for change in c.changes):
+        found = [change for change in c.changes if change.column == column]
+        counts.append(f"{len(found)} × {column}")
+        told = [f"{_name(change.key)}: {_arrow(change)}" for change in found]
+        lines += _section(f"{column}: {len(found)} of {c.common} common rows", told)
+    if len(c.summary):
+        lines += ["", to_markdown(c.summary, PRINTED)]
+    verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
+    return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
+
+
+def to_json(comparison: Comparison) -> str:
+    """The comparison as one JSON object; infinite sizes and missing numbers are null."""
+    c = comparison
+    changes = [
+        change.key._asdict()
+        | {"column": change.column, "before": change.before, "after": change.after}
+        | {"size": change.size if math.isfinite(change.size) else None}
+        for change in c.changes
+    ]
+    summary = c.summary.astype(object).where(c.summary.notna(), None)
+    return json.dumps(
+        {
+            "a": str(c.a),
+            "b": str(c.b),
+            "same": c.same,
+            "incomparable": c.incomparable,
+            "common": c.common,
+            "only_a": [key._asdict() for key in c.only_a],
+            "only_b": [key._asdict() for key in c.only_b],
+            "changes": changes,
+            "summary": summary.to_dict("records"),
+        }
+    )
+
+
+def _read(folder: Path) -> dict[Key, Row]:
+    results = Results(folder)
+    if not results.path.is_file():
+        raise InputError(results.path, "", "is missing: this is no results folder")
+    return results.rows
+
+
+def _head(rows: Mapping[Key, Row]) -> str:
+    versions = ", ".join(sorted({row.version for row in rows.values()})) or "–"
+    problems = ", ".join(sorted({row.problems_version or "(none)" for row in rows.values()})) or "–"
+    return f"{len(rows)} rows, ded-bench {versions}, problems {problems}"
+
+
+def _incomparable(before: Mapping[Key, Row], after: Mapping[Key, Row], shared: Sequence[Key]) -> str:
+    """Why the two tables are not about the same problems; empty if they are."""
+    pairs = [(before[key], after[key]) for key in shared]
+    other = [(x, y) for x, y in pairs if (x.case, x.problems_version) != (y.case, y.problems_version)]
+    if other:
+        x, y = other[0]
+        return (
+            f"{len(other)} common rows are of different problems, "
+            f"such as {_name(x.key)}: {_problems(x)} in A, {_problems(y)} in B"
+        )
+    if not shared and before and after:
+        return "no row is in both"
+    return ""
+
+
+def _problems(row: Row) -> str:
+    return f"{row.case} {row.problems_version or '(no version)'}"
+
+
+def _limits(tolerance: Tolerance) -> dict[str, float]:
+    """Columns that decide, in the order in which they are told, with the size of a change."""
+    return {
+        "status": 0.0,
+        "feasible": 0.0,
+        "objective": tolerance.objective,
+        "freq_violation_hz": tolerance.hz,
+        "ramp_violation": tolerance.pu,
+        "bound_violation": tolerance.pu,
+        "initial_violation": tolerance.pu,
+    }
+
+
+def _changes(before: Row, after: Row, tolerance: Tolerance) -> Iterator[Change]:
+    for column, limit in _limits(tolerance).items():
+        x, y = getattr(before, column), getattr(after, column)
+        size = _distance(x, y, relative=column == "objective")
+        if size > limit:
+            yield Change(before.key, column, x, y, size)
+
+
+def _distance(x: object, y: object, relative: bool) -> float:
+    if x == y:
+        return 0.0
+    if not (isinstance(x, float) and isinstance(y, float)):
+        return math.inf
+    return abs(y - x) / max(abs(x), abs(y)) if relative else abs(y - x)
+
+
+def _summary(a: Path, b: Path) -> pd.DataFrame:
+    """Mean gap and time per method over the common rows that have one in both folders."""
+    names = list(Key._fields)
+    frames = [gaps(Results(folder).frame()).set_index(names, drop=False) for folder in (a, b)]
+    common = frames[0].index.intersection(frames[1].index, sort=False)
+    x, y = (frame.loc[common] for frame in frames)
+    timings = []
+    for folder in (a, b):
+        timing = latest_host(timing_frame(read_timing(folder / "timing.csv")))
+        timings.append(timing.set_index(GROUP)["solve_s"])
+    rows = []
+    for regime, method, settings, part in groups(x.reset_index(drop=True)):
+        chosen = pd.MultiIndex.from_frame(part[names])
+        mine, theirs = x.loc[chosen], y.loc[chosen]
+        both = (mine["gap_percent"].notna() & theirs["gap_percent"].notna()).to_numpy()
+        ratios = (theirs["solve_s"] / mine["solve_s"].where(mine["solve_s"] > 0)).dropna()
+        alone = [timing.get((regime, method, settings), math.nan) for timing in timings]
+        rows.append(
+            {
+                "regime": regime,
+                "title": title(method, settings),
+                "method": method,
+                "settings": settings,
+                "common": len(part),
+                "gap_percent_a": float(mine["gap_percent"][both].mean()),
+                "gap_percent_b": float(theirs["gap_percent"][both].mean()),
+                "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
+                "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
+            }
+        )
+    return table(rows, SUMMARY_COLUMNS)
+
+
+def _section(heading: str, items: Sequence[str]) -> list[str]:
+    rest = [f"  … and {len(items) - SHOWN} more"] if len(items) > SHOWN else []
+    return [heading, *(f"  {item}" for item in items[:SHOWN]), *rest]
+
+
+def _name(key: Key) -> str:
+    return " ".join(key[:3]) + ("" if key.settings == "default" else f" [{key.settings}]")
+
+
+def _arrow(change: Change) -> str:
+    numbers = isinstance(change.before, float) and isinstance(change.after, float)
+    by = f" ({'relative ' if change.column == 'objective' else ''}{change.size:.2g})" if numbers else ""
+    return f"{_cell(change.before)} → {_cell(change.after)}{by}"
+
+
+def _cell(value: object) -> str:
+    return "(none)" if value is None else f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+SUMMARY_COLUMNS = [
+    *("regime", "title", "method", "settings", "common"),
+    *("gap_percent_a", "gap_percent_b", "time_ratio", "time_ratio_alone"),
+]
+PRINTED = (
+    Column("regime", "Regime"),
+    Column("title", "Method"),
+    Column("common", "rows"),
+    Column("gap_percent_a", "mean gap A, %"),
+    Column("gap_percent_b", "mean gap B, %"),
+    Column("time_ratio", "time B/A, under load"),
+    Column("time_ratio_alone", "time B/A, alone"),
+)

@@ -1,0 +1,1 @@
+"""Instance × regime × method to rows: results table, tasks, worker processes, cluster."""

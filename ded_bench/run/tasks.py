@@ -1,0 +1,97 @@
+"""What worker processes do: solve one task, score a few; a failure is an answer, too."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ded_bench.methods.plugin import accept
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.run.environment import host
+from ded_bench.run.pool import NoAnswerError, WorkerDiedError
+from ded_bench.run.shipping import Files, unpacked
+from ded_bench.solvers.status import Status
+from ded_bench.truth.score import Score, score_many
+from ded_bench.truth.simulate import SimulationError
+
+if TYPE_CHECKING:
+    from ded_bench.run.results import Key
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row to be made."""
+
+    instance: Instance
+    split: str
+    regime: str
+    method: str
+    settings: Settings
+    fingerprint: str
+    files: Files = ()  # for a worker without the results folder
+
+    @property
+    def key(self) -> Key:
+        """The row's place in the results table."""
+        from ded_bench.run.results import Key  # and with it pandas, which worker processes do without
+
+        return Key(self.instance.id, self.regime, self.method, self.settings.slug)
+
+
+def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
+    """Solve one task in this process; returns the Solution and the machine.
+
+    A method that raises, or answers with something that is no Solution for this instance, gives a
+    failed Solution that says so.
+    """
+    started = time.perf_counter()
+    try:
+        answer = _prepared(case, task.method, task.regime, task.settings, task.files)(task.instance)
+        return accept(answer, case, task.instance, time.perf_counter() - started), host()
+    except Exception as error:  # the boundary to other people's methods: a failure is a row
+        return failed(error), host()
+
+
+def score_tasks(
+    case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule]
+) -> list[Score | BaseException]:
+    """Score tasks of one time grid side by side; if one loses synchronism, each on its own."""
+    regimes = [task.regime for task in tasks]
+    try:
+        return list(score_many(case, [task.instance for task in tasks], schedules, regimes))
+    except SimulationError as error:
+        if len(tasks) == 1:
+            return [error]
+        middle = len(tasks) // 2
+        return score_tasks(case, tasks[:middle], schedules[:middle]) + score_tasks(
+            case, tasks[middle:], schedules[middle:]
+        )
+
+
+def failed(error: object) -> Solution:
+    """A Solution for a method that raised or gave no answer, or whose process died."""
+    status = Status.TIME_LIMIT if isinstance(error, NoAnswerError) else Status.FAILED
+    return Solution(status, error=reason_of(error))
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(case: Case, method: str, regime: str, settings: Settings, files: Files) -> Solver:
+    if not files:
+        return get_method(method).prepare(case, regime, settings)
+    with unpacked(settings, files) as own:
+        return get_method(method).prepare(case, regime, own)
+
+
+def reason_of(error: object) -> str:
+    """One line that a person understands and any file can hold."""
+    first = (str(error).strip().splitlines() or ["no message"])[0]
+    if isinstance(error, BaseException) and not isinstance(error, NoAnswerError | WorkerDiedError):
+        first = f"{type(error).__name__}: {first}"
+    return first.encode("utf-8", "replace").decode()[:300]

@@ -1,0 +1,263 @@
+"""IPOPT: from the `casadi` wheel, which needs no installation, or as an `ipopt` executable."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+import pyomo.environ as pyo
+from pyomo.common.errors import ApplicationError
+from pyomo.opt import SolverResults, SolverStatus, TerminationCondition
+from pyomo.repn.plugins.nl_writer import NLWriter
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import Array
+from ded_bench.solvers.linear_program import LinearProgram, assign, bounds, read_linear
+from ded_bench.solvers.outcome import Options, Outcome
+from ded_bench.solvers.status import Status
+
+#: IPOPT's return values as CasADi spells them; everything else is a failure.
+_IPOPT_STATUS = {
+    "Solve_Succeeded": Status.OPTIMAL,
+    "Solved_To_Acceptable_Level": Status.FEASIBLE,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
+    "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
+}
+#: For linear programs: derivatives that never change, and bounds as they are (by default IPOPT relaxes
+#: them by 1e-8). Mehrotra's steps would save a third, but with them IPOPT never says infeasible.
+LINEAR_OPTIONS: dict[str, Any] = {
+    "bound_relax_factor": 0.0,
+    "grad_f_constant": "yes",
+    "jac_c_constant": "yes",
+    "jac_d_constant": "yes",
+    "hessian_constant": "yes",
+}
+_IPOPT_VERSION = f"ipopt (casadi {importlib.metadata.version('casadi')})"
+#: What `SolverFactory("ipopt_casadi")` reports.
+_PYOMO_STATUS = {
+    Status.OPTIMAL: (SolverStatus.ok, TerminationCondition.optimal),
+    Status.FEASIBLE: (SolverStatus.ok, TerminationCondition.feasible),
+    Status.INFEASIBLE: (SolverStatus.warning, TerminationCondition.infeasible),
+    Status.TIME_LIMIT: (SolverStatus.aborted, TerminationCondition.maxTimeLimit),
+    Status.FAILED: (SolverStatus.error, TerminationCondition.error),
+}
+
+
+class CasadiIpopt:
+    """IPOPT and MUMPS from the `casadi` wheel: on a linear model's arrays, else on its .nl form.
+
+    Args:
+        model: the Pyomo model, or its arrays; its structure must not change afterwards.
+        options: IPOPT options beyond the defaults.
+    """
+
+    def __init__(self, model: pyo.ConcreteModel | LinearProgram, options: Options | None = None) -> None:
+        started = time.perf_counter()
+        self._options = dict(options or {})
+        try:
+            program = model if isinstance(model, LinearProgram) else read_linear(model)
+            program.numbers()
+            self._source: _Arrays | _Nl = _Arrays(program)
+        except ValueError:  # not linear, or not until its data are fixed
+            self._source = _Nl(model)
+        self._solver: casadi.Function | None = None
+        self._limit: float | None = None
+        self._setup_s = time.perf_counter() - started
+
+    def solve(self, time_limit_s: float | None = None) -> Outcome:
+        """See `Compiled`; the first call also pays for symbolic derivatives."""
+        started = time.perf_counter()
+        source = self._source
+        if self._solver is None or self._limit != time_limit_s:
+            self._solver, self._limit = self._make(time_limit_s), time_limit_s
+        arguments, objective_from = source.current()
+        start = np.array([0.0 if v.value is None else v.value for v in source.columns])
+        setup = self._setup_s + time.perf_counter() - started
+        self._setup_s = 0.0  # paid once, by the first solve
+        started = time.perf_counter()
+        with _silent_failure() as caught:
+            result = self._solver(x0=start, lbg=source.g_lower, ubg=source.g_upper, **arguments)
+        elapsed = time.perf_counter() - started
+        stats = self._solver.stats()
+        message = caught[0] if caught else str(stats["return_status"])
+        status = Status.FAILED if caught else _IPOPT_STATUS.get(message, Status.FAILED)
+        has_values = status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT)
+        if has_values:
+            assign(source.columns, result["x"].full().ravel())
+        objective = objective_from(float(result["f"])) if has_values else None
+        return Outcome(
+            status, has_values, stats.get("iter_count"), setup, elapsed, objective, _IPOPT_VERSION, message
+        )
+
+    def _make(self, time_limit_s: float | None) -> casadi.Function:
+        ipopt: dict[str, Any] = {"print_level": 0, "sb": "yes", **self._options}
+        if time_limit_s is not None:
+            ipopt["max_wall_time"] = time_limit_s
+        # Scalar expressions must be expanded, or every evaluation takes several times as long.
+        expand = isinstance(self._source, _Nl)
+        options: dict[str, Any] = {"expand": expand, "print_time": False, "error_on_fail": False}
+        return casadi.nlpsol("ipopt", "ipopt", self._source.nlp, options | {"ipopt": ipopt})
+
+
+#: What IPOPT is called with, and how its objective becomes the model's.
+_Current = tuple[dict[str, Array], Callable[[float], float]]
+
+
+class _Arrays:
+    """A linear program for CasADi: constant matrices, costs as parameters."""
+
+    def __init__(self, program: LinearProgram) -> None:
+        n_rows, n = program.a.shape
+        pattern = casadi.Sparsity(n_rows, n, program.a.indptr.tolist(), program.a.indices.tolist())
+        x, cost = casadi.MX.sym("x", n), casadi.MX.sym("cost", n)
+        g = casadi.mtimes(casadi.DM(pattern, program.a.data), x)
+        self.nlp: dict[str, Any] = {"x": x, "p": cost, "f": casadi.dot(cost, x), "g": g}
+        self.columns = program.columns
+        self.g_lower, self.g_upper = program.row_lower, program.row_upper
+        self._program = program
+
+    def current(self) -> _Current:
+        numbers = self._program.numbers()
+        arguments = {"lbx": numbers.lower, "ubx": numbers.upper, "p": numbers.cost}
+        return arguments, lambda f: self._program.sense * (f + numbers.constant)
+
+
+class _Nl:
+    """A Pyomo model for CasADi through its .nl form."""
+
+    def __init__(self, model: pyo.ConcreteModel) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "model.nl")
+            with path.open("w") as stream:
+                info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
+            builder = casadi.NlpBuilder()
+            builder.import_nl(str(path))
+        g = casadi.vertcat(*builder.g)
+        self.nlp: dict[str, Any] = {"x": casadi.vertcat(*builder.x), "f": builder.f, "g": g}
+        self.columns = tuple(info.variables)
+        self.g_lower, self.g_upper = np.array(builder.g_lb), np.array(builder.g_ub)
+        self._sign = -1.0 if next(iter(info.objectives)).sense == pyo.maximize else 1.0
+
+    def current(self) -> _Current:
+        lower, upper = bounds(self.columns)
+        return {"lbx": lower, "ubx": upper}, lambda f: self._sign * f
+
+
+class IpoptExecutable:
+    """An `ipopt` executable on the PATH, through Pyomo's own interface and files.
+
+    Raises:
+        InputError: there is none.
+    """
+
+    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
+        self._model = model
+        # Pyomo passes options with this prefix in a file, which knows more of them than the command line.
+        self._options = {f"OF_{name}": value for name, value in (options or {}).items()}
+        path = shutil.which("ipopt")
+        if path is None:
+            raise InputError("ipopt", "", "no such executable on the PATH; the default settings need none")
+        self._solver = pyo.SolverFactory("ipopt", executable=path)
+        self._version = "ipopt " + ".".join(map(str, self._solver.version() or ()))
+
+    def solve(self, time_limit_s: float | None = None) -> Outcome:
+        """See `Compiled`; writing the .nl file and reading the answer count as set-up."""
+        started = time.perf_counter()
+        limit = {} if time_limit_s is None else {"OF_max_wall_time": time_limit_s}
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder, "ipopt.log")
+            try:
+                results = self._solver.solve(
+                    self._model, options=self._options | limit, load_solutions=False, logfile=str(log)
+                )
+            except ApplicationError as error:
+                return self._failed(time.perf_counter() - started, str(error))
+            found = re.search(r"Number of Iterations\.*:\s*(\d+)", log.read_text(errors="replace"))
+        message = str(results.solver.message).replace("\\x3a", ":")
+        status = _executable_status(results.solver.termination_condition, message)
+        has_values = status in (Status.OPTIMAL, Status.FEASIBLE)
+        if has_values:
+            self._model.solutions.load_from(results)
+        solve_s = float(results.solver.time)
+        return Outcome(
+            status,
+            has_values,
+            int(found.group(1)) if found else None,
+            time.perf_counter() - started - solve_s,
+            solve_s,
+            _objective_value(self._model) if has_values else None,
+            self._version,
+            message,
+        )
+
+    def _failed(self, elapsed: float, message: str) -> Outcome:
+        return Outcome(Status.FAILED, False, None, 0.0, elapsed, None, self._version, message)
+
+
+def _executable_status(condition: TerminationCondition, message: str) -> Status:
+    """IPOPT's answer in a .sol file: a condition, and a sentence that tells more."""
+    if "time exceeded" in message.lower():
+        return Status.TIME_LIMIT
+    if condition == TerminationCondition.infeasible:
+        return Status.INFEASIBLE
+    if condition == TerminationCondition.optimal:
+        return Status.FEASIBLE if "acceptable" in message.lower() else Status.OPTIMAL
+    return Status.FAILED
+
+
+def _objective_value(model: pyo.ConcreteModel) -> float:
+    return float(pyo.value(next(model.component_data_objects(pyo.Objective, active=True))))
+
+
+@contextlib.contextmanager
+def _silent_failure() -> Iterator[list[str]]:
+    """Turn an exception of the solver library into a message."""
+    caught: list[str] = []
+    try:
+        yield caught
+    except RuntimeError as error:
+        caught.append(str(error).splitlines()[0][:200])
+
+
+@pyo.SolverFactory.register("ipopt_casadi", doc="IPOPT from the casadi wheel")
+class IpoptCasadi:
+    """`SolverFactory("ipopt_casadi")`: IPOPT for any continuous Pyomo model, without an executable."""
+
+    def __init__(self, options: Options | None = None, **_: Any) -> None:
+        self.options: dict[str, Any] = dict(options or {})
+
+    def __enter__(self) -> IpoptCasadi:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def available(self, exception_flag: bool = True) -> bool:
+        """Always: CasADi is a dependency."""
+        return True
+
+    def solve(
+        self,
+        model: pyo.ConcreteModel,
+        options: Options | None = None,
+        timelimit: float | None = None,
+        tee: bool = False,
+    ) -> SolverResults:
+        """Solve from the model's current values; variables get values only if there is a solution."""
+        own = self.options | dict(options or {}) | ({"print_level": 5} if tee else {})
+        outcome = CasadiIpopt(model, own).solve(timelimit)
+        results = SolverResults()
+        results.solver.status, results.solver.termination_condition = _PYOMO_STATUS[outcome.status]
+        results.solver.message = outcome.message
+        results.solver.time = outcome.solve_s
+        return results

@@ -1,0 +1,28 @@
+"""What a solver claims, in a word and in a sentence."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Status(enum.StrEnum):
+    """What the solver claims; the scorer's verdict stands in other columns."""
+
+    OPTIMAL = "Optimal"
+    FEASIBLE = "Feasible"
+    INFEASIBLE = "Infeasible"
+    TIME_LIMIT = "TimeLimit"
+    FAILED = "Failed"
+    POLICY = "Policy"
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return {
+            Status.OPTIMAL: "the solver reports an optimum within its tolerances",
+            Status.FEASIBLE: "the method gives a schedule without a claim of optimality",
+            Status.INFEASIBLE: "the solver reports that no schedule meets every constraint",
+            Status.TIME_LIMIT: "the time limit passed before the solver finished",
+            Status.FAILED: "the method ended without a schedule",
+            Status.POLICY: "a trained policy was evaluated; no solver ran",
+        }[self]

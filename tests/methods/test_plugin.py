@@ -1,0 +1,243 @@
+"""Other people's methods: what counts as one, what they may answer, and how each mistake is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.plugin import accept
+from ded_bench.methods.registry import METHODS, get_method, registered
+from ded_bench.methods.solution import Settings, Solution
+from ded_bench.problem.case import Case
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+
+MODULE = """
+import numpy as np
+from ded_bench import Schedule, Solution, Status
+
+SETTINGS = {"default": {}, "bold": {}}
+weights = "w1"
+
+def flat(instance, power):
+    return Schedule(t=np.array([0.0, instance.horizon_s]), p=np.array([power, power]))
+
+def solve(instance, regime):
+    return flat(instance, list(instance.initial.power.values()))
+
+def with_case(instance, regime, case):
+    return flat(instance, case.p_nominal)
+
+def with_option(instance, regime, gain=2.0):
+    return flat(instance, list(instance.initial.power.values()))
+
+def prepare(case, regime, settings):
+    def run(instance):
+        return Solution(Status.OPTIMAL, flat(instance, case.p_nominal), iterations=7, solve_s=0.25)
+    return run
+
+def hollow(case, regime, settings):
+    return None
+
+def alone(instance):
+    return None
+
+def bent(case, regime):
+    return None
+
+constant = 3
+"""
+
+
+@pytest.fixture
+def theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module of somebody's in the working directory; returns its name."""
+    name = f"theirs_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p != ""])
+    yield name
+    sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def instance(threebus: Case, quiet_instance):
+    return quiet_instance(threebus, horizon_s=1.0)
+
+
+def answer(name: str, case: Case, instance, settings: Settings | None = None) -> Solution:
+    return get_method(name).prepare(case, "NO", settings or Settings())(instance)
+
+
+def test_a_function_of_instance_and_regime_is_a_method(theirs, threebus, instance) -> None:
+    solution = answer(f"{theirs}:solve", threebus, instance)
+    assert solution.status is Status.FEASIBLE
+    assert solution.schedule.p.tolist() == [[0.6], [0.6]]
+    assert 0 < solution.solve_s < 1
+    assert answer(f"{theirs}:with_option", threebus, instance).status is Status.FEASIBLE
+
+
+def test_it_gets_the_case_if_it_asks(theirs, threebus, instance) -> None:
+    assert answer(f"{theirs}:with_case", threebus, instance).schedule.p.tolist() == [[0.6], [0.6]]
+
+
+def test_a_prepare_is_one_with_its_settings(theirs, threebus, instance) -> None:
+    solution = answer(f"{theirs}:prepare", threebus, instance, Settings("bold"))
+    assert (solution.status, solution.iterations, solution.solve_s) == (Status.OPTIMAL, 7, 0.25)
+    with pytest.raises(InputError, match=r"--settings: meek: unknown to method .*known: default, bold"):
+        answer(f"{theirs}:prepare", threebus, instance, Settings("meek"))
+    with pytest.raises(InputError, match=r"bold: unknown to method .*known: default\)"):
+        answer(f"{theirs}:solve", threebus, instance, Settings("bold"))
+    with pytest.raises(TypeError, match="returned nothing, not a function"):
+        answer(f"{theirs}:hollow", threebus, instance)
+
+
+def test_its_name_in_the_rows_leads_back_to_it(theirs) -> None:
+    method = get_method(f"{theirs}:solve")
+    assert method.name == f"{theirs}.solve"
+    assert get_method(method.name) == method
+
+
+@pytest.mark.parametrize(
+    ("target", "told"),
+    [
+        ("nowhere_at_all:solve", "nowhere_at_all cannot be imported (ModuleNotFoundError"),
+        ("{}:absent", ".py has no function 'absent'"),
+        ("{}:constant", "has no function 'constant'"),
+        ("{}:alone", "takes other arguments than solve(instance, regime)"),
+        ("{}:bent", "takes other arguments than"),
+        ("{}:solve()", "not of the form module:function"),
+        ("../{}:solve", "not of the form"),
+        (":solve", "not of the form"),
+        ("{}:", "not of the form"),
+        ("nowhere.at_all", "cannot be imported"),
+        ("magic", "unknown method (known: "),
+        ("x" * 70 + ":solve", "cannot be imported"),
+    ],
+)
+def test_what_is_no_method_is_told_in_one_line(theirs, target, told) -> None:
+    with pytest.raises(InputError) as caught:
+        get_method(target.format(theirs))
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["raise SystemExit(3)", "1 / 0", "def f(:", "print('hi'); import gone"])
+def test_a_module_that_cannot_be_imported_is_bad_input(text, tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "broken_module_of_theirs.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="broken_module_of_theirs cannot be imported"):
+        get_method("broken_module_of_theirs:f")
+    assert capsys.readouterr().out == ""
+
+
+def test_the_fingerprint_follows_the_sources_and_what_the_module_says(
+    tmp_path, threebus, monkeypatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    prints = []
+    for name, text, helper in (("one", "", "x = 1"), ("two", "", "x = 1"), ("three", "", "x = 2")):
+        package = tmp_path / f"pack_{name}"
+        package.mkdir()
+        (package / "__init__.py").write_text(text)
+        (package / "helper.py").write_text(helper)
+        (package / "main.py").write_text("def solve(instance, regime): ...")
+        method = get_method(f"pack_{name}.main:solve")
+        prints.append(method.artifact(threebus, "NO", Settings()))
+    assert prints[0] == prints[1] != prints[2]  # a change anywhere in the package counts
+    (tmp_path / "speaking.py").write_text(
+        "def artifact(case, regime, settings): return 'weights-7-'\ndef solve(instance, regime): ..."
+    )
+    assert get_method("speaking:solve").artifact(threebus, "NO", Settings()).startswith("weights-7-")
+
+
+GOOD = Schedule(np.array([0.0, 1.0]), np.array([[0.6], [0.6]]))
+END = np.array([0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (None, "returned nothing, not a Schedule"),
+        ([[0.6], [0.6]], "an object of type list"),
+        (Schedule, "an object of type type"),
+        (Schedule(END, np.array([[0.6], [np.nan]])), "finite numbers"),
+        (Schedule(END, np.array([0.6, 0.6])), "shapes (2,) and (2,), wanted"),
+        (Schedule(END, np.full((2, 2), 0.6)), "shapes (2,) and (2, 2)"),
+        (Schedule(END[:1], np.full((1, 1), 0.6)), "at least two rows"),
+        (Schedule(0.5 * END, np.full((2, 1), 0.6)), "must end at the horizon 1.0, not 0.5"),
+        (Schedule(60 * END, np.full((2, 1), 0.6)), "must end at the horizon 1.0, not 60.0"),
+        (Schedule(END[::-1], np.full((2, 1), 0.6)), "increase strictly"),
+        (Schedule("ab", np.full((2, 1), 0.6)), "wrong schedule"),
+        (Schedule(END, np.full((2, 1), 1j)), "must be real numbers"),
+        (Schedule(None, None), "wrong schedule"),
+        (Solution(Status.OPTIMAL, "soon"), "wrong schedule"),
+        (Solution(Status.OPTIMAL), "claims Optimal but returned no schedule"),
+        (Solution("Splendid", GOOD), "unknown status 'Splendid'"),
+    ],
+)
+def test_nonsense_is_a_failed_solution_that_says_why(returned, told, threebus, instance) -> None:
+    solution = accept(returned, threebus, instance, 0.5)
+    assert solution.status is Status.FAILED
+    assert solution.schedule is None
+    assert told in solution.error
+    assert solution.solve_s == 0.5
+
+
+def test_what_a_table_cannot_hold_is_left_out(threebus, instance) -> None:
+    strange = Solution(
+        Status.FEASIBLE,
+        Schedule([0, 1], [[0.6], [0.6]]),  # lists will do
+        iterations=np.int64(4),
+        build_s=float("nan"),
+        setup_s=-1.0,
+        solve_s=float("inf"),
+        solver_objective="much",
+        solver_version="a\nb",
+        error="\ud800",
+    )
+    assert dataclasses.replace(accept(strange, threebus, instance, 0.5), schedule=None) == Solution(
+        Status.FEASIBLE, None, 4, None, None, 0.5, None, "a b", "?"
+    )
+    limit = Solution(Status.TIME_LIMIT, error="no time left")
+    assert accept(limit, threebus, instance, 0.5) == dataclasses.replace(limit, solve_s=0.5)
+
+
+def install(folder: Path, name: str, text: str) -> None:
+    """What an installer leaves of a package's entry points."""
+    (folder / f"{name}-1.0.dist-info").mkdir(parents=True)
+    (folder / f"{name}-1.0.dist-info" / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n"
+    )
+    (folder / f"{name}-1.0.dist-info" / "entry_points.txt").write_text(f"[ded_bench.methods]\n{text}\n")
+
+
+def test_installed_packages_bring_methods(theirs, tmp_path, threebus, instance, monkeypatch) -> None:
+    install(
+        tmp_path / "site", "pack", f"wise = {theirs}:solve\nded = {theirs}:solve\nun/safe = {theirs}:solve"
+    )
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    assert list(registered()) == [*METHODS, "wise"]
+    assert get_method("ded") is METHODS["ded"]  # ours keep their names
+    assert get_method("wise").name == "wise"
+    assert answer("wise", threebus, instance).status is Status.FEASIBLE
+    with pytest.raises(InputError, match=r"known: .*ded-ko.*, wise, or module:function"):
+        get_method("magic")
+    install(tmp_path / "other", "rival", f"wise = {theirs}:with_case")
+    monkeypatch.syspath_prepend(tmp_path / "other")
+    with pytest.raises(InputError, match="wise: two packages"):
+        get_method("wise")
+
+
+def test_an_installed_method_that_is_broken_is_told(tmp_path, monkeypatch) -> None:
+    install(tmp_path / "site", "pack", "gone = nowhere_at_all:solve\nbare = json")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    with pytest.raises(InputError, match="nowhere_at_all cannot be imported"):
+        get_method("gone")
+    with pytest.raises(InputError, match="json: is not of the form module:function"):
+        get_method("bare")

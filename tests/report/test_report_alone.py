@@ -1,0 +1,86 @@
+"""The report of folders that hold little or nothing, or something wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ded_bench.evaluate.certificate import Certificate, save_certificate
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import Case
+from ded_bench.report.report import write_report
+from ded_bench.run.results import Results, Row
+
+
+@pytest.mark.usefixtures("sketched")
+def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
+    files = write_report(ninebus, tmp_path / "empty", problems)
+    text = (tmp_path / "empty" / "report.md").read_text()
+    assert "No rows yet" in text
+    assert "ded-bench solve" in text
+    assert "run `ded-bench bench`" in text
+    assert "`ded-bench train-dpc` trains one" in text
+    made = pd.read_csv(tmp_path / "empty" / "tables" / "table_v.csv")
+    assert made["paper_solve_s"].tolist() == [32.34, 17.34, 6.8e-4, 32.38, 18.8, 6.8e-4]
+    assert (made["n"] == 0).all()
+    assert all(path.is_file() for path in files)
+
+
+@pytest.mark.usefixtures("sketched")
+def test_another_case_has_no_paper_columns_filled(threebus: Case, tmp_path: Path) -> None:
+    """And rows of other cases in the folder are not its own."""
+    folder = tmp_path / "other"
+    Results(folder).add(
+        [Row("x", "test", "TO", "ded", "default", "Optimal", objective=1.0, case="elsewhere")]
+    )
+    write_report(threebus, folder, tmp_path / "no-problems")
+    text = (folder / "report.md").read_text()
+    assert "No rows yet" in text
+    assert "The problem files cannot be read" in text
+    assert len(pd.read_csv(folder / "tables" / "table_v.csv")) == 0
+
+
+@pytest.mark.usefixtures("sketched")
+def test_certificate_is_shown(ninebus: Case, problems: Path, tmp_path: Path) -> None:
+    facts = {
+        "case": "9bus",
+        "method": "ded-dpc",
+        "reference": "ded-ko-knots",
+        "regime": "TO",
+        "settings": "default",
+        "seed": 2_000_000,
+        "count": 10_000,
+        "successes": 9_950,
+        "meets_limits": 9_960,
+        "near_reference": 9_970,
+        "tolerance_hz": 1e-6,
+        "tolerance_pu": 1e-8,
+        "gap_percent": 1.0,
+        "delta": 0.01,
+        "clopper_pearson": 0.9931,
+        "hoeffding": 0.9798,
+        "artifacts": "abc",
+        "version": "0",
+        "host": "here",
+        "date": "2026-01-01T00:00:00Z",
+    }
+    save_certificate(tmp_path, Certificate(**facts))
+    save_certificate(tmp_path, Certificate(**facts | {"regime": "NO"}))
+    save_certificate(tmp_path, Certificate(**facts | {"successes": 9_951}))
+    write_report(ninebus, tmp_path, problems)
+    text = (tmp_path / "report.md").read_text()
+    assert "at least 99.31% of fresh TO instances meet every limit" in text
+    assert "| TO | DED-DPC | 10000 | 9951 | 9960 | 9970 | 99.31 % | 97.98 % |" in text
+    assert "9950 of 10000" in text  # NO
+    assert text.count("of 10000 did") == 2  # the third replaced the first
+
+
+@pytest.mark.usefixtures("sketched")
+@pytest.mark.parametrize("name", ["results.csv", "timing.csv"])
+def test_a_wrong_table_is_bad_input(ninebus: Case, problems: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("a,b\n1,2\n")
+    with pytest.raises(InputError) as caught:
+        write_report(ninebus, tmp_path, problems)
+    assert name in caught.value.source

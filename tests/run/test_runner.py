@@ -1,0 +1,164 @@
+"""The runner: resume, failures as rows, dying workers, scoring kept apart from solving."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import time
+from pathlib import Path
+
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.registry import METHODS
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.run import runner
+from ded_bench.run.pool import ATTEMPTS
+from ded_bench.run.results import Results
+from ded_bench.run.runner import make_tasks, run
+from ded_bench.truth.score import score
+from tests.strange_methods import STRANGE, solve_strange
+
+
+@pytest.fixture
+def strange(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Register the misbehaving method here and in worker processes; returns its log."""
+    log = tmp_path / "calls"
+    log.touch()
+    monkeypatch.setenv("STRANGE_LOG", str(log))
+    monkeypatch.setitem(METHODS, "ded", STRANGE)
+    monkeypatch.setattr(runner, "solve_task", solve_strange)
+    return log
+
+
+@pytest.fixture
+def make(threebus: Case, quiet_instance):
+    def make_these(*names: str, regimes=("NO", "TO"), settings=Settings()):  # noqa: B008
+        instances = [(quiet_instance(threebus, id=name, horizon_s=0.2), "none") for name in names]
+        return make_tasks(threebus, instances, ["ded"], regimes, settings)
+
+    return make_these
+
+
+def calls(log: Path) -> collections.Counter[str]:
+    return collections.Counter(log.read_text().split())
+
+
+def test_rows_are_scored_like_the_scorer_does(strange, make, threebus: Case, tmp_path: Path) -> None:
+    tasks = make("calm-1", "calm-2")
+    rows = run(threebus, tasks, Results(tmp_path / "out"), workers=2)
+    assert [row.key for row in rows] == [task.key for task in tasks]
+    results = Results(tmp_path / "out")
+    for task, row in zip(tasks, rows, strict=True):
+        verdict = score(
+            threebus, task.instance, results.schedule(task.key, threebus, task.instance), task.regime
+        )
+        assert row.objective == pytest.approx(verdict.objective, rel=1e-12)
+        assert row.feasible is True
+        assert row.status == "Feasible"
+        assert row.host
+        assert row.version
+        assert row.date.endswith("Z")
+
+
+def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_path: Path) -> None:
+    run(threebus, make("calm-1"), Results(tmp_path / "out"))
+    before = (tmp_path / "out" / "results.csv").read_bytes()
+    run(threebus, make("calm-1"), Results(tmp_path / "out"))
+    assert (tmp_path / "out" / "results.csv").read_bytes() == before
+    run(threebus, make("calm-1", "calm-2"), Results(tmp_path / "out"))
+    assert calls(strange) == {"calm-1": 2, "calm-2": 2}  # once per regime
+
+
+def test_a_schedule_without_its_score_is_only_scored(strange, make, threebus: Case, tmp_path: Path) -> None:
+    results = Results(tmp_path / "out")
+    rows = run(threebus, make("calm-1"), results)
+    results.add([dataclasses.replace(row, objective=None, feasible=None) for row in rows])
+    assert run(threebus, make("calm-1"), Results(tmp_path / "out")) == rows
+    assert calls(strange) == {"calm-1": 2}
+
+
+def test_failures_are_rows_and_the_run_goes_on(strange, make, threebus: Case, tmp_path: Path) -> None:
+    tasks = make("raise-1", "crash-1", "calm-1", "apart-1", regimes=["NO"])
+    rows = run(threebus, tasks, Results(tmp_path / "out"), workers=2)
+    by_name = {row.instance: row for row in rows}
+    assert by_name["raise-1"].status == "Failed"
+    assert by_name["raise-1"].error == "ValueError: no idea how"
+    assert by_name["crash-1"].status == "Failed"
+    assert f"died {ATTEMPTS} times" in by_name["crash-1"].error
+    assert by_name["calm-1"].objective is not None
+    assert by_name["apart-1"].status == "Feasible"  # the claim stays, the verdict is separate
+    assert by_name["apart-1"].feasible is not True
+    assert len(rows) == 4
+
+
+def test_a_worker_that_dies_once_costs_nothing(strange, make, threebus: Case, tmp_path: Path) -> None:
+    rows = run(threebus, make("once-1", "calm-1"), Results(tmp_path / "out"), workers=2)
+    assert [row.objective is not None for row in rows] == [True] * 4
+    assert len({row.key for row in rows}) == 4
+
+
+def test_nonsense_is_a_row_that_says_what_is_wrong(strange, make, threebus: Case, tmp_path: Path) -> None:
+    names = ("wrong", "nothing", "shape", "nan", "infeasible", "huge", "numpy", "calm")
+    results = Results(tmp_path / "out")
+    run(threebus, make(*names, regimes=["NO"]), results)
+    rows = {row.instance: row for row in Results(tmp_path / "out").rows.values()}  # the table can be read
+    for name, status, error in (
+        ("wrong", "Failed", "type int, not a Schedule or a Solution"),
+        ("nothing", "Failed", "claims Optimal but returned no schedule"),
+        ("shape", "Failed", "(2, 7)"),
+        ("nan", "Failed", "finite"),
+        ("infeasible", "Infeasible", "no way"),
+    ):
+        assert rows[name].status == status
+        assert error in rows[name].error
+        assert rows[name].objective is None
+    assert (rows["huge"].solver_objective, rows["huge"].error, rows["huge"].iterations) == (None, "a b", 3)
+    assert (rows["numpy"].solver_objective, rows["numpy"].solve_s) == (1.5, 0.5)
+    assert all(rows[name].feasible for name in ("huge", "numpy", "calm"))
+
+
+def test_a_hang_is_a_time_limit_and_blames_nobody_else(
+    strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "GRACE_S", 4.0)
+    tasks = make("hang", "slow-1", "slow-2", "slow-3", regimes=["NO"], settings=Settings(time_limit_s=1.0))
+    started = time.monotonic()
+    rows = {row.instance: row for row in run(threebus, tasks, Results(tmp_path / "out"), workers=2)}
+    assert time.monotonic() - started < 60.0
+    assert rows.pop("hang").status == "TimeLimit"
+    assert Results(tmp_path / "out").rows[tasks[0].key].error.startswith("no answer after 5 s")
+    assert {row.status for row in rows.values()} == {"Feasible"}
+    assert calls(strange) == {"hang": 1, "slow-1": 1, "slow-2": 1, "slow-3": 1}
+
+
+def test_without_a_time_limit_nothing_is_killed(
+    strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "GRACE_S", 0.0)
+    (row,) = run(threebus, make("slow", regimes=["NO"]), Results(tmp_path / "out"))
+    assert row.status == "Feasible"
+
+
+def test_a_failure_takes_the_schedule_of_an_older_model_away(
+    strange, make, threebus: Case, constant, tmp_path: Path
+) -> None:
+    """Else the schedule would be taken for the failed row's own."""
+    results = Results(tmp_path / "out")
+    (task,) = make("raise", regimes=["NO"])
+    power = task.instance.p_initial(threebus)
+    constant(task.instance, power).write(results.schedule_path(task.key), threebus.generators)
+    run(threebus, [task], results)
+    assert not results.schedule_path(task.key).exists()
+    assert not Results(results.folder).solved(task.key, task.fingerprint)
+
+
+def test_wrong_choices_name_the_known_ones(threebus: Case, quiet_instance) -> None:
+    instances = [(quiet_instance(threebus), "none")]
+    with pytest.raises(InputError, match=r"unknown method.*ded-ko"):
+        make_tasks(threebus, instances, ["magic"], ["NO"], Settings())
+    with pytest.raises(InputError, match="unknown regime"):
+        make_tasks(threebus, instances, ["ded"], ["XX"], Settings())
+    with pytest.raises(InputError, match=r"magic: unknown to method ded \(known: default"):
+        make_tasks(threebus, instances, ["ded"], ["NO"], Settings(name="magic"))

@@ -1,0 +1,246 @@
+"""Solvers: known optima, renewed numbers, honest statuses, what is missing is said."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pyomo.environ as pyo
+import pytest
+from pyomo.opt import TerminationCondition
+
+from ded_bench.files.errors import InputError
+from ded_bench.solvers.compile import SOLVERS, compile_model, fix
+from ded_bench.solvers.linear_program import read_linear
+from ded_bench.solvers.status import Status
+
+LINEAR = ("ipopt", "piqp", "highs")
+
+
+def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.ConcreteModel:
+    """Buy x, y >= 0 with x + 2 y >= need and x <= 3: prices and need are data."""
+    m = pyo.ConcreteModel()
+    m.price = pyo.Var([0, 1])
+    m.need = pyo.Var()
+    m.x = pyo.Var(bounds=(0, 3))
+    m.y = pyo.Var(bounds=(0, None))
+    m.enough = pyo.Constraint(expr=m.x + 2 * m.y - m.need >= 0)
+    m.total = pyo.Objective(expr=m.price[0] * m.x + m.price[1] * m.y + 1)
+    for i in (0, 1):
+        fix(m.price[i], prices[i])
+    fix(m.need, need)
+    return m
+
+
+def rosenbrock() -> pyo.ConcreteModel:
+    m = pyo.ConcreteModel()
+    m.x = pyo.Var(initialize=-1.2)
+    m.y = pyo.Var(initialize=1.0)
+    m.cost = pyo.Objective(expr=(1 - m.x) ** 2 + 100 * (m.y - m.x**2) ** 2)
+    return m
+
+
+def transport(size: int = 60) -> pyo.ConcreteModel:
+    """A dense linear program that takes every solver more than a moment."""
+    rng = np.random.default_rng(0)
+    m = pyo.ConcreteModel()
+    m.i = pyo.RangeSet(0, size - 1)
+    m.x = pyo.Var(m.i, m.i, bounds=(0, None))
+    cost = rng.random((size, size))
+    m.supply = pyo.Constraint(m.i, rule=lambda m, i: sum(m.x[i, j] for j in m.i) <= 1.5)
+    m.demand = pyo.Constraint(m.i, rule=lambda m, j: sum(m.x[i, j] for i in m.i) >= 1.0)
+    m.total = pyo.Objective(expr=sum(cost[i, j] * m.x[i, j] for i in m.i for j in m.i))
+    return m
+
+
+@pytest.mark.parametrize("solver", LINEAR)
+def test_known_optima_before_and_after_new_numbers(solver: str) -> None:
+    """Per unit of need, x costs its price and y half of it; then data and bounds change in place."""
+    model = diet()
+    compiled = compile_model(model, solver)
+    for prices, need, x, y in (((2.0, 3.0), 4.0, 0, 2), ((1.0, 3.0), 4.0, 3, 0.5), ((1.0, 3.0), 2.0, 2, 0)):
+        for i in (0, 1):
+            fix(model.price[i], prices[i])
+        fix(model.need, need)
+        outcome = compiled.solve()
+        assert outcome.status == Status.OPTIMAL
+        assert outcome.has_values
+        assert (model.x.value, model.y.value) == pytest.approx((x, y), abs=1e-6)
+        assert outcome.objective == pytest.approx(prices[0] * x + prices[1] * y + 1, abs=1e-6)
+        assert outcome.objective == pytest.approx(pyo.value(model.total), abs=1e-9)
+        assert outcome.version.startswith(solver)
+        assert outcome.setup_s >= 0 < outcome.solve_s
+
+
+@pytest.mark.parametrize("solver", LINEAR)
+def test_maximisation_keeps_its_sign(solver: str) -> None:
+    model = diet()
+    model.total.deactivate()
+    model.most = pyo.Constraint(expr=model.x + model.y <= 5)
+    model.worth = pyo.Objective(expr=model.price[0] * model.x + model.y, sense=pyo.maximize)
+    outcome = compile_model(model, solver).solve()
+    assert outcome.objective == pytest.approx(8.0, abs=1e-6)  # x = 3 at 2 each, y = 2
+    assert model.x.value == pytest.approx(3.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("solver", LINEAR)
+def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails(solver: str) -> None:
+    model = diet()
+    model.y.setub(0.25)
+    outcome = compile_model(model, solver).solve()
+    assert outcome.status == Status.INFEASIBLE
+    assert not outcome.has_values
+    assert outcome.objective is None
+    model = diet(prices=(2.0, -1.0))
+    outcome = compile_model(model, solver).solve()
+    assert outcome.status == Status.FAILED
+    assert outcome.message
+
+
+@pytest.mark.parametrize("solver", LINEAR)
+def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
+    model = transport()
+    compiled = compile_model(model, solver)
+    whole = compiled.solve()
+    assert whole.status == Status.OPTIMAL
+    assert compiled.solve(1e-4).status == Status.TIME_LIMIT
+    again = compiled.solve(60.0)
+    assert again.status == Status.OPTIMAL
+    assert again.objective == pytest.approx(whole.objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("solver", ["piqp", "highs"])
+def test_linear_solvers_refuse_what_is_not_linear(solver: str) -> None:
+    model = diet()
+    model.curved = pyo.Constraint(expr=model.x**2 + model.y <= 9)
+    with pytest.raises(ValueError, match="curved is not linear"):
+        compile_model(model, solver)
+    model = diet()
+    model.need.setub(None)
+    model.total.expr += model.need * model.x
+    with pytest.raises(ValueError, match="not linear in the free variables"):
+        compile_model(model, solver).solve()
+    with pytest.raises(ValueError, match="not linear"):
+        compile_model(rosenbrock(), solver).solve()
+
+
+def test_ipopt_solves_nonlinear_models() -> None:
+    model = rosenbrock()
+    outcome = compile_model(model, "ipopt").solve()
+    assert outcome.status == Status.OPTIMAL
+    assert outcome.iterations > 5
+    assert (model.x.value, model.y.value) == pytest.approx((1.0, 1.0))
+    model.x.setub(0.5)  # the valley's floor is y = x²
+    outcome = compile_model(model, "ipopt").solve()
+    assert outcome.objective == pytest.approx(0.25, abs=1e-6)
+
+
+def test_read_linear_gives_the_arrays_of_the_model() -> None:
+    model = diet()
+    program = read_linear(model)
+    numbers = program.numbers()
+    values = {"x": 1.5, "y": 0.25, "need": 4.0, "price[0]": 2.0, "price[1]": 3.0}
+    point = np.array([values[v.name] for v in program.columns])
+    assert (program.a @ point).tolist() == [1.5 + 0.5 - 4.0]
+    assert (program.row_lower.tolist(), program.row_upper.tolist()) == ([0.0], [np.inf])
+    assert program.objective(numbers, point) == pytest.approx(2 * 1.5 + 3 * 0.25 + 1)
+    assert sorted(v.name for v, free in zip(program.columns, numbers.free, strict=True) if free) == ["x", "y"]
+
+
+def test_pyomo_knows_ipopt_casadi() -> None:
+    model = rosenbrock()
+    with pyo.SolverFactory("ipopt_casadi") as solver:
+        assert solver.available()
+        results = solver.solve(model, options={"max_iter": 200})
+    pyo.assert_optimal_termination(results)
+    assert model.x.value == pytest.approx(1.0)
+    results = pyo.SolverFactory("ipopt_casadi", options={"max_iter": 2}).solve(rosenbrock())
+    assert results.solver.termination_condition == TerminationCondition.error
+    assert results.solver.message == "Maximum_Iterations_Exceeded"
+    bad = diet()
+    bad.y.setub(0.25)
+    before = bad.x.value
+    results = pyo.SolverFactory("ipopt_casadi").solve(bad)
+    assert results.solver.termination_condition == TerminationCondition.infeasible
+    assert bad.x.value == before
+    results = pyo.SolverFactory("ipopt_casadi").solve(transport(), timelimit=1e-4)
+    assert results.solver.termination_condition == TerminationCondition.maxTimeLimit
+
+
+def test_unknown_and_missing_solvers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="known: ipopt"):
+        compile_model(diet(), "simplex")
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="ipopt: no such executable on the PATH"):
+        compile_model(diet(), "ipopt-executable")
+    monkeypatch.setitem(sys.modules, "piqp", None)
+    with pytest.raises(InputError, match="pip install piqp"):
+        compile_model(diet(), "piqp")
+    assert set(LINEAR) | {"ipopt-executable"} == set(SOLVERS)
+
+
+#: Stands in for the executable: speaks its command line, its .nl and .sol files and its log.
+STAND_IN = """
+import sys
+if "-v" in sys.argv:
+    print("Ipopt 3.14.16 (x86_64-linux-gnu), ASL(20231111)")
+    sys.exit()
+import casadi, pathlib
+if {broken}:
+    sys.exit("libgfortran.so: cannot open shared object file")
+stub = sys.argv[1].removesuffix(".nl")
+given = [pathlib.Path(a.split("=")[1]).read_text().split() for a in sys.argv if "option_file_name" in a]
+options = {{}} if not given else dict(zip(given[0][::2], map(float, given[0][1::2])))
+nlp = casadi.NlpBuilder()
+nlp.import_nl(stub + ".nl")
+solver = casadi.nlpsol("s", "ipopt", {{"x": casadi.vertcat(*nlp.x), "f": nlp.f, "g": casadi.vertcat(*nlp.g)}},
+    {{"print_time": False, "error_on_fail": False, "ipopt": {{"print_level": 0, "sb": "yes", **options}}}})
+answer = solver(x0=nlp.x_init, lbx=nlp.x_lb, ubx=nlp.x_ub, lbg=nlp.g_lb, ubg=nlp.g_ub)
+sentence, code = {{"Solve_Succeeded": ("Optimal Solution Found.", 0),
+    "Infeasible_Problem_Detected": ("Converged to a locally infeasible point.", 200),
+    "Maximum_WallTime_Exceeded": ("Maximum Wallclock Time Exceeded.", 402)}}[solver.stats()["return_status"]]
+x, g = answer["x"].full().ravel().tolist(), answer["lam_g"].full().ravel().tolist()
+print("Number of Iterations....:", solver.stats()["iter_count"])
+head = ["", f"Ipopt 3.14.16: {{sentence}}", "", "Options", 3, 1, 1, 0, len(g), len(g), len(x), len(x)]
+pathlib.Path(stub + ".sol").write_text("\\n".join(map(str, [*head, *g, *x, f"objno 0 {{code}}"])) + "\\n")
+"""
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch, broken: bool = False) -> None:
+    path = folder / "ipopt"
+    path.write_text(f"#!{sys.executable}\n" + textwrap.dedent(STAND_IN.format(broken=broken)))
+    path.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+
+
+def test_an_executable_on_the_path_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, monkeypatch)
+    model = rosenbrock()
+    outcome = compile_model(model, "ipopt-executable").solve()
+    assert outcome.status == Status.OPTIMAL
+    assert outcome.version.startswith("ipopt 3.14.16")
+    assert outcome.iterations == compile_model(rosenbrock(), "ipopt").solve().iterations
+    assert outcome.objective == pytest.approx(0.0, abs=1e-9)
+    assert (model.x.value, model.y.value) == pytest.approx((1.0, 1.0))
+    model = diet()
+    compiled = compile_model(model, "ipopt-executable", {"bound_relax_factor": 0.0})
+    assert compiled.solve().objective == pytest.approx(7.0, abs=1e-6)
+    fix(model.need, 2.0)
+    assert compiled.solve().objective == pytest.approx(4.0, abs=1e-6)
+    assert compiled.solve(1e-6).status == Status.TIME_LIMIT
+    model.y.setub(0.25)
+    fix(model.need, 4.0)
+    outcome = compiled.solve()
+    assert outcome.status == Status.INFEASIBLE
+    assert not outcome.has_values
+
+
+def test_a_broken_executable_is_a_failure_not_a_crash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, monkeypatch, broken=True)
+    outcome = compile_model(diet(), "ipopt-executable").solve()
+    assert outcome.status == Status.FAILED
+    assert outcome.message

@@ -6,11 +6,11 @@ import functools
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
@@ -25,6 +25,8 @@ Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Range = tuple[Number, Number]
+#: Knots of a case that names no number of its own.
+KNOTS = 50
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 #: Cases that come with the suite: beside a checkout, or inside an installed package.
@@ -32,6 +34,14 @@ SHIPPED_CASES = next(
     (p for p in (REPOSITORY / "problems", REPOSITORY / "ded_bench" / "_problems") if p.is_dir()),
     REPOSITORY / "problems",
 )
+
+
+class _Extended(Record):
+    """A record that case/2 extends: what is not given is not written, so that case/1 stays as it is."""
+
+    @model_serializer(mode="wrap")
+    def _given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in write(self).items() if value is not None}
 
 
 class Bus(Record):
@@ -52,14 +62,15 @@ class Line(Record):
     x: Magnitude
 
 
-class Machine(Record):
-    """Inertia m (s² pu/rad), damping d (s pu/rad) and power limits in pu of one generator."""
+class Machine(_Extended):
+    """Inertia m (s² pu/rad), damping d (s pu/rad), power limits in pu and ramp limit of one generator."""
 
     m: Magnitude
     d: NonNegative
     p_nominal: Number
     p_min: Number
     p_max: Number
+    ramp_pu_per_s: Magnitude | None = None  # case/2; else the case's
 
     @model_validator(mode="after")
     def _ordered(self) -> Machine:
@@ -74,15 +85,20 @@ class Limits(Record):
     omega_hz: Magnitude
 
 
-class Sampling(Record):
-    """Ranges of the sampler (paper, Table III); uniform unless said otherwise."""
+class Sampling(_Extended):
+    """Ranges of the sampler (paper, Table III); uniform unless said otherwise.
+
+    Loads ramp at rates of either sign whose size is in `rate_pu_per_s`, or, in case/2, in
+    `rate_relative_per_s` times the size of the load's nominal value.
+    """
 
     horizon_s: Positive
     dt_s: Positive
     load_relative: NonNegative
     start_s: Range
     duration_s: Range
-    rate_pu_per_s: Range
+    rate_pu_per_s: Range | None = None
+    rate_relative_per_s: Range | None = None  # case/2
     rate_zero_probability: Probability
     perturbation: Range
     omega_rad_per_s: Range
@@ -93,16 +109,20 @@ class Sampling(Record):
         for name, value in self:
             if isinstance(value, tuple) and value[0] > value[1]:
                 raise ValueError(f"{name}: lower end above upper end")
-            if name in ("start_s", "duration_s", "rate_pu_per_s", "cost") and value[0] < 0:
+            positive = name in ("start_s", "duration_s", "rate_pu_per_s", "rate_relative_per_s", "cost")
+            if positive and value is not None and value[0] < 0:
                 raise ValueError(f"{name}: must not be negative")
+        if (self.rate_pu_per_s is None) == (self.rate_relative_per_s is None):
+            raise ValueError("exactly one of rate_pu_per_s and rate_relative_per_s is needed")
         return self
 
 
-class Case(Record):
+class Case(_Extended):
     """One grid. Buses keep the file's order; generators and loads are named by their bus."""
 
-    schema_: Literal["ded-bench/case/1"] = Field(alias="schema")
+    schema_: Literal["ded-bench/case/1", "ded-bench/case/2"] = Field(alias="schema")
     id: Name
+    source: str | dict[Name, str] | None = None  # case/2: where the data come from, and their licence
     f0_hz: Magnitude
     buses: tuple[Bus, ...]
     lines: tuple[Line, ...]
@@ -110,6 +130,7 @@ class Case(Record):
     ramp_pu_per_s: Magnitude
     regimes: dict[Name, Limits]
     sampling: Sampling
+    knots: Annotated[int, Field(ge=2, le=100_000)] | None = None  # case/2: `n_knots`
 
     @model_validator(mode="after")
     def _consistent(self) -> Case:
@@ -131,7 +152,20 @@ class Case(Record):
             if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - set(names):
                 raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
         self._check_connected(set(names))
+        self._check_schema()
         return self
+
+    def _check_schema(self) -> None:
+        if self.schema_ != "ded-bench/case/1":
+            return
+        given = {"": self, "sampling.": self.sampling}
+        given |= {f"machines.{bus}.": machine for bus, machine in self.machines.items()}
+        for place, record in given.items():
+            newer = {"source", "knots", "rate_relative_per_s"} & record.model_fields_set
+            if place.startswith("machines."):
+                newer = {"ramp_pu_per_s"} & record.model_fields_set
+            for name in sorted(newer):
+                raise ValueError(f"{place}{name}: belongs to schema ded-bench/case/2")
 
     def _check_connected(self, names: set[str]) -> None:
         reached = {self.slack}
@@ -193,6 +227,28 @@ class Case(Record):
     def load_nominal(self) -> Array:
         """Nominal load injections, shape (n_load,), pu (negative)."""
         return np.array([bus.p_nominal for bus in self.buses if bus.kind == "load"], dtype=float)
+
+    @functools.cached_property
+    def ramp(self) -> Array:
+        """Ramp limits of the generators, shape (n_gen,), pu/s."""
+        own = [self.machines[g].ramp_pu_per_s for g in self.generators]
+        return np.array([self.ramp_pu_per_s if ramp is None else ramp for ramp in own])
+
+    @functools.cached_property
+    def load_rate(self) -> Array:
+        """Least and largest size of a load's ramp rate in the sampler, shape (2, n_load), pu/s."""
+        if self.sampling.rate_relative_per_s is not None:
+            return np.outer(self.sampling.rate_relative_per_s, np.abs(self.load_nominal))
+        return np.repeat(np.array([self.sampling.rate_pu_per_s], dtype=float).T, len(self.loads), axis=1)
+
+    @property
+    def n_knots(self) -> int:
+        """Number of knots of policies and knot methods, chosen from the fastest mode (`knots` in case/2)."""
+        return KNOTS if self.knots is None else self.knots
+
+    def knot_times(self, horizon_s: float) -> Array:
+        """Equidistant times from 0 to the horizon, shape (n_knots,), s."""
+        return np.linspace(0.0, horizon_s, self.n_knots)
 
     def omega_bound(self, regime: str) -> float:
         """Bound on |omega| in rad/s.

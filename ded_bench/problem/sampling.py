@@ -56,7 +56,7 @@ def sample_instance(case: Case, master: int, index: int) -> Instance:
     start = _rounded(_between(ranges.start_s, load[:, 1]))
     duration = _rounded(_between(ranges.duration_s, load[:, 2]))
     sign = np.where(load[:, 4] < 0.5, -1.0, 1.0)
-    rate = _rounded(_between(ranges.rate_pu_per_s, load[:, 3]) * sign)
+    rate = _rounded(_between(case.load_rate, load[:, 3]) * sign)
     rate = np.where(load[:, 5] < ranges.rate_zero_probability, 0.0, rate)
     last = rest[6 * n_load :].reshape(2, n_gen)
     perturbation = _between(ranges.perturbation, last[0])
@@ -144,7 +144,7 @@ def _draws(master: int, index: int, count: int) -> Array:
     return np.random.default_rng(np.random.SeedSequence([master, index])).random(count)
 
 
-def _between(ends: Range, uniform: Array) -> Array:
+def _between(ends: Range | Array, uniform: Array) -> Array:
     return np.asarray(ends[0] + (ends[1] - ends[0]) * uniform)
 
 

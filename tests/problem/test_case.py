@@ -101,7 +101,22 @@ def _add_bus(**bus: object):
         (_set("machines.plant.colour", 1), "machines.plant.colour", "extra inputs"),
         (_drop("f0_hz"), "f0_hz", "required"),
         (_drop("lines.0.x"), "lines.0.x", "required"),
-        (_set("schema", "ded-bench/case/2"), "schema", "ded-bench/case/1"),
+        (_set("schema", "ded-bench/case/3"), "schema", "'ded-bench/case/1' or 'ded-bench/case/2'"),
+        (_set("knots", 50), "", "knots: belongs to schema ded-bench/case/2"),
+        (_set("knots", None), "", "knots: belongs to schema ded-bench/case/2"),
+        (_set("source", "a book"), "", "source: belongs to schema ded-bench/case/2"),
+        (
+            _set("machines.plant.ramp_pu_per_s", 0.1),
+            "",
+            "machines.plant.ramp_pu_per_s: belongs to schema ded-bench/case/2",
+        ),
+        (
+            _set("sampling.rate_relative_per_s", None),
+            "",
+            "sampling.rate_relative_per_s: belongs to schema ded-bench/case/2",
+        ),
+        (_set("sampling.rate_relative_per_s", [0.0, 0.1]), "sampling", "exactly one of"),
+        (_drop("sampling.rate_pu_per_s"), "sampling", "exactly one of"),
         (_set("id", "../evil"), "id", "pattern"),
         (_set("f0_hz", "60"), "f0_hz", "valid number"),
         (_set("f0_hz", True), "f0_hz", "valid number"),
@@ -139,6 +154,49 @@ def test_a_wrong_case_is_refused(threebus, edit, field, problem):
     assert caught.value.source == str(Path("bad/case.json"))
     assert caught.value.field == field
     assert problem in caught.value.problem
+
+
+def _extended(data: dict) -> dict:
+    """The same case in case/2, with every field that it adds."""
+    data = copy.deepcopy(data) | {"schema": "ded-bench/case/2", "knots": 7, "source": {"data": "a book"}}
+    data["machines"]["plant"]["ramp_pu_per_s"] = 0.125
+    data["sampling"]["rate_relative_per_s"] = [0.01, 0.5]
+    del data["sampling"]["rate_pu_per_s"]
+    return data
+
+
+def test_fields_of_case_2(threebus):
+    """What each of them means, and that a case keeps them through a file."""
+    plain = json.loads(threebus.model_dump_json(by_alias=True))
+    case = parse_record(Case, json.dumps(_extended(plain)), "case.json")
+    assert json.loads(case.model_dump_json(by_alias=True)) == _extended(plain)
+    np.testing.assert_array_equal(case.ramp, [0.125])
+    np.testing.assert_array_equal(case.load_rate, [[0.01 * 1.0], [0.5 * 1.0]])
+    np.testing.assert_array_equal(case.knot_times(3.0), [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+    assert case.fingerprint != threebus.fingerprint
+    for path, value, field in (
+        ("knots", 1, "knots"),
+        ("knots", 50.0, "knots"),
+        ("machines.plant.ramp_pu_per_s", 0.0, "machines.plant.ramp_pu_per_s"),
+        ("sampling.rate_relative_per_s", [-0.1, 0.1], "sampling"),
+        ("sampling.rate_relative_per_s", [0.2, 0.1], "sampling"),
+    ):
+        data = _extended(plain)
+        _set(path, value)(data)
+        with pytest.raises(InputError) as caught:
+            parse_record(Case, json.dumps(data), "case.json")
+        assert caught.value.field == field
+
+
+def test_without_fields_of_case_2_a_case_is_as_in_case_1(ninebus, threebus):
+    """The case's ramp limit and range of rates, 50 knots; nothing of case/2 is written."""
+    np.testing.assert_array_equal(ninebus.ramp, [0.05, 0.05])
+    np.testing.assert_array_equal(ninebus.load_rate, [[0.01] * 3, [0.05] * 3])
+    assert ninebus.n_knots == 50
+    np.testing.assert_array_equal(ninebus.knot_times(60.0), np.linspace(0.0, 60.0, 50))
+    assert (ninebus.fingerprint, threebus.fingerprint) == ("a0fa08e05e5d", "8cc5cb23d399")
+    file = json.loads((SHIPPED_CASES / "9bus" / "case.json").read_text())
+    assert json.loads(ninebus.model_dump_json(by_alias=True)).keys() == file.keys()
 
 
 def test_equality_is_about_content_not_about_what_was_computed(case_file: Path) -> None:

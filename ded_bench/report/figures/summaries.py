@@ -221,12 +221,12 @@ def parameters_figure(case: Case, instances: Sequence[Instance]) -> Figure:
         [i.load[bus].initial / nominal - 1 for i in instances for bus, nominal in _nominal(case)], dtype=float
     )
     rate = np.array([ramp.rate for ramp in ramps])
-    largest = ranges.rate_pu_per_s[1]
+    least, largest = float(case.load_rate[0].min()), float(case.load_rate[1].max())
     panels: list[tuple[str, Array, tuple[float, ...]]] = [
         ("initial load / nominal − 1", relative, (-ranges.load_relative, ranges.load_relative)),
         ("ramp start (s)", np.array([ramp.start for ramp in ramps]), ranges.start_s),
         ("ramp duration (s)", np.array([ramp.duration for ramp in ramps]), ranges.duration_s),
-        ("ramp rate (pu/s)", rate, (-largest, -ranges.rate_pu_per_s[0], ranges.rate_pu_per_s[0], largest)),
+        ("ramp rate (pu/s)", rate, (-largest, -least, least, largest)),
         ("perturbation $s_i$", perturbations(case, instances), ranges.perturbation),
         (
             "initial $\\omega_i$ (rad/s)",

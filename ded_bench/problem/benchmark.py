@@ -10,16 +10,18 @@ from typing import Literal, get_args
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, load_instances
-from ded_bench.problem.sampling import load_manifest, load_split
+from ded_bench.problem.sampling import VALIDATION_SEED, load_manifest, load_split, sample_instances
 
-SplitName = Literal["test", "train", "all"]
-#: What `--split` may say.
+SplitName = Literal["test", "train", "validation", "all"]
+#: What `--split` may say; `all` are the instances that are files.
 SPLITS: tuple[str, ...] = get_args(SplitName)
+#: How many validation instances there are unless a limit says otherwise.
+VALIDATION_COUNT = 100
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Instances of one case, each with its split (`train`, `test` or `none`)."""
+    """Instances of one case, each with its split (`train`, `test`, `validation` or `none`)."""
 
     case: Case
     instances: tuple[tuple[Instance, str], ...]
@@ -39,13 +41,17 @@ def select_split(name: str | Path, split: str = "test", limit: int | None = None
 
     Args:
         name: a shipped case, a benchmark's folder, or its case.json.
-        split: `test`, `train` or `all`.
+        split: `test`, `train`, `validation` (drawn afresh, see `validation_instances`) or `all`.
 
     Raises:
         InputError: there is no such case or split, or a file is missing or wrong.
     """
     case = Case.load(name)
     folder = problem_folder(name, case)
+    if split == "validation":
+        manifest = load_manifest(folder)
+        drawn = validation_instances(case, VALIDATION_COUNT if limit is None else limit)
+        return Selection(case, tuple((i, split) for i in drawn), manifest.version if manifest else "")
     known = load_split(folder)
     named = {"train": known.train, "test": known.test, "all": known.train + known.test}
     if split not in named:
@@ -53,6 +59,18 @@ def select_split(name: str | Path, split: str = "test", limit: int | None = None
     ids = sorted(named[split])[:limit]
     instances, case = load_instances([folder / "instances" / f"{i}.json" for i in ids], case)
     return _selection(case, instances, folder)
+
+
+def validation_instances(case: Case, count: int, first: int = 0) -> list[Instance]:
+    """Draw validation instances `first` to `first + count - 1` of a case, `<case>-v0000` and so on.
+
+    Weights, prices, steps and variants are chosen on them; they are no part of the benchmark.
+    """
+    drawn = sample_instances(case, VALIDATION_SEED, count, first)
+    return [
+        instance.model_copy(update={"id": f"{case.id}-v{index:04d}"})
+        for index, instance in enumerate(drawn, start=first)
+    ]
 
 
 def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selection:

@@ -18,6 +18,8 @@ from ded_bench.problem.instance import Initial, Instance, LoadRamp
 
 #: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 5).
 POLICY_SEED, CERTIFICATE_SEED, KOOPMAN_SEED = 1_000_000, 2_000_000, 3_000_000
+#: Between the seeds of policies: instances on which choices are made, so that test instances only score.
+VALIDATION_SEED = POLICY_SEED + 500_000
 DECIMALS = 9
 TEST_FRACTION = 0.2
 

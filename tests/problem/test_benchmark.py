@@ -8,9 +8,20 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.problem.benchmark import select_files, select_split
+from ded_bench.problem.benchmark import (
+    VALIDATION_COUNT,
+    select_files,
+    select_split,
+    validation_instances,
+)
 from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import load_split, write_benchmark
+from ded_bench.problem.sampling import (
+    VALIDATION_SEED,
+    load_manifest,
+    load_split,
+    sample_instance,
+    write_benchmark,
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +45,23 @@ def test_splits_are_parts_of_the_whole_in_order(folder: Path, threebus: Case) ->
     assert select_split(folder / "case.json", "test") == parts["test"]
 
 
+def test_validation_instances_are_drawn_afresh_and_are_not_of_the_benchmark(
+    folder: Path, threebus: Case
+) -> None:
+    chosen = select_split(folder, "validation", 3)
+    ids = [instance.id for instance, _ in chosen.instances]
+    assert ids == ["threebus-v0000", "threebus-v0001", "threebus-v0002"]
+    assert [split for _, split in chosen.instances] == ["validation"] * 3
+    manifest = load_manifest(folder)
+    assert manifest is not None
+    assert chosen.version == manifest.version
+    plain = sample_instance(threebus, VALIDATION_SEED, 2)
+    assert chosen.instances[2][0] == plain.model_copy(update={"id": "threebus-v0002"})
+    assert validation_instances(threebus, 1, first=2) == [chosen.instances[2][0]]
+    assert len(select_split(folder, "validation").instances) == VALIDATION_COUNT
+    assert not set(ids) & {instance.id for instance, _ in select_split(folder, "all").instances}
+
+
 def test_files_know_their_split_and_version(folder: Path, tmp_path: Path, threebus: Case) -> None:
     files = sorted((folder / "instances").glob("*.json"))
     assert select_files(files) == select_split(folder, "all")
@@ -46,7 +74,7 @@ def test_files_know_their_split_and_version(folder: Path, tmp_path: Path, threeb
 
 
 def test_wrong_choices_are_told(folder: Path) -> None:
-    with pytest.raises(InputError, match="split: holdout: is not one of test, train, all"):
+    with pytest.raises(InputError, match="split: holdout: is not one of test, train, validation, all"):
         select_split(folder, "holdout")
     with pytest.raises(InputError, match="no such case"):
         select_split("atlantis")

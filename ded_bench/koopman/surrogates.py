@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.koopman.linear import linear_model, single_sample
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import REPOSITORY, Case
@@ -28,7 +29,7 @@ def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
 
 def model_file(results: Path, kind: str) -> Path:
     """Where a results folder keeps a model."""
-    return results / "koopman" / f"{kind}.safetensors"
+    return ResultsFolder(results).model(kind)
 
 
 def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:

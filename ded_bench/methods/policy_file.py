@@ -13,6 +13,7 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
+from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.methods.solution import DEFAULT_MODEL, Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -123,7 +124,7 @@ def policy_file(
     """Where a results folder keeps a policy; other settings or another Koopman model say so in its name."""
     suffix = "" if settings == "default" else f"-{settings}"
     suffix += "" if model == DEFAULT_MODEL else f"-{Path(model).stem}"
-    return results / "policies" / f"{method}-{regime}{suffix}.safetensors"
+    return ResultsFolder(results).policy(f"{method}-{regime}{suffix}")
 
 
 def find_policy_file(

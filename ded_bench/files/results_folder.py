@@ -1,0 +1,92 @@
+"""Every path inside a results folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class ResultsFolder:
+    """Where a results folder keeps what; it need not exist."""
+
+    path: Path
+
+    @property
+    def results(self) -> Path:
+        """Rows of instance × regime × method × settings."""
+        return self.path / "results.csv"
+
+    @property
+    def timing(self) -> Path:
+        """Times of methods alone on the machine."""
+        return self.path / "timing.csv"
+
+    @property
+    def schedules(self) -> Path:
+        """Folder of the schedules of the results' rows."""
+        return self.path / "schedules"
+
+    def schedule(self, method: str, settings: str, regime: str, instance: str) -> Path:
+        """The schedule of one row."""
+        return self.schedules / method / settings / regime / f"{instance}.csv.gz"
+
+    @property
+    def koopman(self) -> Path:
+        """Folder of identified models."""
+        return self.path / "koopman"
+
+    def model(self, kind: str) -> Path:
+        """An identified model."""
+        return self.koopman / f"{kind}.safetensors"
+
+    @property
+    def models(self) -> list[Path]:
+        """The models that are there, by name."""
+        return sorted(self.koopman.glob("*.safetensors"))
+
+    def model_errors(self, kind: str) -> Path:
+        """Rollout errors of models; `kind` is a model's, or says whose schedules they are."""
+        return self.koopman / f"{kind}.errors.csv"
+
+    @property
+    def all_model_errors(self) -> list[Path]:
+        """The tables of rollout errors that are there, by name."""
+        return sorted(self.koopman.glob("*.errors.csv"))
+
+    def policy(self, name: str) -> Path:
+        """A trained policy."""
+        return self.path / "policies" / f"{name}.safetensors"
+
+    @property
+    def policies(self) -> list[Path]:
+        """The policies that are there, by name."""
+        return sorted((self.path / "policies").glob("*.safetensors"))
+
+    @property
+    def training_histories(self) -> list[Path]:
+        """The loss curves of the policies that are there, by name."""
+        return sorted((self.path / "policies").glob("*.history.csv"))
+
+    @property
+    def certificates(self) -> Path:
+        """Certificates of policies."""
+        return self.path / "certificate.json"
+
+    def certificate_rows(self, method: str, settings: str, regime: str) -> Path:
+        """What one certificate counts, one row per instance."""
+        return self.path / "certificates" / f"{method}-{settings}-{regime}.csv"
+
+    @property
+    def tables(self) -> Path:
+        """Folder of the report's tables."""
+        return self.path / "tables"
+
+    @property
+    def figures(self) -> Path:
+        """Folder of the report's figures."""
+        return self.path / "figures"
+
+    def report(self, suffix: str) -> Path:
+        """The report; `suffix` is `md` or `html`."""
+        return self.path / f"report.{suffix}"

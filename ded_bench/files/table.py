@@ -1,0 +1,219 @@
+"""Typed CSV tables: a frozen dataclass declares the columns; floats keep every digit.
+
+A field without a default is a column that must be there and filled in. Any other column may be missing, or
+its cell empty: the value is then the field's default. Columns that the dataclass does not declare are
+ignored, so that tables of a newer or an older version stay readable.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import read_text, write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: No number of a table is larger unless the file is damaged; sums and ratios then stay finite.
+LARGEST = 1e15
+_NUMBERS = {
+    int: re.compile(r"[-+]?[0-9]{1,18}"),
+    float: re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"),
+}
+
+T = TypeVar("T")
+
+
+def cell(
+    *,
+    default: Any = dataclasses.MISSING,
+    lowest: float = -LARGEST,
+    highest: float = LARGEST,
+    check: Callable[[str], str] | None = None,
+) -> Any:
+    """Declare a field whose values are limited.
+
+    Args:
+        lowest, highest: of a number.
+        check: of a text; returns the value, or raises ValueError.
+    """
+    limits = {"lowest": lowest, "highest": highest, "check": check}
+    return dataclasses.field(default=default, metadata=limits)
+
+
+def plain_name(text: str) -> str:
+    """Check of a cell that also names a file or folder; ValueError if it would leave its folder."""
+    if "/" in text or "\\" in text or text.startswith("."):
+        raise ValueError(text)
+    return text
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: how its cells are read."""
+
+    name: str
+    kind: type
+    default: Any = dataclasses.MISSING
+    lowest: float = -LARGEST
+    highest: float = LARGEST
+    check: Callable[[str], str] | None = None
+
+    @property
+    def required(self) -> bool:
+        """The column must be there, and its cells filled in."""
+        return self.default is dataclasses.MISSING
+
+    def parse(self, cell: str) -> Any:
+        """Return the value of a cell; ValueError if it is wrong."""
+        if not cell:
+            if self.required:
+                raise ValueError("empty")
+            return self.default
+        if self.kind is str:
+            return self.check(cell) if self.check else cell
+        if self.kind is bool:
+            if cell not in ("True", "False"):
+                raise ValueError(cell)
+            return cell == "True"
+        if not _NUMBERS[self.kind].fullmatch(cell):
+            raise ValueError(cell)
+        value = self.kind(cell)
+        if not self.lowest <= value <= self.highest:
+            raise ValueError(cell)
+        return value
+
+
+class Table(Generic[T]):
+    """Reads and writes tables whose rows are instances of one frozen dataclass.
+
+    Its fields are of type str, int, float or bool, or one of these or None.
+    """
+
+    def __init__(self, kind: type[T]) -> None:
+        self.kind = kind
+        hints = typing.get_type_hints(kind)
+        self.columns = tuple(_column(field, hints[field.name]) for field in dataclasses.fields(kind))  # type: ignore[arg-type]
+        self.names = tuple(column.name for column in self.columns)
+
+    def read(self, path: str | Path) -> list[T]:
+        """Read a table.
+
+        Raises:
+            InputError: the file cannot be read, a required column is missing, or a value is wrong; names
+                line and column.
+        """
+        found = records(read_text(path), path)
+        header = self.check_header(found[0][1] if found else [], path)
+        return [row for row, _ in self.rows(found[1:], header, path)]
+
+    def check_header(self, cells: Sequence[str], source: str | Path) -> tuple[str, ...]:
+        """Return the names of a header; InputError if a required column is missing or any is there twice."""
+        found = f"found: {', '.join(cells)[:100] or 'nothing'}"
+        for column in self.columns:
+            if column.required and column.name not in cells:
+                raise InputError(source, column.name, f"required column is missing ({found})")
+        for name in cells:
+            if cells.count(name) > 1:
+                raise InputError(source, name[:40], f"column is there twice ({found})")
+        return tuple(cells)
+
+    def rows(
+        self, found: Iterable[tuple[int, list[str]]], header: Sequence[str], source: str | Path
+    ) -> Iterator[tuple[T, dict[str, str]]]:
+        """Yield every row, and its cells of columns that are not declared here, by name.
+
+        Args:
+            found: line numbers and cells (see `records`).
+            header: the file's own.
+
+        Raises:
+            InputError: a line has too many or too few values, or a wrong one.
+        """
+        places = [(column, header.index(column.name)) for column in self.columns if column.name in header]
+        others = [(name, i) for i, name in enumerate(header) if name not in self.names]
+        for line, cells in found:
+            if len(cells) != len(header):
+                raise InputError(source, f"line {line}", f"{len(cells)} values for {len(header)} columns")
+            values = {}
+            for column, i in places:
+                try:
+                    values[column.name] = column.parse(cells[i])
+                except ValueError:
+                    where, what = f"line {line}, {column.name}", f"{cells[i][:30]!r} is not a valid value"
+                    raise InputError(source, where, what) from None
+            yield self.kind(**values), {name: cells[i] for name, i in others}
+
+    def format(self, rows: Iterable[T]) -> str:
+        """Rows as CSV text under a header of all columns; missing values are empty."""
+        return csv_line(self.names) + "".join(self.format_row(row, self.names) for row in rows)
+
+    def format_row(self, row: T, header: Sequence[str], others: Mapping[str, str] | None = None) -> str:
+        """One row as a line of CSV under a header, which may have columns that are not declared here.
+
+        Args:
+            others: cells of those columns by name; empty where not given.
+        """
+        known = set(self.names)
+        others = others or {}
+        return csv_line([_text(getattr(row, n)) if n in known else others.get(n, "") for n in header])
+
+    def write(self, path: Path, rows: Iterable[T]) -> None:
+        """Replace a table by these rows, in one step."""
+        write_atomically(path, self.format(rows))
+
+    def frame(self, rows: Iterable[T]) -> pd.DataFrame:
+        """Rows as a data frame with typed columns; missing values are NaN or None."""
+        import pandas as pd  # worker processes, which read no table, do without
+
+        values = [[getattr(row, name) for name in self.names] for row in rows]
+        frame = pd.DataFrame(values, columns=list(self.names))
+        for column in self.columns:
+            if column.kind is float:
+                frame[column.name] = frame[column.name].astype("float64")
+        return frame
+
+
+def records(text: str, source: str | Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and cells of CSV text; a byte order mark and blank lines at the end do not count.
+
+    Raises:
+        InputError: it is not CSV.
+    """
+    reader = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""))
+    try:
+        found = [(reader.line_num, cells) for cells in reader]
+    except csv.Error as error:
+        raise InputError(source, "", f"is not a CSV file ({error})") from None
+    while found and not any(found[-1][1]):
+        found.pop()
+    return found
+
+
+def csv_line(cells: Sequence[str]) -> str:
+    """Cells as one record of CSV, with its line break."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def _column(field: dataclasses.Field[Any], hint: Any) -> Column:
+    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    (kind,) = (choice for choice in choices if choice is not types.NoneType)
+    return Column(field.name, kind, field.default, **field.metadata)

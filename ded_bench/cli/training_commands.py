@@ -84,16 +84,11 @@ def _train_dpc(a: argparse.Namespace) -> int:
     import torch
 
     from ded_bench.koopman.surrogates import find_model
-    from ded_bench.methods.dpc import training
-    from ded_bench.methods.dpc_paper import paper_training
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
 
-    trainers: dict[str, Any] = {"ded-dpc-paper": paper_training.train, "ded-dpc": training.train}
-    if a.method not in trainers:
-        known = ", ".join(trainers)
-        raise InputError("--method", a.method, f"is not trained by this command (known: {known})")
-    choices = get_method(a.method).settings
+    method = get_method(a.method)
+    train, choices = method.train, method.settings
     if a.settings not in choices:
         raise InputError("--settings", a.settings, f"unknown (known: {', '.join(choices)})")
     case = Case.load(a.case)
@@ -106,9 +101,10 @@ def _train_dpc(a: argparse.Namespace) -> int:
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     torch.set_num_threads(1)  # these networks gain nothing from more, and results then repeat anywhere
-    options = choices[a.settings] | {"seed": a.seed, "device": a.device, "resume": a.resume}
+    options: dict[str, Any] = dict(choices[a.settings])
+    options |= {"seed": a.seed, "seconds": a.seconds, "device": a.device, "resume": a.resume}
     options |= {"epochs": a.epochs} if a.epochs else {}
-    policy = trainers[a.method](case, a.regime, instances, model, out, seconds=a.seconds, **options)
+    policy = train(case, a.regime, instances, model, out, **options)
     facts = policy.training
     print(
         f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s, "

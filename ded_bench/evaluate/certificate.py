@@ -315,9 +315,9 @@ def _fingerprint(case: Case, method: str, reference: str, regime: str, settings:
         case.fingerprint,
         method,
         settings.slug,
-        get_method(method).artifact(case, regime, settings),
+        *(a.fingerprint for a in get_method(method).artifacts(case, regime, settings)),
         reference,
-        get_method(reference).artifact(case, regime, plain),
+        *(a.fingerprint for a in get_method(reference).artifacts(case, regime, plain)),
         str(seed),
     ]
     return "-".join(part for part in parts if part)

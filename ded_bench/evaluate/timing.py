@@ -119,9 +119,9 @@ def bench_methods(
     jobs = []
     for method in methods:
         for regime in regimes:
-            artifact = get_method(method).artifact(case, regime, settings)
+            artifacts = get_method(method).artifacts(case, regime, settings)
             parts = [case.fingerprint, *(i.fingerprint for i in instances)]
-            parts += [regime, method, settings.slug, artifact, str(repeats)]
+            parts += [regime, method, settings.slug, *(a.fingerprint for a in artifacts), str(repeats)]
             jobs.append((method, regime, hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]))
     known = {(row.key, row.fingerprint): row for row in kept if not row.error}
     rows = []

@@ -38,15 +38,27 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
     Raises:
         InputError: there is no such model yet (names the command that makes it), or its file is wrong.
     """
-    if name == "linear":
+    path = find_model_file(case, name, search)
+    if path is None:
         return linear_model(case)
-    if name == "koopman-single":
-        return single_sample(find_model(case, "koopman", search), case)
-    if name in TRAINED:
+    model = Koopman.load(path, case)
+    return single_sample(model, case) if name == "koopman-single" else model
+
+
+def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | None:
+    """The file that a model is read or derived from; None if it follows from the case.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it).
+    """
+    if name == "linear":
+        return None
+    kind = "koopman" if name == "koopman-single" else name
+    if kind in TRAINED:
         for folder in search:
-            if model_file(folder, name).is_file():
-                return Koopman.load(model_file(folder, name), case)
-        raise InputError("--model", name, f"not identified yet; run `ded-bench train-ko --case {case.id}`")
+            if model_file(folder, kind).is_file():
+                return model_file(folder, kind)
+        raise InputError("--model", kind, f"not identified yet; run `ded-bench train-ko --case {case.id}`")
     if Path(name).is_file():
-        return Koopman.load(name, case)
+        return Path(name)
     raise InputError("--model", name, f"no such file and no such model (known: {', '.join(MODELS)})")

@@ -13,6 +13,7 @@ import pyomo.environ as pyo
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import find_model
+from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -30,9 +31,9 @@ SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def artifact(case: Case, regime: str, settings: Settings) -> str:
-    """Fingerprint of the Koopman model that `prepare` would use."""
-    return find_model(case, settings.model, settings.search).fingerprint
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The Koopman model that `prepare` would use."""
+    return (model_artifact(case, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ded_bench.koopman.model import Koopman, hat_functions
 from ded_bench.koopman.surrogates import find_model
+from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.ded_ko import check_step
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
@@ -48,9 +49,9 @@ MAX_ROUNDS = 100
 N_BLOCKS = 16
 
 
-def artifact(case: Case, regime: str, settings: Settings) -> str:
-    """Fingerprint of the Koopman model that `prepare` would use."""
-    return find_model(case, settings.model, settings.search).fingerprint
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The Koopman model that `prepare` would use."""
+    return (model_artifact(case, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

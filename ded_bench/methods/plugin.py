@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import LARGEST, Case
 from ded_bench.problem.instance import Instance
@@ -84,11 +85,11 @@ class Foreign:
 
         return solve
 
-    def artifact(self, case: Case, regime: str, settings: Settings) -> str:
-        """Hash of the sources of the function's package, after what the module itself says."""
+    def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+        """One: what the module says of itself, then a hash of the sources of its package."""
         own = getattr(self.module, "artifact", None)
         said = str(own(case, regime, settings)) if callable(own) else ""
-        return said + _sources(self.module)
+        return (Artifact("code", self.target, said + _sources(self.module)),)
 
     @property
     def _prepares(self) -> bool:

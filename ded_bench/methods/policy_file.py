@@ -127,13 +127,8 @@ def policy_file(
     return ResultsFolder(results).policy(f"{method}-{regime}{suffix}")
 
 
-def find_policy_file(
-    method: str, case: Case, regime: str, settings: Settings, trained: str = "default"
-) -> Path:
+def find_policy_file(method: str, case: Case, regime: str, settings: Settings) -> Path:
     """Return the policy file given in the settings, else the first one in the folders to search.
-
-    Args:
-        trained: slug of the training settings.
 
     Raises:
         InputError: there is none; names the command that trains one.
@@ -141,10 +136,10 @@ def find_policy_file(
     if settings.policy:
         return settings.policy
     for folder in settings.search:
-        path = policy_file(folder, method, regime, settings.model, trained)
+        path = policy_file(folder, method, regime, settings.model, settings.name)
         if path.is_file():
             return path
     command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.id}"
-    command += "" if trained == "default" else f" --settings {trained}"
+    command += "" if settings.name == "default" else f" --settings {settings.name}"
     command += "" if settings.model == DEFAULT_MODEL else f" --model {settings.model}"
     raise InputError("--policy", "", f"no {method} policy for {regime} yet; run `{command}`")

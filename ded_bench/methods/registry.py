@@ -1,21 +1,62 @@
 """METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`plugin`).
 
 A method's module offers `prepare(case, regime, settings) -> (instance -> Solution)` and `SETTINGS`, a
-mapping whose keys are the slugs of its settings. If it depends on a trained model or policy, it
-also offers `artifact(case, regime, settings) -> str`, a fingerprint of it.
+mapping from the slugs of its settings to keyword options. If it depends on a trained model or policy,
+it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is trained
+itself, its line here names the module whose `train` does it (see `Trainer`); `ded-bench train-dpc` finds
+it there.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from ded_bench.files.errors import InputError
+from ded_bench.koopman.model import Koopman
 from ded_bench.methods import plugin
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+
+
+class TrainedPolicy(Protocol):
+    """What a training returns, after it has written the policy's file."""
+
+    @property
+    def training(self) -> Mapping[str, Any]:
+        """Facts for the header: at least `epochs` (done) and `seconds` (spent)."""
+
+
+class Trainer(Protocol):
+    """`train` of a method's training module."""
+
+    def __call__(
+        self,
+        case: Case,
+        regime: str,
+        instances: Sequence[Instance],
+        model: Koopman,
+        out: Path,
+        *,
+        seed: int,
+        seconds: float | None,
+        device: str,
+        resume: bool,
+        **options: Any,
+    ) -> TrainedPolicy:
+        """Train on instances that share one time grid, and write `out` and its history.
+
+        Args:
+            seconds: end after so much training time, s; None: train for all epochs.
+            device: "cpu" or "cuda".
+            resume: go on from the checkpoint beside `out`, if there is one.
+            options: those of the method's setting, and perhaps `epochs`.
+        """
 
 
 @dataclass(frozen=True)
@@ -25,6 +66,7 @@ class Method:
     name: str
     module: str
     title: str
+    trainer: str = ""  # the module that trains it
 
     @property
     def _loaded(self) -> Any:
@@ -46,11 +88,27 @@ class Method:
         solver: Solver = self._loaded.prepare(case, regime, settings)
         return solver
 
-    def artifact(self, case: Case, regime: str, settings: Settings) -> str:
-        """Fingerprint of the trained model or policy that answers depend on; empty if none."""
+    def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+        """All models and policies that answers depend on.
+
+        Raises:
+            InputError: unknown settings, or a model or policy that is missing or does not fit.
+        """
         self._check(settings)
-        find = getattr(self._loaded, "artifact", None)
-        return str(find(case, regime, settings)) if find else ""
+        find = getattr(self._loaded, "artifacts", None)
+        return tuple(find(case, regime, settings)) if find else ()
+
+    @property
+    def train(self) -> Trainer:
+        """The function that trains this method's policy.
+
+        Raises:
+            InputError: it has none (names the methods that do).
+        """
+        if not self.trainer:
+            raise InputError("--method", self.name, f"is not trained (known: {', '.join(trainable())})")
+        trainer: Trainer = importlib.import_module(self.trainer).train
+        return trainer
 
     def _check(self, settings: Settings) -> None:
         if settings.name not in self.settings:
@@ -66,8 +124,15 @@ METHODS: dict[str, Method] = {
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
         Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),
-        Method("ded-dpc-paper", "ded_bench.methods.dpc_paper.paper_policy", "DED-DPC (paper's recipe)"),
-        Method("ded-dpc", "ded_bench.methods.dpc.policy", "DED-DPC"),
+        Method(
+            "ded-dpc-paper",
+            "ded_bench.methods.dpc_paper.paper_policy",
+            "DED-DPC (paper's recipe)",
+            trainer="ded_bench.methods.dpc_paper.paper_training",
+        ),
+        Method(
+            "ded-dpc", "ded_bench.methods.dpc.policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
+        ),
         Method("ded-dpc-refined", "ded_bench.methods.dpc.refined", "DED-DPC (refined)"),
     )
 }
@@ -81,6 +146,11 @@ def registered() -> dict[str, Method]:
     others = plugin.installed()
     names = sorted(name for name in others if name not in METHODS and plugin.SLUG.fullmatch(name))
     return METHODS | {name: Method(name, others[name], name) for name in names}
+
+
+def trainable() -> list[str]:
+    """Names of the methods that are trained; imports none of them."""
+    return [method.name for method in METHODS.values() if method.trainer]
 
 
 def get_method(name: str) -> Method:

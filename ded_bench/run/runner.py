@@ -45,9 +45,10 @@ def make_tasks(
     tasks = []
     for method in map(get_method, methods):
         for regime in regimes:
-            artifact = method.artifact(case, regime, settings)
+            artifacts = [a.fingerprint for a in method.artifacts(case, regime, settings)]
             for instance, split in instances:
-                parts = (case.fingerprint, instance.fingerprint, regime, method.name, settings.slug, artifact)
+                names = regime, method.name, settings.slug
+                parts = (case.fingerprint, instance.fingerprint, *names, *artifacts)
                 fingerprint = hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
                 tasks.append(Task(instance, split, regime, method.name, settings, fingerprint))
     return tasks
@@ -112,8 +113,7 @@ def _packed(case: Case, tasks: Sequence[Task]) -> Iterator[Task]:
 
     @functools.cache
     def files(method: str, regime: str, settings: Settings) -> Files:
-        trained = get_method(method).artifact(case, regime, settings)
-        return pack(settings, regime) if trained else ()
+        return pack(settings, get_method(method).artifacts(case, regime, settings))
 
     for task in tasks:
         yield dataclasses.replace(task, files=files(task.method, task.regime, task.settings))

@@ -4,29 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import glob
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.solution import Settings
 
-#: Contents by their path below a results folder.
+#: Contents by their path below a results folder, or below `GIVEN`.
 Files = tuple[tuple[str, bytes], ...]
+#: Folder of files that the settings name by their paths.
+GIVEN = "given"
 
 
-def pack(settings: Settings, regime: str) -> Files:
-    """Read every file that a method may look for under these settings, in a regime."""
-    found: dict[str, Path] = {}
-    for folder in settings.search:
-        for pattern in ("koopman/*.safetensors", f"policies/*-{glob.escape(regime)}*.safetensors"):
-            for path in sorted(folder.glob(pattern)):
-                found.setdefault(path.relative_to(folder).as_posix(), path)
-    if settings.policy:
-        found[_place("policy", settings.policy)] = settings.policy
-    if Path(settings.model).is_file():
-        found[_place("model", settings.model)] = Path(settings.model)
-    return tuple((name, path.read_bytes()) for name, path in found.items())
+def pack(settings: Settings, artifacts: Iterable[Artifact]) -> Files:
+    """Read every file that an answer depends on."""
+    return tuple((_place(a.kind, a.path, settings), a.path.read_bytes()) for a in artifacts if a.path)
 
 
 @contextlib.contextmanager
@@ -35,16 +28,25 @@ def unpacked(settings: Settings, files: Files) -> Iterator[Settings]:
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
         folder = Path(name)
         for place, content in files:
-            (folder / place).parent.mkdir(exist_ok=True)
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
             (folder / place).write_bytes(content)
-        model = folder / _place("model", settings.model)
-        yield dataclasses.replace(
-            settings,
-            search=(folder,),
-            policy=settings.policy and folder / _place("policy", settings.policy),
-            model=str(model) if model.is_file() else settings.model,
-        )
+        policy, model = settings.policy, settings.model
+        places = {place for place, _ in files}
+        if policy is not None:
+            policy = folder / _given("policy", policy)
+        if _given("model", model) in places:
+            model = str(folder / _given("model", model))
+        yield dataclasses.replace(settings, search=(folder,), policy=policy, model=model)
 
 
-def _place(kind: str, path: str | Path) -> str:
-    return f"{kind}/{Path(path).name}"
+def _place(kind: str, path: Path, settings: Settings) -> str:
+    """Where methods look for a file: by its path in the settings, else below a folder to search."""
+    if path not in (settings.policy, Path(settings.model)):
+        for folder in settings.search:
+            if path.is_relative_to(folder):
+                return path.relative_to(folder).as_posix()
+    return _given(kind, path)
+
+
+def _given(kind: str, path: str | Path) -> str:
+    return f"{GIVEN}/{kind}/{Path(path).name}"

@@ -27,6 +27,7 @@ from ded_bench.evaluate.timing import (
     timing_frame,
 )
 from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import METHODS, Method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
@@ -80,7 +81,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     module.calls = []
     module.times = [0.5]
     module.artifact_name = "one"
-    module.artifact = lambda case, regime, settings: module.artifact_name
+    module.artifacts = lambda case, regime, settings: (Artifact("policy", "fake", module.artifact_name),)
 
     def prepare(case: Case, regime: str, settings: Settings) -> Callable[[Instance], Solution]:
         def solve(instance: Instance) -> Solution:

@@ -14,6 +14,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.koopman.linear import injection_lift, linear_model
 from ded_bench.koopman.model import Koopman, hat_functions
 from ded_bench.methods import ded_ko, ded_ko_knots
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Array, Case
@@ -297,6 +298,8 @@ def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> N
 @pytest.mark.parametrize("method", METHODS)
 def test_prepare_finds_the_model_that_the_settings_name(method, case: Case) -> None:
     settings, instance = Settings(model="linear"), short(case, 0)
-    assert method.artifact(case, "NO", settings) == linear_model(case).fingerprint
+    assert method.artifacts(case, "NO", settings) == (
+        Artifact("model", "linear", linear_model(case).fingerprint),
+    )
     solution = method.prepare(case, "NO", settings)(instance)
     check_limits(case, linear_model(case), instance, solution, "NO")

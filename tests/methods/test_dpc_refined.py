@@ -16,7 +16,7 @@ from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import N_KNOTS, DispatchPolicy
-from ded_bench.methods.dpc.refined import SETTINGS, artifact, prepare
+from ded_bench.methods.dpc.refined import SETTINGS, artifacts, prepare
 from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc_paper.paper_loss import knot_times
@@ -145,7 +145,7 @@ def test_it_serves_as_a_method(threebus: Case, tmp_path: Path) -> None:
     assert answers["steps25"].iterations == 25
     assert answers["default"].solve_s > 0
     assert not np.array_equal(answers["default"].schedule.p, answers["steps25"].schedule.p)
-    before = artifact(threebus, regime, settings["default"])
+    before = artifacts(threebus, regime, settings["default"])
     torch.nn.init.ones_(policy.network.stages[0].last.bias)
     policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
-    assert artifact(threebus, regime, settings["default"]) != before
+    assert artifacts(threebus, regime, settings["default"]) != before

@@ -148,12 +148,15 @@ def test_the_fingerprint_follows_the_sources_and_what_the_module_says(
         (package / "helper.py").write_text(helper)
         (package / "main.py").write_text("def solve(instance, regime): ...")
         method = get_method(f"pack_{name}.main:solve")
-        prints.append(method.artifact(threebus, "NO", Settings()))
-    assert prints[0] == prints[1] != prints[2]  # a change anywhere in the package counts
+        prints.append(method.artifacts(threebus, "NO", Settings()))
+    assert [(a.kind, a.path) for (a,) in prints] == [("code", None)] * 3
+    one, two, three = (a.fingerprint for (a,) in prints)
+    assert one == two != three  # a change anywhere in the package counts
     (tmp_path / "speaking.py").write_text(
         "def artifact(case, regime, settings): return 'weights-7-'\ndef solve(instance, regime): ..."
     )
-    assert get_method("speaking:solve").artifact(threebus, "NO", Settings()).startswith("weights-7-")
+    (speaking,) = get_method("speaking:solve").artifacts(threebus, "NO", Settings())
+    assert speaking.fingerprint.startswith("weights-7-")
 
 
 GOOD = Schedule(np.array([0.0, 1.0]), np.array([[0.6], [0.6]]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import os
 import signal
@@ -20,6 +21,7 @@ from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.linear import linear_model
 from ded_bench.koopman.surrogates import find_model, model_file
+from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
@@ -233,17 +235,26 @@ def test_what_is_shipped_is_what_was_there(threebus: Case, tmp_path: Path) -> No
     for folder, name in ((first, "m-TO"), (second, "m-TO"), (second, "m-TO-long"), (second, "m-NO")):
         (folder / "policies").mkdir(exist_ok=True)
         (folder / "policies" / f"{name}.safetensors").write_bytes(f"{folder.name} {name}".encode())
-    (first / "policies" / "m-TO.checkpoint.pt").touch()
-    policy = tmp_path / "p.safetensors"
+    policy = tmp_path / "own" / "own.safetensors"  # a model and a policy given by paths may share a name
+    policy.parent.mkdir()
     policy.write_bytes(b"given")
     settings = Settings(model=str(tmp_path / "own.safetensors"), policy=policy, search=(first, second))
-    with unpacked(settings, pack(settings, "TO")) as own:
+    artifacts = (
+        Artifact("policy", "m", "1", policy),
+        model_artifact(threebus, settings),
+        Artifact("model", "linear", "2"),
+        model_artifact(threebus, dataclasses.replace(settings, model="koopman-single")),
+        Artifact("policy", "m", "3", second / "policies" / "m-TO-long.safetensors"),
+    )
+    with unpacked(settings, pack(settings, artifacts)) as own:
         (folder,) = own.search
         assert own.slug == settings.slug
         assert own.policy is not None
         assert own.policy.read_bytes() == b"given"
-        for name in (own.model, "koopman", "koopman-paper"):
+        for name in (own.model, "koopman"):
             assert find_model(threebus, name, own.search).fingerprint == model.fingerprint
         there = {path.name: path.read_bytes() for path in (folder / "policies").iterdir()}
-        assert there == {"m-TO.safetensors": b"first m-TO", "m-TO-long.safetensors": b"second m-TO-long"}
+        assert there == {"m-TO-long.safetensors": b"second m-TO-long"}
+        with pytest.raises(InputError, match="koopman-paper"):
+            find_model(threebus, "koopman-paper", own.search)
     assert not folder.exists()

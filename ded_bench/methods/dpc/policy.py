@@ -18,6 +18,7 @@ import torch
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc.inference import CompiledStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.network import StagedNetwork
@@ -142,13 +143,13 @@ def find_policy(case: Case, regime: str, settings: Settings) -> DispatchPolicy:
     Raises:
         InputError: there is none (names the command that trains one), or it does not fit.
     """
-    path = find_policy_file(METHOD, case, regime, settings, settings.name)
-    return DispatchPolicy.load(path, case, regime)
+    return DispatchPolicy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
 
 
-def artifact(case: Case, regime: str, settings: Settings) -> str:
-    """Fingerprint of the policy that `prepare` would use."""
-    return find_policy(case, regime, settings).fingerprint
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy that `prepare` would use."""
+    path = find_policy_file(METHOD, case, regime, settings)
+    return (Artifact("policy", METHOD, DispatchPolicy.load(path, case, regime).fingerprint, path),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import dataclasses
 import time
 from typing import Any
 
@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from ded_bench.koopman.surrogates import find_model
+from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.refinement import STEPS, Refiner
@@ -29,16 +30,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-def artifact(case: Case, regime: str, settings: Settings) -> str:
-    """Fingerprint of the policy and the model that `prepare` would use."""
-    policy = _policy(case, regime, settings).fingerprint
-    model = find_model(case, settings.model, settings.search).fingerprint
-    return hashlib.sha256(f"{policy} {model}".encode()).hexdigest()[:12]
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy and the model that `prepare` would use."""
+    return (*dpc_policy.artifacts(case, regime, _plain(settings)), model_artifact(case, settings))
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return the refined policy as a method; condensing and factorising are done once, here."""
-    policy = _policy(case, regime, settings)
+    policy = dpc_policy.find_policy(case, regime, _plain(settings))
     model = find_model(case, settings.model, settings.search)
     steps: int = SETTINGS[settings.name]["steps"]
     refiners: dict[tuple[float, int], Refiner] = {}
@@ -60,6 +59,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     return solve
 
 
-def _policy(case: Case, regime: str, settings: Settings) -> dpc_policy.DispatchPolicy:
-    plain = Settings("default", settings.model, settings.policy, settings.time_limit_s, settings.search)
-    return dpc_policy.find_policy(case, regime, plain)
+def _plain(settings: Settings) -> Settings:
+    """Of the policy: it is the one of the default training, however many steps refine it."""
+    return dataclasses.replace(settings, name="default")

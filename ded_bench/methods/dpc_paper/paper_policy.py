@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_paper.paper_features import Features
 from ded_bench.methods.dpc_paper.paper_loss import knot_times
 from ded_bench.methods.policy_file import (
@@ -27,7 +28,6 @@ from ded_bench.methods.policy_file import (
     weights_fingerprint,
     write_policy,
 )
-from ded_bench.methods.policy_file import policy_file as policy_file
 from ded_bench.methods.policy_solver import method
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Array, Case
@@ -193,9 +193,10 @@ def find_policy(case: Case, regime: str, settings: Settings) -> Policy:
     return Policy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
 
 
-def artifact(case: Case, regime: str, settings: Settings) -> str:
-    """Fingerprint of the policy that `prepare` would use."""
-    return find_policy(case, regime, settings).fingerprint
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy that `prepare` would use."""
+    path = find_policy_file(METHOD, case, regime, settings)
+    return (Artifact("policy", METHOD, Policy.load(path, case, regime).fingerprint, path),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

@@ -136,7 +136,8 @@ def _certify(a: argparse.Namespace) -> int:
 
 
 def _compare(a: argparse.Namespace) -> int:
-    from ded_bench.report.compare import Tolerance, compare, to_json, to_text
+    from ded_bench.evaluate.compare import Tolerance, compare
+    from ded_bench.report.comparison import to_json, to_text
 
     limits = Tolerance(a.tolerance, a.tolerance_hz, a.tolerance_pu)
     found = compare(a.a, a.b, limits, common_only=a.common)
@@ -146,8 +147,6 @@ def _compare(a: argparse.Namespace) -> int:
 
 def _report(a: argparse.Namespace) -> int:
     with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
-        if pool:
-            pool.warm("ded_bench.report.gallery")  # while this process imports it, too
         from ded_bench.report.report import write_report
 
         case = Case.load(a.case)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from ded_bench.evaluate.compare import Tolerance, compare
 from ded_bench.evaluate.timing import TimingRow, format_timing
 from ded_bench.files.errors import InputError
-from ded_bench.report.compare import Tolerance, compare, to_json, to_text
+from ded_bench.report.comparison import to_json, to_text
 from ded_bench.run.results import Results, Row
 
 

@@ -1,0 +1,84 @@
+"""The comparison of two results folders as text for a terminal, and as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+
+from ded_bench.evaluate.compare import Change, Comparison, name_of
+from ded_bench.report.render import Column, to_markdown
+
+#: Rows that a section of the printed comparison names; the rest are counted.
+SHOWN = 10
+PRINTED = (
+    Column("regime", "Regime"),
+    Column("title", "Method"),
+    Column("common", "rows"),
+    Column("gap_percent_a", "mean gap A, %"),
+    Column("gap_percent_b", "mean gap B, %"),
+    Column("time_ratio", "time B/A, under load"),
+    Column("time_ratio_alone", "time B/A, alone"),
+)
+
+
+def to_text(comparison: Comparison) -> str:
+    """The comparison for a terminal: a few lines for each kind of change, a table, one verdict."""
+    c = comparison
+    lines = [f"A  {c.a}: {c.heads[0]}", f"B  {c.b}: {c.heads[1]}"]
+    if c.incomparable:
+        return "\n".join([*lines, f"not comparable: {c.incomparable}"]) + "\n"
+    counts = []
+    for name, keys in (("only in A", c.only_a), ("only in B", c.only_b)):
+        if keys:
+            counts.append(f"{len(keys)} rows {name}")
+            lines += _section(f"{name}: {len(keys)} rows", [name_of(key) for key in keys])
+    for column in dict.fromkeys(change.column for change in c.changes):
+        found = [change for change in c.changes if change.column == column]
+        counts.append(f"{len(found)} × {column}")
+        told = [f"{name_of(change.key)}: {_arrow(change)}" for change in found]
+        lines += _section(f"{column}: {len(found)} of {c.common} common rows", told)
+    if len(c.summary):
+        lines += ["", to_markdown(c.summary, PRINTED)]
+    verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
+    return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
+
+
+def to_json(comparison: Comparison) -> str:
+    """The comparison as one JSON object; infinite sizes and missing numbers are null."""
+    c = comparison
+    changes = [
+        change.key._asdict()
+        | {"column": change.column, "before": change.before, "after": change.after}
+        | {"size": change.size if math.isfinite(change.size) else None}
+        for change in c.changes
+    ]
+    summary = c.summary.astype(object).where(c.summary.notna(), None)
+    return json.dumps(
+        {
+            "a": str(c.a),
+            "b": str(c.b),
+            "same": c.same,
+            "incomparable": c.incomparable,
+            "common": c.common,
+            "only_a": [key._asdict() for key in c.only_a],
+            "only_b": [key._asdict() for key in c.only_b],
+            "changes": changes,
+            "summary": summary.to_dict("records"),
+        }
+    )
+
+
+def _section(heading: str, items: Sequence[str]) -> list[str]:
+    rest = [f"  … and {len(items) - SHOWN} more"] if len(items) > SHOWN else []
+    return [heading, *(f"  {item}" for item in items[:SHOWN]), *rest]
+
+
+def _arrow(change: Change) -> str:
+    numbers = isinstance(change.before, float) and isinstance(change.after, float)
+    by = f" ({'relative ' if change.column == 'objective' else ''}{change.size:.2g})" if numbers else ""
+    return f"{_cell(change.before)} → {_cell(change.after)}{by}"
+
+
+def _cell(value: object) -> str:
+    return "(none)" if value is None else f"{value:.10g}" if isinstance(value, float) else str(value)

@@ -32,18 +32,10 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.figures import summaries
+from ded_bench.report.figures.frequencies import frequency_figure, koopman_figure
 from ded_bench.report.figures.plan import Plan, plan
-from ded_bench.report.figures.schedules import (
-    DPI,
-    Shown,
-    Worst,
-    frequency_figure,
-    koopman_figure,
-    plain,
-    save_figure,
-    schedule_figure,
-    worst_figure,
-)
+from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
+from ded_bench.report.figures.style import DPI, Shown, plain, save_figure
 from ded_bench.report.page import Block, Picture, Text
 from ded_bench.run.pool import Call, Workers
 from ded_bench.run.results import Key, Results

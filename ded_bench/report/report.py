@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pandas as pd
@@ -93,10 +92,8 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
     frame = judged_rows(everything)
     timings = timing_frame(read_timing(folder / "timing.csv"))
     timing = latest_host(timings[timings["case"] == case.id])
-    with ThreadPoolExecutor(1) as aside:  # meanwhile `draw` mostly waits for other processes
-        computed = aside.submit(_frames, case, folder, frame, everything, timing)
-        gallery = draw(case, results, frame, timing, problems, pool)
-        frames = computed.result()
+    frames = _frames(case, folder, frame, everything, timing)
+    gallery = draw(case, results, frame, timing, problems, pool)
     rows_from = rows_caption(frame, everything)
     files = _write_tables(folder, frames, rows_from, timing)
     notes = data_notes(frame, everything, frames["summary"], timings, timing, case, problems)

@@ -22,20 +22,9 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.figures import summaries
-from ded_bench.report.figures.schedules import (
-    RAD_TO_HZ,
-    Shown,
-    Worst,
-    colour,
-    dashes,
-    frequency_figure,
-    koopman_figure,
-    marker,
-    save_figure,
-    schedule_figure,
-    thin,
-    worst_figure,
-)
+from ded_bench.report.figures.frequencies import frequency_figure, koopman_figure
+from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
+from ded_bench.report.figures.style import RAD_TO_HZ, Shown, colour, dashes, marker, save_figure, thin
 from ded_bench.report.gallery import rollout
 from ded_bench.truth.simulate import simulate_many
 

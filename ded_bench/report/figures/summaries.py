@@ -17,7 +17,7 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.report.figures.schedules import (
+from ded_bench.report.figures.style import (
     BLACK,
     BLUE,
     BUS_COLOURS,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
@@ -34,30 +35,78 @@ class LoadRamp(Record):
         into = np.minimum(np.maximum(t - self.start, 0.0), self.duration)  # np.clip takes twice as long
         return np.asarray(self.initial + self.rate * into)
 
+    @property
+    def kinks(self) -> tuple[float, ...]:
+        """Times in s at which the injection changes its slope; they may lie beyond the horizon."""
+        return (self.start, self.start + self.duration) if self.rate and self.duration else ()
+
+
+class LoadPoints(Record):
+    """A load by its injections in pu at times in s, linear between them (instance/2)."""
+
+    points: Annotated[
+        tuple[Annotated[tuple[NonNegative, Number], Field(strict=False)], ...],
+        Field(strict=False, min_length=2),
+    ]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> LoadPoints:
+        times = [t for t, _ in self.points]
+        if times[0] != 0:
+            raise ValueError("points: must start at t = 0")
+        if any(b <= a for a, b in itertools.pairwise(times)):
+            raise ValueError("points: times must increase strictly")
+        return self
+
+    def at(self, t: Array) -> Array:
+        """Injection in pu at times `t` in s (any shape), up to the last point."""
+        times, values = zip(*self.points, strict=True)
+        return np.asarray(np.interp(t, times, values))
+
+    @property
+    def kinks(self) -> tuple[float, ...]:
+        """Times in s at which the injection may change its slope."""
+        return tuple(t for t, _ in self.points[1:-1])
+
+
+def _load_of_its_kind(value: Any, _: Any) -> LoadRamp | LoadPoints:
+    """Read a load as what its fields say it is: a union's errors would name fields of both kinds."""
+    if isinstance(value, LoadRamp | LoadPoints):
+        return value
+    kind = LoadPoints if isinstance(value, dict) and "points" in value else LoadRamp
+    return kind.model_validate(value)
+
+
+Load = Annotated[LoadRamp | LoadPoints, WrapValidator(_load_of_its_kind)]
+
 
 class Initial(Record):
-    """State at t = 0: generator power in pu and frequency deviation in rad/s, by bus."""
+    """State at t = 0, by generator bus: power in pu, frequency deviation in rad/s, angle in rad.
+
+    Without angles (always in instance/1) they are those of the power flow.
+    """
 
     power: dict[Name, Number]
     omega: dict[Name, Number]
+    theta: dict[Name, Number] | None = Field(default=None, exclude_if=lambda theta: theta is None)
 
 
 class Instance(Record):
-    """One DED problem. Angles at t = 0 follow from the power flow (see `truth.swing`)."""
+    """One DED problem; angles at t = 0: see `truth.network.Network.initial_angles`."""
 
-    schema_: Literal["ded-bench/instance/1"] = Field(alias="schema")
+    schema_: Literal["ded-bench/instance/1", "ded-bench/instance/2"] = Field(alias="schema")
     id: Name
     case: Name
     seed: int | tuple[int, ...]
     horizon_s: Positive
     dt_s: Positive
     cost: dict[Name, NonNegative]
-    load: dict[Name, LoadRamp]
+    load: dict[Name, Load]
     initial: Initial
 
     @field_validator("seed", mode="after")
     @classmethod
-    def _plain_seed(cls, seed: int | tuple[int, ...], info: ValidationInfo) -> int | tuple[int, ...]:
+    def _plain_seed(cls, seed: int | tuple[int, ...]) -> int | tuple[int, ...]:
         if any(part < 0 for part in (seed if isinstance(seed, tuple) else (seed,))):
             raise ValueError("must not be negative")
         return seed
@@ -69,6 +118,19 @@ class Instance(Record):
             raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
         if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
             raise ValueError("horizon_s: must be a whole multiple of dt_s")
+        return self
+
+    @model_validator(mode="after")
+    def _fields_of_its_schema(self) -> Instance:
+        second = self.schema_ == "ded-bench/instance/2"
+        if self.initial.theta is not None and not second:
+            raise ValueError("initial.theta: needs schema ded-bench/instance/2")
+        for bus, load in self.load.items():
+            if isinstance(load, LoadPoints):
+                if not second:
+                    raise ValueError(f"load.{bus}.points: needs schema ded-bench/instance/2")
+                if load.points[-1][0] < self.horizon_s:
+                    raise ValueError(f"load.{bus}.points: must reach the horizon")
         return self
 
     @staticmethod
@@ -101,6 +163,8 @@ class Instance(Record):
             "initial.power": (self.initial.power, case.generators),
             "initial.omega": (self.initial.omega, case.generators),
         }
+        if self.initial.theta is not None:
+            wanted["initial.theta"] = (self.initial.theta, case.generators)
         for field, (given, buses) in wanted.items():
             if missing := [bus for bus in buses if bus not in given]:
                 raise InputError(source, f"{field}.{missing[0]}", "field required")
@@ -129,6 +193,12 @@ class Instance(Record):
     def omega_initial(self, case: Case) -> Array:
         """Frequency deviation at t = 0, shape (n_gen,), rad/s."""
         return np.array([self.initial.omega[g] for g in case.generators])
+
+    def theta_initial(self, case: Case) -> Array | None:
+        """Angles at t = 0 relative to the slack, shape (n_gen,), rad; None where the power flow gives them."""
+        if self.initial.theta is None:
+            return None
+        return np.array([self.initial.theta[g] for g in case.generators])
 
     def cost_gen(self, case: Case) -> Array:
         """Generator costs c_i, shape (n_gen,)."""
@@ -178,7 +248,9 @@ def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
 
     Columns: `id, case, seed, horizon_s, dt_s` (the seed's parts joined by spaces), then by bus
     `cost_<bus>`, `load_<bus>_initial` (pu), `_start` (s), `_duration` (s), `_rate` (pu/s), `P0_<bus>`
-    (initial power, pu) and `omega0_<bus>` (initial frequency deviation, rad/s).
+    (initial power, pu) and `omega0_<bus>` (initial frequency deviation, rad/s). A load that is given by
+    points has them as pairs (s, pu) in `load_<bus>_points` instead; where an instance gives angles,
+    `theta0_<bus>` are those (rad).
     """
     import pandas as pd  # here only: loading instances does without it
 
@@ -188,9 +260,10 @@ def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
         row: dict[str, Any] = {"id": instance.id, "case": instance.case, "seed": " ".join(map(str, seed))}
         row |= {"horizon_s": instance.horizon_s, "dt_s": instance.dt_s}
         row |= {f"cost_{bus}": value for bus, value in instance.cost.items()}
-        for bus, ramp in instance.load.items():
-            row |= {f"load_{bus}_{name}": value for name, value in ramp}
+        for bus, load in instance.load.items():
+            row |= {f"load_{bus}_{name}": value for name, value in load}
         row |= {f"P0_{bus}": value for bus, value in instance.initial.power.items()}
         row |= {f"omega0_{bus}": value for bus, value in instance.initial.omega.items()}
+        row |= {f"theta0_{bus}": value for bus, value in (instance.initial.theta or {}).items()}
         rows.append(row)
     return pd.DataFrame(rows)

@@ -16,6 +16,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.state import State
 
 #: Newton stops at this mismatch, pu; doubles resolve f to about 1e-15.
 MISMATCH = 1e-12
@@ -76,10 +77,10 @@ class Network:
         self.d = np.array([case.machines[g].d for g in case.generators])
         self._outer_algebraic = self._outer(self.algebraic)
         self._outer_unknown = self._outer(self.unknown)
-        flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
-        self._first_step = np.zeros_like(flat)
+        self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
+        self._first_step = np.zeros_like(self._flat)
         self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
-            flat[np.ix_(self.unknown, self.unknown)]
+            self._flat[np.ix_(self.unknown, self.unknown)]
         )
 
     def injections(self, theta: Array) -> Array:
@@ -130,9 +131,30 @@ class Network:
         return np.asarray((p_gen - f_gen - self.d * omega) / self.m)
 
     def initial_angles(self, instance: Instance) -> Array:
-        """Angles at t = 0: the power flow of P_0 and the initial loads, shape (n_bus,), rad."""
-        loads = instance.p_load(self.case, np.zeros(1))[0]
-        return self.power_flow(instance.p_initial(self.case), loads)
+        """Angles at t = 0, shape (n_bus,), rad.
+
+        The power flow of P_0 and the initial loads, unless the instance gives the generators' angles: then
+        the loads fix the others.
+
+        Raises:
+            PowerFlowError: there are no such angles.
+        """
+        p_load = instance.p_load(self.case, np.zeros(1))[0]
+        given = instance.theta_initial(self.case)
+        if given is None:
+            return self.power_flow(instance.p_initial(self.case), p_load)
+        theta = np.zeros(self.n_bus)
+        theta[self.generators] = given
+        # Newton's guess: angles that the lines, linearised at zero, would give the other buses.
+        alg, gen = self.algebraic, self.generators
+        wanted = self.load_injections(p_load) - self._flat[np.ix_(alg, gen)] @ given
+        theta[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], wanted)
+        return self.solve_loads(theta, self.load_injections(p_load))[0]
+
+    def initial_state(self, instance: Instance) -> State:
+        """The generators at t = 0; raises PowerFlowError where `initial_angles` does."""
+        theta = self.initial_angles(instance)[self.generators]
+        return State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
 
     def linearise(self, theta: Array) -> Linearisation:
         """Linearise at the angles of an equilibrium, shape (n_bus,)."""
@@ -178,11 +200,10 @@ def check_servable(case: Case, instance: Instance, source: str) -> None:
     try:
         network.initial_angles(instance)
     except PowerFlowError as error:
-        problem = f"initial loads and power cannot be served: {error}"
-        raise InputError(source, "load, initial.power", problem) from None
-    kinks = {0.0, instance.horizon_s}
-    for ramp in instance.load.values():
-        kinks |= {ramp.start, ramp.start + ramp.duration}
+        given = "power" if instance.initial.theta is None else "theta"
+        problem = f"initial loads and {given} cannot be served: {error}"
+        raise InputError(source, f"load, initial.{given}", problem) from None
+    kinks = {0.0, instance.horizon_s, *(t for load in instance.load.values() for t in load.kinks)}
     times = np.array(sorted(t for t in kinks if t <= instance.horizon_s))
     p_load = instance.p_load(case, times)
     p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)

@@ -122,7 +122,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     What instances differ in - costs, loads, initial values, the regime's bound - are variables
     that `set_instance` fixes by their bounds.
     """
-    network = Network(case)
+    network, ramp = Network(case), dict(zip(case.generators, case.ramp.tolist(), strict=True))
     m = pyo.ConcreteModel()
     m.t = dae.ContinuousSet(bounds=(0, steps * dt))
     m.gen = pyo.Set(initialize=case.generators, ordered=True)
@@ -173,7 +173,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     @m.Constraint(m.gen, m.step)
     def ineq_ramp(m: Any, g: str, k: int) -> Any:
         rate = (m.p_gen[g, times[k]] - m.p_gen[g, times[k - 1]]) / dt
-        return pyo.inequality(-case.ramp_pu_per_s, rate, case.ramp_pu_per_s)
+        return pyo.inequality(-ramp[g], rate, ramp[g])
 
     @m.Objective()
     def cost_total(m: Any) -> Any:

@@ -63,21 +63,26 @@ def _compiled(case: Case, elements: int) -> Compiled:
 
 
 def element_count(case: Case, instance: Instance, length_s: float) -> int:
-    """Number of elements of about a given length, the same for all instances of one horizon."""
+    """Number of elements of about a given length; for loads that ramp once it depends on the horizon only."""
     pieces = 2 * len(case.loads) + 1  # a load ramp starts and ends: what lies between needs an element
+    pieces = max(pieces, len(_kinks(instance)) - 1)
     return min(max(round(instance.horizon_s / length_s), pieces), instance.steps)
 
 
-def element_ends(case: Case, instance: Instance, elements: int) -> NDArray[np.int_]:
+def _kinks(instance: Instance) -> list[int]:
+    """Grid indices k of the kinks of the loads, rounded, with the first and the last point of the grid."""
+    kinks = [t for load in instance.load.values() for t in load.kinks]
+    places = {round(t / instance.dt_s) for t in kinks if t < instance.horizon_s}
+    return sorted(places | {0, instance.steps})
+
+
+def element_ends(instance: Instance, elements: int) -> NDArray[np.int_]:
     """Grid indices k of the element ends, shape (elements + 1,), from 0 to the last.
 
     Every kink of a load is an end, rounded to the grid; between kinks the elements are of nearly equal
     length, and the longest is as short as can be.
     """
-    ramps = [instance.load[bus] for bus in case.loads]
-    kinks = [t for r in ramps if r.rate and r.duration for t in (r.start, r.start + r.duration)]
-    places = {round(t / instance.dt_s) for t in kinks if t < instance.horizon_s}
-    pieces = list(itertools.pairwise(sorted(places | {0, instance.steps})))
+    pieces = list(itertools.pairwise(_kinks(instance)))
     counts = [1] * len(pieces)
     for _ in range(elements - len(pieces)):
         lengths = [(b - a) / count for (a, b), count in zip(pieces, counts, strict=True)]
@@ -96,7 +101,7 @@ def build_ded_radau(case: Case, elements: int) -> pyo.ConcreteModel:
     sum over the grid points t_k: half of what is at an element's ends and all between, which is exact for
     generator powers; for |P_s| it is the number of grid steps times the mean by Radau's quadrature.
     """
-    network = Network(case)
+    network, ramp = Network(case), dict(zip(case.generators, case.ramp.tolist(), strict=True))
     m = pyo.ConcreteModel()
     m.tau = dae.ContinuousSet(bounds=(0, elements))
     m.element = pyo.RangeSet(1, elements)
@@ -157,7 +162,7 @@ def build_ded_radau(case: Case, elements: int) -> pyo.ConcreteModel:
     @m.Constraint(m.gen, m.element)
     def ineq_ramp(m: Any, g: str, e: int) -> Any:
         rate = (m.p_gen[g, e] - m.p_gen[g, e - 1]) / m.length[e]
-        return pyo.inequality(-case.ramp_pu_per_s, rate, case.ramp_pu_per_s)
+        return pyo.inequality(-ramp[g], rate, ramp[g])
 
     def cost_rate(end: int) -> Any:
         generation = sum(m.cost[g] * m.p_gen[g, end] for g in m.gen)
@@ -203,7 +208,7 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     for g in case.generators:
         fix(m.cost[g], instance.cost[g])
     fix(m.cost_slack, instance.cost_slack(case))
-    for e, steps in zip(m.element, np.diff(element_ends(case, instance, len(m.element))), strict=True):
+    for e, steps in zip(m.element, np.diff(element_ends(instance, len(m.element))), strict=True):
         fix(m.steps[e], float(steps))
         fix(m.length[e], float(steps) * instance.dt_s)
     times, load = point_times(m), instance.p_load(case)
@@ -246,6 +251,6 @@ def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedul
 
     IPOPT relaxes bounds by 1e-8 of their size; powers are put back, which makes no ramp steeper.
     """
-    ends = element_ends(case, instance, len(m.element))
+    ends = element_ends(instance, len(m.element))
     values: Array = np.array([[m.p_gen[g, end].value for g in case.generators] for end in m.end])
     return Schedule(t=instance.grid[ends], p=np.clip(values, case.p_min, case.p_max))

@@ -158,7 +158,7 @@ class SequentialDed:
         right[:, n_gen:] = offset * self._sign
         right[0, :n_gen] += theta[0] / dt
         right[0, n_gen:-1] += self._network.m / dt * instance.omega_initial(case)
-        limit = np.full((self._steps, n_gen), case.ramp_pu_per_s)
+        limit = np.tile(case.ramp, (self._steps, 1))
         start = np.zeros_like(limit)
         start[0] = instance.p_initial(case) / dt
         prices = [np.zeros(2 * n_gen), instance.cost_gen(case), np.full(2, instance.cost_slack(case))]

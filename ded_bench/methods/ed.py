@@ -64,7 +64,7 @@ def follow(case: Case, instance: Instance, targets: Array, interval_s: float) ->
     power = np.empty((len(grid), len(case.generators)))
     power[0] = instance.p_initial(case)
     for target, a, b in zip(targets, *_intervals(instance, interval_s), strict=True):
-        reach = case.ramp_pu_per_s * (grid[a + 1 : b + 1, None] - grid[a])
+        reach = case.ramp * (grid[a + 1 : b + 1, None] - grid[a])
         power[a + 1 : b + 1] = power[a] + np.clip(target - power[a], -reach, reach)
     return Schedule(t=grid, p=power)
 

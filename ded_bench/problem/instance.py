@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, WrapValidator, field_validator, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    WrapValidator,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
@@ -88,7 +95,11 @@ class Initial(Record):
 
     power: dict[Name, Number]
     omega: dict[Name, Number]
-    theta: dict[Name, Number] | None = Field(default=None, exclude_if=lambda theta: theta is None)
+    theta: dict[Name, Number] | None = None
+
+    @model_serializer(mode="wrap")
+    def _given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in write(self).items() if value is not None}
 
 
 class Instance(Record):
@@ -123,7 +134,7 @@ class Instance(Record):
     @model_validator(mode="after")
     def _fields_of_its_schema(self) -> Instance:
         second = self.schema_ == "ded-bench/instance/2"
-        if self.initial.theta is not None and not second:
+        if "theta" in self.initial.model_fields_set and not second:
             raise ValueError("initial.theta: needs schema ded-bench/instance/2")
         for bus, load in self.load.items():
             if isinstance(load, LoadPoints):

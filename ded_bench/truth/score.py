@@ -72,7 +72,7 @@ def judge(case: Case, instance: Instance, trajectory: Trajectory, regime: str) -
     p_gen = trajectory.p_gen
     cost = p_gen @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(trajectory.p_slack)
     excess_omega = np.abs(trajectory.omega) - case.omega_bound(regime)
-    excess_ramp = np.abs(np.diff(p_gen, axis=0)) - case.ramp_pu_per_s * instance.dt_s
+    excess_ramp = np.abs(np.diff(p_gen, axis=0)) - case.ramp * instance.dt_s
     excess_bound = np.maximum(p_gen - case.p_max, case.p_min - p_gen)
     return Score(
         objective=float(cost.sum()),

@@ -66,7 +66,17 @@ BAD = {
     "number for a name": (_with("id", 7), "id", "string"),
     "path as a name": (_with("id", "../../etc/passwd"), "id", "pattern"),
     "empty name": (_with("case", ""), "case", "pattern"),
-    "other schema": (_with("schema", "ded-bench/instance/2"), "schema", "ded-bench/instance/1"),
+    "other schema": (_with("schema", "ded-bench/instance/3"), "schema", "ded-bench/instance/1"),
+    "points in instance/1": (
+        _with("load.town", {"points": [[0, -1.0], [6, -1.1]]}),
+        "",
+        "load.town.points: needs schema ded-bench/instance/2",
+    ),
+    "angles in instance/1": (
+        _with("initial.theta", {"plant": 0.1}),
+        "",
+        "initial.theta: needs schema ded-bench/instance/2",
+    ),
     "negative seed": (_with("seed", [2022, -1]), "seed", "negative"),
     "negative duration": (_with("load.town.duration", -1.0), "load.town.duration", "greater than or equal"),
     "negative start": (_with("load.town.start", -1e-9), "load.town.start", "greater than or equal"),

@@ -52,7 +52,7 @@ def with_inputs(case: Case, instance: Instance, elements: int, schedule: Schedul
     """The model solved with its generator powers fixed and its frequencies free."""
     model = build_ded_radau(case, elements)
     set_instance(model, case, instance, "NO")
-    times = instance.grid[element_ends(case, instance, elements)]
+    times = instance.grid[element_ends(instance, elements)]
     for j, g in enumerate(case.generators):
         for end, value in zip(model.end, schedule.at(times)[:, j].tolist(), strict=True):
             model.p_gen[g, end].setlb(value)
@@ -82,7 +82,7 @@ def test_elements_end_where_loads_kink(ninebus: Case) -> None:
         instance = sample_instance(ninebus, 77, index)
         count = element_count(ninebus, instance, 0.25)
         assert count == 240
-        ends = element_ends(ninebus, instance, count)
+        ends = element_ends(instance, count)
         assert ends.shape == (count + 1,)
         assert (ends[0], ends[-1]) == (0, 6000)
         assert (np.diff(ends) >= 1).all()
@@ -98,11 +98,11 @@ def test_elements_are_never_finer_than_the_grid_nor_fewer_than_the_kinks(
 ) -> None:
     instance = ramping(threebus, quiet_instance)
     assert element_count(threebus, instance, 1e-3) == instance.steps
-    assert element_ends(threebus, instance, instance.steps).tolist() == list(range(instance.steps + 1))
+    assert element_ends(instance, instance.steps).tolist() == list(range(instance.steps + 1))
     assert element_count(threebus, instance, 100.0) == 3
-    assert element_ends(threebus, instance, 3).tolist() == [0, 50, 130, 200]
+    assert element_ends(instance, 3).tolist() == [0, 50, 130, 200]
     still = quiet_instance(threebus, horizon_s=HORIZON)
-    assert element_ends(threebus, still, 4).tolist() == [0, 50, 100, 150, 200]
+    assert element_ends(still, 4).tolist() == [0, 50, 100, 150, 200]
 
 
 def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> None:
@@ -115,7 +115,7 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
     errors, gaps = [], []
     for elements in (3, 6, 12):
         model = with_inputs(case, instance, elements, schedule)
-        ends = element_ends(case, instance, elements)
+        ends = element_ends(instance, elements)
         omega = np.array([[model.omega[g, end].value for g in case.generators] for end in model.end])
         errors.append(np.abs(omega - truth.omega[ends]).max())
         cost = truth.p_gen @ instance.cost_gen(case)

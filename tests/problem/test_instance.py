@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from ded_bench.problem.instance import LoadRamp
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import parse_record
+from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp, instances_frame
 from ded_bench.problem.sampling import sample_instance
 
 
@@ -64,3 +68,74 @@ def test_vectors_follow_the_order_of_the_case(ninebus, quiet_instance):
     assert instance.cost_slack(ninebus) == 0.1
     np.testing.assert_array_equal(instance.p_initial(ninebus), [1.2, 0.9])
     np.testing.assert_array_equal(instance.omega_initial(ninebus), [0.002, -0.003])
+
+
+# instance/2.
+
+POINTS = [[0.0, -0.9], [1.5, -0.9], [3.5, -0.96], [60.0, -0.96]]
+
+
+def second(case, instance, **changes) -> str:
+    """An instance's file as instance/2, with some loads given by points, or angles at t = 0."""
+    data = json.loads(instance.model_dump_json(by_alias=True)) | {"schema": "ded-bench/instance/2"}
+    data["load"] |= {bus: {"points": points} for bus, points in changes.get("points", {}).items()}
+    if "theta" in changes:
+        data["initial"]["theta"] = changes["theta"]
+    return json.dumps(data)
+
+
+def test_fingerprints_of_instance_1_are_what_they_always_were(ninebus, threebus):
+    """Rows of results carry them."""
+    assert [sample_instance(ninebus, 2022, i).fingerprint for i in (0, 7)] == ["4a5578c227d6", "a06fd9b927bd"]
+    assert [sample_instance(threebus, 5, i).fingerprint for i in (0, 1)] == ["b1614654f712", "5a65e3c30ee0"]
+
+
+def test_points_that_say_what_a_ramp_says_are_the_same_load():
+    ramp = LoadRamp(initial=-0.9, start=1.5, duration=2.0, rate=-0.03)
+    points = LoadPoints.model_validate({"points": POINTS})
+    t = np.linspace(0.0, 60.0, 6001)
+    np.testing.assert_allclose(points.at(t), ramp.at(t), rtol=0, atol=1e-15)
+    assert points.kinks == ramp.kinks == (1.5, 3.5)
+    assert LoadRamp(initial=-0.9, start=1.5, duration=2.0, rate=0.0).kinks == ()
+
+
+def test_instance_2_reads_back_as_it_was_written(case, quiet_instance):
+    """Points and ramps side by side; angles stand in the order of the case."""
+    theta = {bus: 0.01 * i for i, bus in enumerate(reversed(case.generators))}
+    text = second(case, quiet_instance(case), points={case.loads[0]: POINTS}, theta=theta)
+    instance = parse_record(Instance, text, "second")
+    assert json.loads(instance.model_dump_json(by_alias=True)) == json.loads(text)
+    np.testing.assert_array_equal(instance.theta_initial(case), [theta[g] for g in case.generators])
+    assert instance.p_load(case)[[0, 150, 250, 350], 0] == pytest.approx([-0.9, -0.9, -0.93, -0.96])
+    frame = instances_frame([instance, quiet_instance(case)])
+    assert frame[f"load_{case.loads[0]}_points"][0] == tuple(map(tuple, POINTS))
+    assert frame[f"theta0_{case.generators[0]}"][0] == theta[case.generators[0]]
+    assert frame[f"load_{case.loads[0]}_initial"].isna().tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("points", "field", "problem"),
+    [
+        ([[0.0, -1.0]], "load.town.points", "at least 2"),
+        ([[0.5, -1.0], [60.0, -1.0]], "load.town", "points: must start at t = 0"),
+        ([[0.0, -1.0], [0.0, -1.1], [60.0, -1.0]], "load.town", "points: times must increase strictly"),
+        ([[0.0, -1.0], [5.99, -1.0]], "", "load.town.points: must reach the horizon"),
+        ([[0.0, -1.0], [60.0, "x"]], "load.town.points.1.1", "valid number"),
+        ([[0.0, -1.0], [60.0]], "load.town.points.1.1", "field required"),
+        ([[0.0, -1.0], [60.0, 1e300]], "load.town.points.1.1", "less than"),
+        (None, "load.town.points", "valid array"),
+    ],
+)
+def test_wrong_points_are_refused(threebus, quiet_instance, points, field, problem):
+    with pytest.raises(InputError) as caught:
+        parse_record(Instance, second(threebus, quiet_instance(threebus), points={"town": points}), "bad")
+    assert caught.value.field == field
+    assert problem in caught.value.problem
+
+
+def test_angles_are_given_for_exactly_the_generators(threebus, quiet_instance):
+    for theta, field in (({}, "plant"), ({"plant": 0.0, "town": 0.0}, "town")):
+        instance = parse_record(Instance, second(threebus, quiet_instance(threebus), theta=theta), "bad")
+        with pytest.raises(InputError) as caught:
+            instance.check_case(threebus)
+        assert caught.value.field == f"initial.theta.{field}"

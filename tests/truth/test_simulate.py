@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 
 import numpy as np
 import pytest
@@ -10,14 +11,16 @@ from scipy.integrate import OdeSolver, cumulative_simpson, solve_ivp
 from scipy.linalg import expm
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.strict import parse_record
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import SimulationError, _Run, bends, simulate, simulate_many
 
 
-def pushed(case, omega: float) -> dict:
-    """Nominal power, generators pushed apart by ω in rad/s."""
+def swinging(case, omega: float) -> dict:
+    """Nominal power, neighbouring generators at ±ω in rad/s."""
     return {
         "power": dict(zip(case.generators, case.p_nominal.tolist(), strict=True)),
         "omega": {bus: omega * (-1) ** i for i, bus in enumerate(case.generators)},
@@ -45,7 +48,7 @@ def test_equilibrium_stays_at_rest(case, quiet_instance, constant):
 def test_the_system_returns_to_rest(case, quiet_instance, constant):
     """After a push and a jump of power it settles where the power flow says, as fast as its modes decay."""
     p_end = 0.5 * (case.p_nominal + case.p_max)
-    instance = quiet_instance(case, horizon_s=60.0, dt_s=0.05, initial=pushed(case, 0.1))
+    instance = quiet_instance(case, horizon_s=60.0, dt_s=0.05, initial=swinging(case, 0.1))
     trajectory = simulate(case, instance, constant(instance, p_end))
     network = Network(case)
     rest = network.power_flow(p_end, case.load_nominal)
@@ -82,7 +85,7 @@ def test_p_slack_is_what_acceleration_and_damping_leave(case, quiet_instance):
     grid points next to a kink of the loads are left out.
     """
     instance = quiet_instance(
-        case, horizon_s=6.0, initial=pushed(case, 0.02), load=ramping(case, -0.02, 1.003, 2.0)
+        case, horizon_s=6.0, initial=swinging(case, 0.02), load=ramping(case, -0.02, 1.003, 2.0)
     )
     rising = Schedule(np.array([0.0, 6.0]), np.stack([case.p_nominal, case.p_nominal + 0.2]))
     trajectory = simulate(case, instance, rising)
@@ -121,7 +124,7 @@ def test_energy_is_conserved_without_damping(case, alter, quiet_instance, consta
     """
     machines = {g: {**machine.model_dump(), "d": 0.0} for g, machine in case.machines.items()}
     frictionless = alter(case, machines=machines)
-    instance = quiet_instance(frictionless, horizon_s=10.0, initial=pushed(case, 0.3))
+    instance = quiet_instance(frictionless, horizon_s=10.0, initial=swinging(case, 0.3))
     trajectory = simulate(frictionless, instance, constant(instance, case.p_nominal))
     total = energy(frictionless, trajectory)
     m = np.array([case.machines[g].m for g in case.generators])
@@ -133,7 +136,7 @@ def test_energy_is_conserved_without_damping(case, alter, quiet_instance, consta
 
 def test_damping_takes_the_energy_that_is_lost(case, quiet_instance, constant):
     """H(t) - H(0) = -∫ Σ D ω² dt; Simpson's rule at 0.01 s errs by less than 1e-7 of what is lost."""
-    instance = quiet_instance(case, horizon_s=10.0, initial=pushed(case, 0.3))
+    instance = quiet_instance(case, horizon_s=10.0, initial=swinging(case, 0.3))
     trajectory = simulate(case, instance, constant(instance, case.p_nominal))
     d = np.array([case.machines[g].d for g in case.generators])
     lost = cumulative_simpson(trajectory.omega**2 @ d, x=trajectory.t, initial=0.0)
@@ -181,7 +184,7 @@ def test_small_perturbations_follow_the_linearised_dynamics_to_second_order(case
         instance = quiet_instance(
             case,
             horizon_s=horizon,
-            initial=pushed(case, 0.04 * size),
+            initial=swinging(case, 0.04 * size),
             load=ramping(case, 0.01 * size),
         )
         p_gen = case.p_nominal + 0.1 * size * np.arange(1, len(case.generators) + 1)
@@ -210,7 +213,7 @@ def test_chain_follows_its_scalar_swing_equation(threebus, quiet_instance, p_sta
     5 pu within one step, which magnifies errors in time.
     """
     a, b = 1.02 / abs(0.01 + 0.12j), 1.03 / 0.1
-    instance = quiet_instance(threebus, initial=pushed(threebus, 1.0), load=ramping(threebus, rate))
+    instance = quiet_instance(threebus, initial=swinging(threebus, 1.0), load=ramping(threebus, rate))
     schedule = Schedule(t=np.array([0.0, 6.0]), p=np.array([[p_start], [p_end]]))
     slope = (p_end - p_start) / 6.0
 
@@ -232,6 +235,60 @@ def test_chain_follows_its_scalar_swing_equation(threebus, quiet_instance, p_sta
     np.testing.assert_allclose(trajectory.omega[:, 0], known[1], rtol=0, atol=atol)
     p_slack = torque_and_slack(grid, known[0])[1]
     np.testing.assert_allclose(trajectory.p_slack, p_slack, rtol=0, atol=atol)
+
+
+# Any state.
+
+
+def continued(case, instance, trajectory, k: int):
+    """The instance that begins at grid point k of a trajectory, its loads given by points."""
+    tau, grid = trajectory.t[k], trajectory.t[k:] - trajectory.t[k]
+    gen = Network(case).generators
+    data = json.loads(instance.model_dump_json(by_alias=True)) | {"schema": "ded-bench/instance/2"}
+    data["horizon_s"] = instance.horizon_s - tau
+    data["load"] = {
+        bus: {"points": np.column_stack([grid, column]).tolist()}
+        for bus, column in zip(case.loads, trajectory.p_load[k:].T, strict=True)
+    }
+    data["initial"] = {
+        name: dict(zip(case.generators, values.tolist(), strict=True))
+        for name, values in (
+            ("power", trajectory.p_gen[k]),
+            ("omega", trajectory.omega[k]),
+            ("theta", trajectory.theta[k, gen]),
+        )
+    }
+    return parse_record(Instance, json.dumps(data), "continued")
+
+
+def test_a_trajectory_goes_on_from_any_of_its_states(case, alter):
+    """(θ, ω, P) at an instant, far from any equilibrium, and the loads to come determine all that follows."""
+    instance = alter(sample_instance(case, 31, 2), horizon_s=6.0, initial=swinging(case, 0.1))
+    rng = np.random.default_rng(2)
+    p = rng.uniform(case.p_min, case.p_max, (7, len(case.generators)))
+    uncut = simulate(case, instance, Schedule(np.linspace(0.0, 6.0, 7), p))
+    for k in (1, 137, 300):
+        rest = continued(case, instance, uncut, k)
+        part = simulate(case, rest, Schedule(rest.grid, uncut.p_gen[k:]))
+        for name in ("theta", "omega", "p_slack"):
+            np.testing.assert_allclose(getattr(part, name), getattr(uncut, name)[k:], rtol=0, atol=2e-9)
+    deviation = Network(case).power_flow(uncut.p_gen[300], uncut.p_load[300]) - uncut.theta[300]
+    assert np.abs(deviation).max() > 1e-2
+
+
+def test_points_that_equal_a_ramp_give_the_same_trajectory(case, quiet_instance, constant):
+    """A load's path is what counts, not how the file says it."""
+    ramped = quiet_instance(case, horizon_s=2.0, load=ramping(case, -0.02, 0.503, 1.0))
+    points = {
+        bus: {"points": [[t, float(load.at(np.array(t)))] for t in (0.0, 0.503, 1.503, 2.0)]}
+        for bus, load in ramped.load.items()
+    }
+    pointed = quiet_instance(case, schema="ded-bench/instance/2", horizon_s=2.0, load=points)
+    schedule = constant(ramped, case.p_nominal)
+    first, second = (simulate(case, i, schedule) for i in (ramped, pointed))
+    np.testing.assert_allclose(second.omega, first.omega, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(second.p_slack, first.p_slack, rtol=0, atol=1e-12)
+    assert np.abs(first.omega).max() > 1e-4
 
 
 # Batches.

@@ -14,8 +14,6 @@ from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.simulate import simulate_many
 
-KNOTS = 50
-
 #: Range of a uniform draw.
 Span = tuple[float, float]
 
@@ -82,7 +80,7 @@ def tracking(
     target = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
     gain = instance.dt_s / rng.uniform(*lag_s)
     smooth = instance.dt_s / rng.uniform(*smooth_s)
-    most = rng.uniform(*rate) * case.ramp_pu_per_s * instance.dt_s
+    most = rng.uniform(*rate) * case.ramp * instance.dt_s
     p = np.empty_like(target)
     p[0] = instance.p_initial(case)
     step = np.zeros(target.shape[1])
@@ -107,14 +105,14 @@ def bang_bang(case: Case, instance: Instance, rng: np.random.Generator) -> Array
             stop = k + int(rng.uniform(0.5, 8.0) / instance.dt_s)
             rate[k:stop, j] = rng.integers(-1, 2)
             k = stop
-    return _within(case, instance, rate * case.ramp_pu_per_s * instance.dt_s)
+    return _within(case, instance, rate * case.ramp * instance.dt_s)
 
 
 def random_knots(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
     """A random walk over the policy's knots, linear between them, within the ramp limit."""
-    knots = np.linspace(0.0, instance.horizon_s, KNOTS)
-    slopes = rng.uniform(-1, 1, (KNOTS - 1, len(case.generators))) * case.ramp_pu_per_s
-    at = np.minimum(np.searchsorted(knots, instance.grid[1:], side="left") - 1, KNOTS - 2)
+    knots = case.knot_times(instance.horizon_s)
+    slopes = rng.uniform(-1, 1, (len(knots) - 1, len(case.generators))) * case.ramp
+    at = np.minimum(np.searchsorted(knots, instance.grid[1:], side="left") - 1, len(knots) - 2)
     return _within(case, instance, slopes[at] * instance.dt_s)
 
 

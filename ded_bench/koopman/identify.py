@@ -15,7 +15,7 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 from ded_bench.koopman.data import Trajectories, sample_trajectories
-from ded_bench.koopman.linear import EnergyForm, energy_form, injection_lift, steady_state
+from ded_bench.koopman.energy_form import EnergyForm, energy_form, injection_lift, steady_state
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network

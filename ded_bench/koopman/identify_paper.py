@@ -1,6 +1,6 @@
 """The paper's identification (kind `koopman-paper`): MLP observables, normalised one-step loss, SGD.
 
-It differs from `fit` in what it minimises, not in the form of the model: the single-sample form
+It differs from `identify` in what it minimises, not in the form of the model: the single-sample form
 ψ⁺ = K (ψ - B P⁺) + B P⁺ of the paper's eq. (KO_dyn), with the newer input sample. Since P_s answers a
 load change at once, K ignores the old P_s (its column is zero); the rest of K is exp(A Δt) with A in
 energy form, so that ρ(K) < 1 for every parameter value.
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from ded_bench.koopman.data import Trajectories, sample_trajectories
+from ded_bench.koopman.energy_form import EPSILON
 from ded_bench.koopman.identify import TRAIN, TRAIN_MIX
-from ded_bench.koopman.linear import EPSILON
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
@@ -69,7 +69,7 @@ class PaperKoopman(nn.Module):
 
 
 def identify_paper(case: Case, seed: int = 0, count: int = TRAIN, steps: int = STEPS) -> Koopman:
-    """Identify a model as the paper does, from the trajectories that `fit.identify` uses."""
+    """Identify a model as the paper does, from the trajectories that `identify.identify` uses."""
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
     state, offset, scale = _scaled_state(case, data)
     n_gen, n_in = len(case.generators), data.inputs.shape[-1]

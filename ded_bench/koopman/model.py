@@ -1,4 +1,4 @@
-"""The Koopman surrogate: observables, K, B and G; sequential rollout and its condensed form.
+"""The Koopman surrogate: observables, K, B and G; sequential rollout (condensed: see `condensed`).
 
     ψ(x) = (ω, P_s, N(x))
     ψ_{k+1} = K (ψ_k - B P_k) + B P_k + G (P_{k+1} - P_k)
@@ -81,42 +81,10 @@ class Koopman:
             ψ_k, shape (n_points, ..., n_psi).
         """
         steady = inputs @ self.b.T
-        push = np.diff(inputs, axis=0) @ (self.g - self.b).T
+        increments = np.diff(inputs, axis=0) @ (self.g - self.b).T
         start = np.broadcast_to(psi - steady[0], np.broadcast_shapes(psi.shape, steady.shape[1:]))
-        away = _recurrence(self.k, start, np.broadcast_to(push, (len(push), *start.shape)))
-        return away + steady
-
-    def condense(self, n_gen: int, grid: Array, knots: Array) -> Array:
-        """Γ: the response of (ω, P_s) at every grid point to generator power at the knots.
-
-        The rollout is affine in the knots: outputs = free response + Γ @ knots, where the free
-        response has the loads and ψ_0 but no generator power (see `free_response`).
-
-        Args:
-            n_gen: number of generators.
-            grid: times t_k, shape (n_points,), s.
-            knots: knot times, shape (n_knots,), s.
-
-        Returns:
-            Shape (n_points, n_gen + 1, n_knots, n_gen).
-        """
-        hats = hat_functions(grid, knots)
-        unit = np.zeros((len(grid), len(knots), n_gen, self.b.shape[1]))
-        for j in range(n_gen):
-            unit[:, :, j, j] = hats
-        response = self.rollout(np.zeros(len(self.k)), unit)
-        return np.moveaxis(response[..., : n_gen + 1], -1, 1)
-
-    def free_response(self, psi: Array, p_load: Array) -> Array:
-        """(ω, P_s) without generator power, shape (n_points, ..., n_gen + 1).
-
-        Args:
-            psi: ψ_0, shape (..., n_psi).
-            p_load: load injections, shape (n_points, ..., n_load), pu.
-        """
-        n_gen = self.b.shape[1] - p_load.shape[-1]
-        inputs = np.concatenate([np.zeros((*p_load.shape[:-1], n_gen)), p_load], axis=-1)
-        return self.rollout(psi, inputs)[..., : n_gen + 1]
+        increments = np.broadcast_to(increments, (len(increments), *start.shape))
+        return linear_recurrence(self.k, start, increments) + steady
 
     @property
     def fingerprint(self) -> str:
@@ -125,7 +93,7 @@ class Koopman:
         return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
     def save(self, path: Path) -> None:
-        """Write arrays and header (see `problem.arrays`)."""
+        """Write arrays and header (see `files.arrays`)."""
         arrays = {"k": self.k, "b": self.b, "g": self.g, "lift": self.lift}
         for i, (weight, bias) in enumerate(self.mlp):
             arrays |= {f"mlp.{i}.weight": weight, f"mlp.{i}.bias": bias}
@@ -193,13 +161,21 @@ class Koopman:
             raise InputError(path, "k", "has too few observables")
 
 
-def _recurrence(k: Array, start: Array, push: Array) -> Array:
-    """All x_i of x_{i+1} = K x_i + u_i, a block of steps at a time; vectors stand in the last axis.
+def linear_recurrence(k: Array, start: Array, increments: Array) -> Array:
+    """All x_i of x_{i+1} = K x_i + u_i, computed a block of steps at a time.
+
+    Args:
+        k: K, shape (n, n).
+        start: x_0, shape (..., n).
+        increments: u_i, shape (n_steps, ..., n).
+
+    Returns:
+        Shape (n_steps + 1, ..., n).
 
     Within a block, x is one matrix product of its u's (a block Toeplitz matrix of the powers of K),
     so that the loop in Python has hundreds of turns fewer than there are steps.
     """
-    n, n_steps = len(k), len(push)
+    n, n_steps = len(k), len(increments)
     length = max(1, min(BLOCK // n, n_steps))
     powers = [np.eye(n)]
     for _ in range(length):
@@ -212,7 +188,7 @@ def _recurrence(k: Array, start: Array, push: Array) -> Array:
     before = start.reshape(-1, n)
     batch = len(before)
     u = np.zeros((blocks * length, batch, n))
-    u[:n_steps] = push.reshape(n_steps, batch, n)
+    u[:n_steps] = increments.reshape(n_steps, batch, n)
     u = np.moveaxis(u.reshape(blocks, length, batch, n), 1, 2).reshape(blocks, batch, length * n)
     x = (u @ inside.reshape(length * n, length * n)).reshape(blocks, batch, length, n)
     carry = np.concatenate(powers[1:], axis=1)
@@ -221,8 +197,3 @@ def _recurrence(k: Array, start: Array, push: Array) -> Array:
         before = block[:, -1]
     x = np.moveaxis(x, 2, 1).reshape(blocks * length, *start.shape)
     return np.concatenate([start[None], x[:n_steps]])
-
-
-def hat_functions(grid: Array, knots: Array) -> Array:
-    """Linear interpolation as a matrix, shape (n_grid, n_knots): values(grid) = hats @ values(knots)."""
-    return np.stack([np.interp(grid, knots, row) for row in np.eye(len(knots))], axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,11 +24,11 @@ from ded_bench.solvers.ipopt import LINEAR_OPTIONS
 from ded_bench.truth.network import Network
 
 #: Solver and its options by settings slug; the default is the fastest of those tried.
-SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "default": ("piqp", {}),
-    "ipopt": ("ipopt", LINEAR_OPTIONS),
-    "executable": ("ipopt-executable", LINEAR_OPTIONS),
-    "highs": ("highs", {}),
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "default": {"solver": "piqp"},
+    "ipopt": {"solver": "ipopt", "options": LINEAR_OPTIONS},
+    "executable": {"solver": "ipopt-executable", "options": LINEAR_OPTIONS},
+    "highs": {"solver": "highs"},
 }
 
 
@@ -92,7 +93,7 @@ def _built(program: _Program) -> pyo.ConcreteModel:
 
 @functools.lru_cache(maxsize=1)
 def _compiled(program: _Program, slug: str) -> Compiled:
-    return compile_model(_built(program), *SETTINGS[slug])
+    return compile_model(_built(program), **SETTINGS[slug])
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
@@ -137,10 +138,12 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
     def eq_slack(m: Any, k: int) -> Any:
         return m.p_slack_up[k] - m.p_slack_down[k] == m.psi[n_gen, k]
 
+    ramp = dict(zip(case.generators, case.ramp.tolist(), strict=True))
+
     @m.Constraint(m.gen, m.step)
     def ineq_ramp(m: Any, g: str, k: int) -> Any:
         rate = (m.p_gen[g, k] - m.p_gen[g, k - 1]) / koopman.dt_s
-        return pyo.inequality(-case.ramp_pu_per_s, rate, case.ramp_pu_per_s)
+        return pyo.inequality(-ramp[g], rate, ramp[g])
 
     @m.Objective()
     def cost_total(m: Any) -> Any:
@@ -154,7 +157,7 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
 def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
     """Give a built model the data of one instance and reset its initial point (cold start).
 
-    The initial point is ψ_0 and P_0 held for the whole horizon.
+    The initial point is ψ_0 and P_0 over the whole horizon.
     """
     psi = koopman.initial(Network(case), [instance])[0].tolist()
     bound = case.omega_bound(regime)

@@ -11,8 +11,10 @@ import pytest
 from scipy.optimize import linprog
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.linear import injection_lift, linear_model
-from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.condensed import CondensedRollout
+from ded_bench.koopman.energy_form import injection_lift
+from ded_bench.koopman.linear import linear_model
+from ded_bench.koopman.model import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
@@ -69,7 +71,7 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
     model = replay(case, koopman, instance, solution.schedule)
     assert model.objective == pytest.approx(solution.solver_objective, rel=1e-8)
     assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 1.1 * ded_ko_knots.OMEGA_TOLERANCE
-    assert np.abs(np.diff(p_gen, axis=0)).max() <= case.ramp_pu_per_s * instance.dt_s + 1e-9
+    assert (np.abs(np.diff(p_gen, axis=0)) <= case.ramp * instance.dt_s + 1e-9).all()
     assert (p_gen - case.p_max).max() <= 1e-8
     assert (case.p_min - p_gen).max() <= 1e-8
     assert p_gen[0].tolist() == instance.p_initial(case).tolist()
@@ -79,21 +81,21 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
 def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
     """The optimum on knots with every row there is, and a variable above |P_s| at every point."""
     n_gen, grid = len(case.generators), instance.grid
-    knots = np.linspace(0.0, grid[-1], ded_ko_knots.N_KNOTS)
-    gamma = koopman.condense(n_gen, grid, knots).reshape(len(grid), n_gen + 1, -1)
-    free = koopman.free_response(koopman.initial(Network(case), [instance])[0], instance.p_load(case))
-    n_x, n_s = gamma.shape[2], len(grid)
-    slack, omega = gamma[:, n_gen], gamma[1:, :n_gen].reshape(-1, n_x)
+    knots = case.knot_times(grid[-1])
+    condensed = CondensedRollout.make(case, koopman, grid, knots)
+    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
+    n_x, n_s = len(knots) * n_gen, len(grid)
+    slack, omega = condensed.gamma[n_gen], condensed.gamma[:n_gen, 1:].reshape(-1, n_x)
     ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
     above, none, bound = np.eye(n_s), np.zeros, case.omega_bound(regime)
     rows = [np.hstack([slack, -above]), np.hstack([-slack, -above])]
-    right = [-free[:, n_gen], free[:, n_gen]]
+    right = [-free[n_gen], free[n_gen]]
     for sign in (1, -1):
         rows += [np.hstack([sign * omega, none((len(omega), n_s))])]
-        right += [bound - sign * free[1:, :n_gen].ravel()]
+        right += [bound - sign * free[:n_gen, 1:].ravel()]
         rows += [np.hstack([sign * ramps, none((len(ramps), n_s))])]
-        right += [np.full(len(ramps), case.ramp_pu_per_s * knots[1])]
-    weight = np.outer(hat_functions(grid, knots).sum(axis=0), instance.cost_gen(case)).ravel()
+        right += [np.tile(case.ramp * knots[1], len(knots) - 1)]
+    weight = np.outer(condensed.hat_weights, instance.cost_gen(case)).ravel()
     p_initial = instance.p_initial(case)
     bounds = [(p, p) for p in p_initial] + (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True))
     answer = linprog(
@@ -146,7 +148,7 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Ko
         again = solve(last)
         model = build_ded_ko(case, koopman, last.steps)
         set_instance(model, case, koopman, last, regime)
-        fresh = compile_model(model, *SETTINGS[slug]).solve()
+        fresh = compile_model(model, **SETTINGS[slug]).solve()
         assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
         assert again.build_s < 0.5  # built before
         assert again.setup_s < 0.5
@@ -162,7 +164,7 @@ def test_knots_reach_the_optimum_of_the_program_with_all_rows(
     check_limits(case, koopman, instance, solution, regime)
     every_row = knots_with_all_rows(case, koopman, instance, regime)
     assert solution.solver_objective == pytest.approx(every_row, rel=1e-6)
-    assert solution.schedule.p.shape == (ded_ko_knots.N_KNOTS, len(case.generators))
+    assert solution.schedule.p.shape == (case.n_knots, len(case.generators))
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ded_bench.files.errors import InputError
+from ded_bench.koopman.condensed import CondensedRollout, free_response
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.follower import follow
@@ -16,10 +17,9 @@ from ded_bench.methods.dpc.inference import CompiledStages
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import Objective, coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import StagedNetwork
-from ded_bench.methods.dpc.policy import CHUNK, METHOD, N_KNOTS, DispatchPolicy, prepare
+from ded_bench.methods.dpc.policy import CHUNK, METHOD, DispatchPolicy, prepare
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.training import Loss, Pool
-from ded_bench.methods.dpc_paper.paper_loss import knot_times
 from ded_bench.methods.policy_file import Scope, policy_file
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
@@ -31,7 +31,8 @@ from ded_bench.truth.network import Network
 from ded_bench.truth.score import score_many
 
 HORIZON = 4.0
-KNOTS = knot_times(HORIZON, N_KNOTS)
+N_KNOTS = 50
+KNOTS = np.linspace(0.0, HORIZON, N_KNOTS)
 
 
 def some_instances(case: Case, count: int, first: int = 0, horizon: float = HORIZON) -> list[Instance]:
@@ -48,7 +49,7 @@ def some_instances(case: Case, count: int, first: int = 0, horizon: float = HORI
 
 
 def response_of(case: Case, horizon: float = HORIZON) -> Response:
-    return Response.make(case, knot_times(horizon, N_KNOTS))
+    return Response.make(case, case.knot_times(horizon))
 
 
 def channels_of(case: Case, inputs: Inputs) -> Channels:
@@ -85,7 +86,7 @@ def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
     expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(KNOTS))
     static = channels.sequence[..., sequence_groups(case)["dispatch"]][..., :-1]
     np.testing.assert_allclose(static, expected, atol=1e-12)
-    step = case.ramp_pu_per_s * KNOTS[1]
+    step = case.ramp * KNOTS[1]
     np.testing.assert_array_equal(channels.start, follow(static[:, 1:], inputs.p_initial, step))
     p_slack = -inputs.p_load(KNOTS).sum(axis=2) - expected.sum(axis=2)
     total = (expected * inputs.cost[:, None, 1:]).sum(axis=2) + inputs.cost[:, :1] * np.abs(p_slack)
@@ -116,13 +117,13 @@ def test_bounds_ramps_and_initial_input_hold_for_any_weights(case: Case, size: f
     policy = random_policy(case, size, horizon)
     for instance, schedule in zip(instances, policy(instances), strict=True):
         p = schedule.at(instance.grid)
-        ramp = case.ramp_pu_per_s * instance.dt_s
+        ramp = case.ramp * instance.dt_s
         assert len(p) == instance.steps + 1
-        assert np.abs(np.diff(p, axis=0)).max() <= ramp + 1e-12
+        assert (np.abs(np.diff(p, axis=0)) <= ramp + 1e-12).all()
         assert np.maximum(p - case.p_max, case.p_min - p).max() <= 1e-12
         np.testing.assert_array_equal(p[0], instance.p_initial(case))
-    moved = np.abs(np.diff([s.p for s in policy(instances)], axis=1)).max()
-    assert moved == pytest.approx(policy.network.step)  # the limit was reached
+    moved = np.abs(np.diff([s.p for s in policy(instances)], axis=1)).max(axis=(0, 1))
+    assert moved == pytest.approx(case.ramp * policy.knots[1])  # the limit was reached
 
 
 def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case) -> None:
@@ -180,8 +181,8 @@ def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
     network, grid = Network(case), instances[0].grid
     inputs, stride = Inputs.of(case, instances), coarse_stride(instances[0].dt_s, instances[0].steps)
     assert stride > 1
-    p_load = np.stack([i.p_load(case) for i in instances], axis=1)
-    fine = model.free_response(model.initial(network, instances), p_load).transpose(1, 2, 0)
+    p_load = np.stack([i.p_load(case) for i in instances])
+    fine = free_response(model, model.initial(network, instances), p_load)
     coarse = coarse_free_response(network, model, inputs, grid, stride)
     np.testing.assert_allclose(coarse, fine[:, :, ::stride], atol=1e-6)
 
@@ -189,14 +190,14 @@ def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
     cost = torch.as_tensor(inputs.cost)
     values = []
     for step, free in ((1, fine), (stride, fine[:, :, ::stride])):
-        objective = Objective.make(case, model, grid, KNOTS, step, torch.float64)
+        objective = Objective.make(CondensedRollout.make(case, model, grid, KNOTS, step), torch.float64)
         omega, p_slack = objective.rollout(torch.as_tensor(free.copy()), p_gen)
         values.append((objective.cost(p_gen, p_slack, cost), omega.abs().amax(dim=(1, 2))))
     torch.testing.assert_close(values[0][0], values[1][0], rtol=1e-3, atol=0.0)
     torch.testing.assert_close(values[0][1], values[1][1], rtol=1e-2, atol=0.0)
     # the fine cost is the sum that the scorer takes
     powers = np.stack([np.interp(grid, KNOTS, p_gen[0, :, g]) for g in range(p_gen.shape[2])], axis=1)
-    one = Objective.make(case, model, grid, KNOTS, 1, torch.float64)
+    one = Objective.make(CondensedRollout.make(case, model, grid, KNOTS), torch.float64)
     _, slack = one.rollout(torch.as_tensor(fine[:1].copy()), p_gen[:1])
     total = (powers @ inputs.cost[0, 1:]).sum() + inputs.cost[0, 0] * np.abs(slack.numpy()).sum()
     assert float(values[0][0][0]) == pytest.approx(total, rel=1e-12)
@@ -209,10 +210,11 @@ def test_gradient_of_the_loss_matches_finite_differences(threebus: Case) -> None
     free = coarse_free_response(Network(threebus), model, inputs, instances[0].grid, stride)
     pool = Pool.of(channels, inputs, free, len(instances[0].grid))
     pool = Pool(*(getattr(pool, name).double() for name in pool.__dataclass_fields__))
-    objective = Objective.make(threebus, model, instances[0].grid, KNOTS, stride, torch.float64)
+    condensed = CondensedRollout.make(threebus, model, instances[0].grid, KNOTS, stride)
+    objective = Objective.make(condensed, torch.float64)
     loss = Loss(objective, 1e-3, 0.1)
     network = random_network(threebus, 0.003).double()
-    network.step = 1.0
+    network.step.fill_(1.0)
     for limit in (network.low.sub_, network.high.add_):  # `Clip` is tested apart
         limit(5.0)
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ded_bench.files.errors import InputError
+from ded_bench.koopman.condensed import free_response
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc_paper.paper_features import Features
 from ded_bench.methods.dpc_paper.paper_loss import (
@@ -150,7 +151,7 @@ def test_condensed_loss_equals_the_sequential_one_in_values_and_gradients(case: 
     condensed = Condensed.make(case, model, grid, knot_times(HORIZON, N_KNOTS), torch.float64)
     batch = Batch.of(case, model, instances, "cpu")
     p_load = np.stack([i.p_load(case) for i in instances], axis=1)
-    free = model.free_response(model.initial(Network(case), instances), p_load).transpose(1, 2, 0)
+    free = free_response(model, model.initial(Network(case), instances), p_load.swapaxes(0, 1))
 
     knots = torch.tensor(raw, requires_grad=True)
     omega, p_slack = condensed.rollout(torch.as_tensor(free.copy()), knots)

@@ -9,17 +9,16 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
+from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.model import hat_functions
 from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import StagedNetwork
-from ded_bench.methods.dpc.policy import N_KNOTS, DispatchPolicy
+from ded_bench.methods.dpc.policy import DispatchPolicy
 from ded_bench.methods.dpc.refined import SETTINGS, artifacts, prepare
 from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc_paper.paper_loss import knot_times
 from ded_bench.methods.policy_file import Scope, policy_file
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
@@ -40,7 +39,7 @@ def tightest(case: Case) -> str:
 def static_policy(case: Case, regime: str) -> DispatchPolicy:
     """The follower of the static dispatch: a network that corrects nothing."""
     horizon = case.sampling.horizon_s
-    response = Response.make(case, knot_times(horizon, N_KNOTS))
+    response = Response.make(case, case.knot_times(horizon))
     network = StagedNetwork(case, response, 1, 4, (1,)).eval()
     return DispatchPolicy(Scope(case, regime, horizon), network, {"seed": 0})
 
@@ -48,19 +47,18 @@ def static_policy(case: Case, regime: str) -> DispatchPolicy:
 def optimum(case: Case, regime: str, instance: Instance) -> float:
     """The condensed problem's optimum, written as a linear program for another solver."""
     model, n_gen = linear_model(case), len(case.generators)
-    knots = knot_times(instance.horizon_s, N_KNOTS)
+    knots = case.knot_times(instance.horizon_s)
     stride = coarse_stride(instance.dt_s, instance.steps, refinement.SPACING_S)
     inputs = Inputs.of(case, [instance])
     free = coarse_free_response(Network(case), model, inputs, instance.grid, stride)[0]
-    gamma = model.condense(n_gen, instance.grid, knots)[::stride].reshape(-1, n_gen + 1, N_KNOTS * n_gen)
-    n = len(gamma)
-    slack, omega = gamma[:, n_gen], gamma[:, :n_gen].transpose(1, 0, 2).reshape(n * n_gen, -1)
+    condensed = CondensedRollout.make(case, model, instance.grid, knots, stride)
+    n, n_knots = len(condensed.points), len(knots)
+    slack, omega = condensed.gamma[n_gen], condensed.gamma[:n_gen].reshape(n * n_gen, -1)
     bound = case.omega_bound(regime) * (1.0 - refinement.MARGIN)
-    unit = np.eye(N_KNOTS * n_gen)
+    unit = np.eye(n_knots * n_gen)
     change = unit[n_gen:] - unit[:-n_gen]
-    weights = hat_functions(instance.grid, instance.grid[::stride]).sum(axis=0)
-    held = hat_functions(instance.grid, knots).sum(axis=0)
-    cost = np.concatenate([np.outer(held, inputs.cost[0, 1:]).ravel(), inputs.cost[0, 0] * weights])
+    cost_gen = np.outer(condensed.hat_weights, inputs.cost[0, 1:]).ravel()
+    cost = np.concatenate([cost_gen, inputs.cost[0, 0] * condensed.quadrature_weights])
     none = np.zeros((len(omega), n))
     above = np.vstack(
         [
@@ -73,9 +71,9 @@ def optimum(case: Case, regime: str, instance: Instance) -> float:
         ]
     )
     flat = free[:n_gen].ravel().astype(float)
-    step = np.full(2 * len(change), case.ramp_pu_per_s * knots[1])
+    step = np.tile(case.ramp * knots[1], 2 * (n_knots - 1))
     limits = np.concatenate([-free[n_gen], free[n_gen], bound - flat, bound + flat, step])
-    bounds = [*zip(np.tile(case.p_min, N_KNOTS), np.tile(case.p_max, N_KNOTS), strict=True)]
+    bounds = [*zip(np.tile(case.p_min, n_knots), np.tile(case.p_max, n_knots), strict=True)]
     bounds[:n_gen] = [(p, p) for p in inputs.p_initial[0]]
     result = linprog(cost, above, limits, bounds=bounds + [(0, None)] * n)
     assert result.status == 0
@@ -87,11 +85,11 @@ def condensed_cost(refiner: Refiner, instances: list[Instance], p_gen: np.ndarra
     case, inputs = refiner.case, Inputs.of(refiner.case, instances)
     n_gen = len(case.generators)
     free = coarse_free_response(refiner.network, refiner.model, inputs, refiner.grid, refiner.stride)
-    knots = knot_times(refiner.grid[-1], N_KNOTS)
-    gamma = refiner.model.condense(n_gen, refiner.grid, knots)[:: refiner.stride]
-    p_slack = free[:, n_gen] + np.einsum("tkg,bkg->bt", gamma[:, n_gen], p_gen)
-    generators = (np.einsum("bkg,k->bg", p_gen, refiner.held) * inputs.cost[:, 1:]).sum(axis=1)
-    return generators + inputs.cost[:, 0] * (np.abs(p_slack) @ refiner.stands_for)
+    knots = case.knot_times(refiner.grid[-1])
+    condensed = CondensedRollout.make(case, refiner.model, refiner.grid, knots, refiner.stride)
+    p_slack = free[:, n_gen] + condensed.apply(p_gen)[:, n_gen]
+    generators = (np.einsum("bkg,k->bg", p_gen, condensed.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
+    return generators + inputs.cost[:, 0] * (np.abs(p_slack) @ condensed.quadrature_weights)
 
 
 def test_many_steps_reach_the_optimum_of_the_linear_program(case: Case) -> None:
@@ -117,7 +115,7 @@ def test_hard_limits_hold_after_any_number_of_steps(case: Case, steps: int) -> N
     refiner = Refiner.make(case, linear_model(case), regime, instances[0].grid, policy.knots)
     start = policy.powers(inputs)
     p_gen = refiner(inputs, start, steps)
-    assert np.abs(np.diff(p_gen, axis=1)).max() <= policy.network.step + 1e-12
+    assert (np.abs(np.diff(p_gen, axis=1)) <= case.ramp * policy.knots[1] + 1e-12).all()
     assert np.maximum(p_gen - case.p_max, case.p_min - p_gen).max() <= 1e-12
     np.testing.assert_array_equal(p_gen[:, 0], inputs.p_initial)
     if not steps:

@@ -126,7 +126,9 @@ def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path)
     np.testing.assert_array_equal(loaded.powers(inputs), policy.powers(inputs))
     channels = policy.channels(inputs)
     middle = np.broadcast_to(0.5 * (threebus.p_min + threebus.p_max), channels.start[:, 1:].shape)
-    np.testing.assert_array_equal(channels.start, follow(middle, inputs.p_initial, policy.network.step))
+    np.testing.assert_array_equal(
+        channels.start, follow(middle, inputs.p_initial, threebus.ramp * policy.knots[1])
+    )
     start, undriven, sequence, constants = tensors(channels)
     other = sequence.clone()
     other[..., sequence_groups(threebus)["dispatch"]] += 0.3

@@ -13,12 +13,14 @@ from ded_bench.methods.dpc.follower import Clip, Follow, follow
 def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:
     rng = np.random.default_rng(0)
     targets, start = rng.uniform(-1, 1, (7, 20, 3)), rng.uniform(-1, 1, (7, 3))
-    p = follow(targets, start, 0.3)
+    step = np.array([0.1, 0.3, 0.5])
+    p = follow(targets, start, step)
     for b in range(7):
-        np.testing.assert_array_equal(follow(targets[b : b + 1], start[b : b + 1], 0.3)[0], p[b])
-    torch_p = Follow.apply(torch.as_tensor(targets), torch.as_tensor(start), 0.3)
+        np.testing.assert_array_equal(follow(targets[b : b + 1], start[b : b + 1], step)[0], p[b])
+    torch_p = Follow.apply(torch.as_tensor(targets), torch.as_tensor(start), torch.as_tensor(step))
     np.testing.assert_array_equal(torch_p.numpy(), p)
-    slow = follow(targets, start, 10.0)
+    np.testing.assert_allclose(np.abs(np.diff(p, axis=1)).max(axis=(0, 1)), step)
+    slow = follow(targets, start, np.full(3, 10.0))
     np.testing.assert_array_equal(slow[:, 1:], targets)  # without a limit it is where it should be
 
 
@@ -27,11 +29,12 @@ def test_gradient_of_the_follower_is_the_recursions() -> None:
     targets = torch.tensor(rng.uniform(-1, 1, (5, 12, 2)), requires_grad=True)
     start = torch.tensor(rng.uniform(-1, 1, (5, 2)))
     weight = torch.tensor(rng.normal(size=(5, 13, 2)))
-    (weight * Follow.apply(targets, start, 0.4)).sum().backward()
+    step = torch.tensor([0.3, 0.5], dtype=torch.float64)
+    (weight * Follow.apply(targets, start, step)).sum().backward()
     plain = targets.detach().clone().requires_grad_()
     p = [start]
     for target in plain.unbind(1):
-        p.append(p[-1] + (target - p[-1]).clamp(-0.4, 0.4))
+        p.append(p[-1] + (target - p[-1]).clamp(-step, step))
     (weight * torch.stack(p, dim=1)).sum().backward()
     torch.testing.assert_close(targets.grad, plain.grad)
     assert 0 < int((targets.grad == 0).sum()) < targets.numel()

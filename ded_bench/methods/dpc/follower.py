@@ -19,13 +19,13 @@ from ded_bench.methods.dpc.kernels import track
 from ded_bench.problem.case import Array
 
 
-def follow(targets: Array, p_initial: Array, step: float) -> Array:
+def follow(targets: Array, p_initial: Array, step: Array) -> Array:
     """Follow targets in float64.
 
     Args:
         targets: within bounds, shape (batch, n_knots - 1, n_gen), pu.
         p_initial: P_0, shape (batch, n_gen), pu.
-        step: largest change between two knots, pu.
+        step: largest change between two knots, (n_gen,), pu.
 
     Returns:
         Shape (batch, n_knots, n_gen), pu.
@@ -40,29 +40,28 @@ class Follow(torch.autograd.Function):
     """`follow` for training; its adjoint by hand is ten times faster than recording 150 operations."""
 
     @staticmethod
-    def forward(ctx: Any, targets: Tensor, p_initial: Tensor, step: float) -> Tensor:
+    def forward(ctx: Any, targets: Tensor, p_initial: Tensor, step: Tensor) -> Tensor:
         """See `follow`."""
         p = [p_initial]
         for target in targets.unbind(1):
             p.append(torch.maximum(torch.minimum(p[-1] + step, target), p[-1] - step))
         out = torch.stack(p, dim=1)
-        ctx.save_for_backward(out, targets)
-        ctx.step = step
+        ctx.save_for_backward(out, targets, step)
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         """Adjoint of the recursion, from the last knot to the first."""
         (gradient,) = gradients
-        p, targets = ctx.saved_tensors
-        ahead = targets - p[:, :-1]
-        held = (ahead.abs() > ctx.step).to(gradient.dtype)  # then p only carries on from the knot before
+        p, targets, step = ctx.saved_tensors
+        # where the rate limit binds, p depends on the knot before only, elsewhere on the target only
+        limited = ((targets - p[:, :-1]).abs() > step).to(gradient.dtype)
         total = []
         carry = torch.zeros_like(gradient[:, 0])
-        for own, stuck in zip(reversed(gradient.unbind(1)[1:]), reversed(held.unbind(1)), strict=True):
+        for own, binds in zip(reversed(gradient.unbind(1)[1:]), reversed(limited.unbind(1)), strict=True):
             total.append(own + carry)
-            carry = total[-1] * stuck
-        return torch.stack(total[::-1], dim=1) * (1.0 - held), None, None
+            carry = total[-1] * binds
+        return torch.stack(total[::-1], dim=1) * (1.0 - limited), None, None
 
 
 class Clip(torch.autograd.Function):

@@ -26,7 +26,7 @@ class CompiledStages:
         half = 0.5 * (case.p_max - case.p_min)
         stages = [_matrices(_part(state, f"stages.{i}."), len(dilations), half) for i in range(n_stages)]
         self._weights = tuple(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
-        step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
+        step = case.ramp * (response.knots[1] - response.knots[0])
         self._limits = case.p_min, case.p_max, step
         self._of_power, self._dilations = response.of_power, np.array(dilations)
 

@@ -81,7 +81,7 @@ class Channels:
         sequence = np.empty((batch, n_sequence, len(knots)))
         constants = np.empty((batch, n_constants))
         start = np.empty((batch, len(case.generators), len(knots)))
-        step = float(case.ramp_pu_per_s * (knots[1] - knots[0]))
+        step = case.ramp * (knots[1] - knots[0])
         given = inputs.ramps, inputs.cost, inputs.p_initial, inputs.omega
         limits = case.p_min, case.p_max, step
         fill(*given, nodes, *limits, dispatch, p_load, sequence, constants, start)

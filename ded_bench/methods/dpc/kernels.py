@@ -29,12 +29,16 @@ def compiled(function: Callable[..., None]) -> Callable[..., None]:
 
 
 @compiled
-def track(targets: Array, step: float, p_gen: Array) -> None:
-    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0."""
+def track(targets: Array, step: Array, p_gen: Array) -> None:
+    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0.
+
+    Args:
+        step: largest change between two knots, (n_gen,), pu.
+    """
     for g in range(len(targets)):
         p = p_gen[g, 0] = targets[g, 0]
         for j in range(1, targets.shape[1]):
-            p = min(max(targets[g, j], p - step), p + step)
+            p = min(max(targets[g, j], p - step[g]), p + step[g])
             p_gen[g, j] = p
 
 
@@ -47,7 +51,7 @@ def fill(
     nodes: Array,
     p_min: Array,
     p_max: Array,
-    step: float,
+    step: Array,
     dispatch: bool,
     p_load: Array,
     sequence: Array,
@@ -210,7 +214,7 @@ def answer(
     of_power: Array32,
     low: Array,
     high: Array,
-    step: float,
+    step: Array,
     dilations: Array,
     mean: Array32,
     enter: Array32,

@@ -1,7 +1,7 @@
 """The loss of `ded-dpc`: relative cost and an exact penalty on the frequency bound, on a coarser grid.
 
 Everything but the frequency bound holds by construction (see `follower`), so that only two terms
-remain. Both are evaluated on the condensed rollout at every tenth of a second.
+remain. Both are evaluated on the condensed rollout (`koopman.condensed`) at every tenth of a second.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.condensed import CondensedRollout, free_response
+from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.problem.case import Array, Case
+from ded_bench.methods.dpc.response import Array32
+from ded_bench.problem.case import Array
 from ded_bench.truth.network import Network
 
 #: Spacing of the points at which P_s and ω are evaluated, s. Frequencies are below 0.25 Hz.
@@ -27,29 +29,25 @@ CHUNK = 500
 class Objective:
     """(ω, P_s) at the coarse points, and the cost, as functions of the knots."""
 
-    gamma: Tensor  # ((n_gen + 1) n_coarse, n_knots n_gen)
-    held: Tensor  # Σ_k over the grid of each knot's hat function, (n_knots,)
-    stands_for: Tensor  # grid points that a coarse point stands for, (n_coarse,)
+    gamma: Tensor  # Γ, ((n_gen + 1) n_coarse, n_knots n_gen)
+    hat_weights: Tensor  # sum over the grid of each knot's hat function, (n_knots,)
+    quadrature_weights: Tensor  # of a sum over the grid, taken at the coarse points, (n_coarse,)
     n_gen: int
 
     @staticmethod
-    def make(
-        case: Case, model: Koopman, grid: Array, knots: Array, stride: int, dtype: torch.dtype = torch.float32
-    ) -> Objective:
-        """Condense a model on every `stride`-th point of a grid."""
-        n_gen = len(case.generators)
-        gamma = np.moveaxis(model.condense(n_gen, grid, knots)[::stride], 1, 0)
-        weights = hat_functions(grid, grid[::stride]).sum(axis=0)
+    def make(condensed: CondensedRollout, dtype: torch.dtype = torch.float32) -> Objective:
+        """The condensed rollout as tensors."""
         return Objective(
-            torch.as_tensor(gamma.reshape(-1, len(knots) * n_gen), dtype=dtype),
-            torch.as_tensor(hat_functions(grid, knots).sum(axis=0), dtype=dtype),
-            torch.as_tensor(weights, dtype=dtype),
-            n_gen,
+            torch.as_tensor(condensed.gamma.reshape(-1, condensed.gamma.shape[2]), dtype=dtype),
+            torch.as_tensor(condensed.hat_weights, dtype=dtype),
+            torch.as_tensor(condensed.quadrature_weights, dtype=dtype),
+            condensed.n_gen,
         )
 
     def to(self, device: str) -> Objective:
         """The same on another device."""
-        return Objective(self.gamma.to(device), self.held.to(device), self.stands_for.to(device), self.n_gen)
+        hat_weights, quadrature_weights = self.hat_weights.to(device), self.quadrature_weights.to(device)
+        return Objective(self.gamma.to(device), hat_weights, quadrature_weights, self.n_gen)
 
     def rollout(self, free: Tensor, p_gen: Tensor) -> tuple[Tensor, Tensor]:
         """ω (batch, n_gen, n_coarse), rad/s, and P_s (batch, n_coarse), pu, under powers at the knots."""
@@ -64,8 +62,8 @@ class Objective:
             p_slack: at the coarse points, (batch, n_coarse), pu.
             cost: (slack, generators), (batch, 1 + n_gen).
         """
-        generators = (torch.einsum("bkg,k->bg", p_gen, self.held) * cost[:, 1:]).sum(dim=1)
-        return generators + cost[:, 0] * (p_slack.abs() @ self.stands_for)
+        generators = (torch.einsum("bkg,k->bg", p_gen, self.hat_weights) * cost[:, 1:]).sum(dim=1)
+        return generators + cost[:, 0] * (p_slack.abs() @ self.quadrature_weights)
 
 
 def coarse_stride(dt_s: float, steps: int, spacing_s: float = SPACING_S) -> int:
@@ -76,29 +74,13 @@ def coarse_stride(dt_s: float, steps: int, spacing_s: float = SPACING_S) -> int:
 
 def coarse_free_response(
     network: Network, model: Koopman, inputs: Inputs, grid: Array, stride: int
-) -> np.ndarray:
-    """`Koopman.free_response` at every `stride`-th grid point, (batch, n_gen + 1, n_coarse), float32.
-
-    A coarse step sums what the load changes inside it leave behind, so that the result is the same
-    as of the step-by-step rollout, in a tenth of the time.
-    """
-    n_gen, parts = len(network.generators), []
-    powers = [np.eye(len(model.k))]
-    for _ in range(stride):
-        powers.append(powers[-1] @ model.k)
-    kicks = (model.g - model.b)[:, n_gen:]
-    leave = np.concatenate([(powers[stride - 1 - m] @ kicks).T for m in range(stride)])
+) -> Array32:
+    """`condensed.free_response` of instances, (batch, n_gen + 1, n_coarse), float32."""
+    parts = []
     for start in range(0, len(inputs), CHUNK):
         part = inputs[start : start + CHUNK]
         p_load = part.p_load(grid)
-        psi = model.observables(
-            network, network.power_flow(part.p_initial, p_load[:, 0]), part.omega, p_load[:, 0]
-        )
-        steady = p_load[:, ::stride] @ model.b[:, n_gen:].T
-        push = np.diff(p_load, axis=1).reshape(len(part), -1, stride * p_load.shape[2]) @ leave
-        away = np.empty_like(steady)
-        away[:, 0] = psi - steady[:, 0]
-        for step in range(push.shape[1]):
-            away[:, step + 1] = away[:, step] @ powers[stride].T + push[:, step]
-        parts.append((away + steady)[:, :, : n_gen + 1].transpose(0, 2, 1).astype(np.float32))
+        theta = network.power_flow(part.p_initial, p_load[:, 0])
+        psi = model.observables(network, theta, part.omega, p_load[:, 0])
+        parts.append(free_response(model, psi, p_load, stride).astype(np.float32))
     return np.concatenate(parts)

@@ -44,16 +44,18 @@ class StagedNetwork(nn.Module):
             self.groups[name] = slice(n_seen + part.start, n_seen + part.stop)
         self.response, self.dilations = response, dilations
         self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
-        self.step = float(case.ramp_pu_per_s * (response.knots[1] - response.knots[0]))
+        step = case.ramp * (response.knots[1] - response.knots[0])
         n_knots = len(response.knots)
         by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
         of_power = by_knot.reshape(n_knots * n_gen, -1)
-        for name, value in (("of_power", of_power), ("low", case.p_min), ("high", case.p_max)):
+        buffers = {"of_power": of_power, "low": case.p_min, "high": case.p_max, "step": step}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)
 
-    of_power: Tensor
-    low: Tensor
+    of_power: Tensor  # as `Response.of_power`, powers and outputs knot by knot
+    low: Tensor  # bounds, (n_gen,), pu
     high: Tensor
+    step: Tensor  # largest change between two knots, (n_gen,), pu
 
     def normalise(self, channels: Channels) -> None:
         """Set the affine input normalisation of all stages from training data."""

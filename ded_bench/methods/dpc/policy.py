@@ -24,7 +24,6 @@ from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.variants import SETTINGS as SETTINGS
-from ded_bench.methods.dpc_paper.paper_loss import knot_times
 from ded_bench.methods.policy_file import (
     Scope,
     find_policy_file,
@@ -40,7 +39,6 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
 METHOD = "ded-dpc"
-N_KNOTS = 50
 #: Instances that one thread takes at a time.
 CHUNK = 50
 
@@ -104,7 +102,7 @@ class DispatchPolicy:
         n_sequence, n_constants = n_channels(case)
         n_gen, n_outputs = len(case.generators), self.response.n_outputs
         widths = (n_gen, n_outputs, n_sequence)
-        example = (*(torch.zeros(2, N_KNOTS, n) for n in widths), torch.zeros(2, n_constants))
+        example = (*(torch.zeros(2, case.n_knots, n) for n in widths), torch.zeros(2, n_constants))
         batch = {0: torch.export.Dim("batch")}
         program = torch.export.export(self.network, example, dynamic_shapes=(batch,) * 4)
         buffer = io.BytesIO()
@@ -118,7 +116,7 @@ class DispatchPolicy:
         stages, width, dilations = (training.get(name) for name in ("stages", "width", "dilations"))
         if not (isinstance(stages, int) and isinstance(width, int) and isinstance(dilations, list)):
             raise InputError(path, "training", "lacks the network's stages, width and dilations")
-        if not all(isinstance(d, int) and 0 < d < N_KNOTS for d in dilations):
+        if not all(isinstance(d, int) and 0 < d < case.n_knots for d in dilations):
             raise InputError(path, "training", "has dilations that are no numbers of knots")
         layers = {name for name in arrays if ".mix." in name and name.endswith(".bias")}
         widths = {arrays[name].shape for name in layers} | {(width,)}
@@ -126,7 +124,7 @@ class DispatchPolicy:
             raise InputError(path, "training", "has another width or depth than the weights")
         if not isinstance(training.get("prior", True), bool):
             raise InputError(path, "training", "has a prior that is neither true nor false")
-        response = Response.make(case, knot_times(scope.horizon_s, N_KNOTS))
+        response = Response.make(case, case.knot_times(scope.horizon_s))
         network = StagedNetwork(case, response, stages, width, tuple(dilations))
         load_weights(network, arrays, path)
         return DispatchPolicy(scope, network.eval(), training)

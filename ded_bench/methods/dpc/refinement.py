@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.condensed import CondensedRollout
+from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
@@ -47,14 +48,14 @@ class Refiner:
     model: Koopman
     grid: Array
     stride: int
-    step: float  # largest change between two knots, pu
+    step: Array  # largest change between two knots, (n_gen,), pu
     n_slack: int  # rows of y that are P_s
     rows: Array32  # A, each row weighted, (n_rows, n_knots n_gen)
     solve: Array32  # (AᵀA)⁻¹ for the knots after the first
     low: Array32  # limits of the other rows, (n_rows - n_slack,)
     high: Array32
-    held: Array  # Σ_k over the grid of each knot's hat function, (n_knots,)
-    stands_for: Array  # grid points that a coarse point stands for
+    hat_weights: Array  # see `CondensedRollout`, as the next
+    quadrature_weights: Array
     omega_bound: float
 
     @staticmethod
@@ -62,11 +63,10 @@ class Refiner:
         """Condense and factorise."""
         n_gen, n_knots = len(case.generators), len(knots)
         stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
-        gamma = np.moveaxis(model.condense(n_gen, grid, knots)[::stride], 1, 0).reshape(
-            n_gen + 1, -1, n_knots * n_gen
-        )
+        condensed = CondensedRollout.make(case, model, grid, knots, stride)
+        gamma = condensed.gamma
         root = {name: math.sqrt(value) for name, value in WEIGHTS.items()}
-        bound, step = case.omega_bound(regime), case.ramp_pu_per_s * (knots[1] - knots[0])
+        bound, step = case.omega_bound(regime), case.ramp * (knots[1] - knots[0])
         unit = np.eye(n_knots * n_gen)
         rows = np.concatenate(
             [
@@ -80,7 +80,7 @@ class Refiner:
         high = np.concatenate(
             [
                 np.full(n_gen * n_coarse, (1.0 - MARGIN) * root["omega"]),
-                np.full(n_free, step * root["ramp"]),
+                np.tile(step, n_knots - 1) * root["ramp"],
                 np.tile(case.p_max, n_knots - 1) * root["power"],
             ]
         )
@@ -93,14 +93,14 @@ class Refiner:
             model,
             grid,
             stride,
-            float(step),
+            step,
             n_coarse,
             rows.astype(np.float32),
             np.linalg.inv(free.T @ free).astype(np.float32),
             low.astype(np.float32),
             high.astype(np.float32),
-            hat_functions(grid, knots).sum(axis=0),
-            hat_functions(grid, grid[::stride]).sum(axis=0),
+            condensed.hat_weights,
+            condensed.quadrature_weights,
             bound,
         )
 
@@ -132,9 +132,11 @@ class Refiner:
         rows = self.rows[:, n_gen:]
         # costs per grid point, relative to the instance's own: the scale the weights are chosen for
         unit = 1.0 / (np.maximum(inputs.cost.sum(axis=1), 1e-9) * len(self.grid))
-        cost = (self.held[1:, None] * inputs.cost[:, None, 1:]).reshape(batch, -1) * unit[:, None]
+        cost = (self.hat_weights[1:, None] * inputs.cost[:, None, 1:]).reshape(batch, -1) * unit[:, None]
         pull = cost.astype(np.float32) @ self.solve
-        shrink = (inputs.cost[:, :1] * self.stands_for * (unit[:, None] / slack_unit)).astype(np.float32)
+        shrink = (inputs.cost[:, :1] * self.quadrature_weights * (unit[:, None] / slack_unit)).astype(
+            np.float32
+        )
         project = rows @ self.solve
         x = p_gen[:, 1:].reshape(batch, -1).astype(np.float32)
         y = x @ rows.T + fixed
@@ -160,6 +162,6 @@ class Refiner:
         y = free @ self.rows[: n * (1 + n_gen), n_gen:].T + fixed[:, : n * (1 + n_gen)]
         p_slack = y[:, :n] / math.sqrt(WEIGHTS["p_slack"])
         omega = np.abs(y[:, n:]).max(axis=1) / math.sqrt(WEIGHTS["omega"])
-        generators = (np.einsum("bkg,k->bg", p_gen, self.held) * inputs.cost[:, 1:]).sum(axis=1)
-        cost = generators + inputs.cost[:, 0] * (np.abs(p_slack) @ self.stands_for)
+        generators = (np.einsum("bkg,k->bg", p_gen, self.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
+        cost = generators + inputs.cost[:, 0] * (np.abs(p_slack) @ self.quadrature_weights)
         return np.asarray(cost * (1.0 + EXCESS_PRICE * np.maximum(omega - (1.0 - 0.5 * MARGIN), 0.0)))

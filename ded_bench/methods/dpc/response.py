@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ded_bench.koopman.condensed import hat_functions
 from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.model import hat_functions
 from ded_bench.problem.case import Array, Case
 
 Array32 = NDArray[np.float32]

@@ -18,13 +18,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ded_bench.files.strict import write_atomically
+from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.loss import Objective, coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
-from ded_bench.methods.dpc.policy import METHOD, N_KNOTS, DispatchPolicy
+from ded_bench.methods.dpc.policy import METHOD, DispatchPolicy
 from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc_paper.paper_loss import full_precision, knot_times
+from ded_bench.methods.dpc_paper.paper_loss import full_precision
 from ded_bench.methods.policy_file import Scope, reading_checkpoint
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -153,7 +154,7 @@ def train(
     chosen = Variant(**variant)
     first = instances[0]
     scope = Scope(case, regime, first.horizon_s)
-    response = Response.make(case, knot_times(first.horizon_s, N_KNOTS))
+    response = Response.make(case, case.knot_times(first.horizon_s))
     stride = coarse_stride(first.dt_s, first.steps)
     generator = torch.Generator().manual_seed(seed)
     if fresh:
@@ -171,8 +172,9 @@ def train(
     data, check = (
         Pool.of(c, i, f, len(first.grid)).to(device) for c, i, f in zip(channels, inputs, free, strict=True)
     )
+    condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
     loss = Loss(
-        Objective.make(case, model, first.grid, response.knots, stride).to(device),
+        Objective.make(condensed).to(device),
         case.omega_bound(regime),
         stride * first.dt_s,
     )

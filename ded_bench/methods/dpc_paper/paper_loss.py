@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ded_bench.koopman.model import Koopman, hat_functions
+from ded_bench.koopman.condensed import CondensedRollout, hat_functions
+from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 
 #: Weights of the penalty terms (paper, section on the implementation).
@@ -35,7 +36,7 @@ class Condensed:
     def make(case: Case, model: Koopman, grid: Array, knots: Array, dtype: torch.dtype) -> Condensed:
         """Compute Γ once for a model, a time grid and knots."""
         n_gen = len(case.generators)
-        gamma = np.moveaxis(model.condense(n_gen, grid, knots), 1, 0)
+        gamma = CondensedRollout.make(case, model, grid, knots).gamma
         flat = gamma.reshape((n_gen + 1) * len(grid), len(knots) * n_gen)
         return Condensed(
             torch.as_tensor(flat, dtype=dtype),

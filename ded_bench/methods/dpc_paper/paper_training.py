@@ -17,6 +17,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
 from ded_bench.files.strict import write_atomically
+from ded_bench.koopman.condensed import free_response
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc_paper.paper_features import Features
 from ded_bench.methods.dpc_paper.paper_loss import Condensed, full_precision, knot_times, loss_terms
@@ -50,8 +51,8 @@ class Batch:
         """Features and free responses of instances with one time grid."""
         network = Network(case)
         features = Features.of(network, instances, knot_times(instances[0].horizon_s, N_KNOTS))
-        p_load = np.stack([i.p_load(case) for i in instances], axis=1)
-        free = model.free_response(model.initial(network, instances), p_load).transpose(1, 2, 0)
+        p_load = np.stack([i.p_load(case) for i in instances])
+        free = free_response(model, model.initial(network, instances), p_load)
         arrays = (features.channels(), free, features.cost[:, 1:], features.cost[:, 0], features.p_initial)
         return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32, device=device) for a in arrays))
 

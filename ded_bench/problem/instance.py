@@ -197,6 +197,17 @@ class Instance(Record):
         times = self.grid if t is None else t
         return np.stack([self.load[bus].at(times) for bus in case.loads], axis=-1)
 
+    def ramps(self, case: Case) -> tuple[LoadRamp, ...]:
+        """The loads as ramps, in the order of the case.
+
+        Raises:
+            InputError: a load is given by points.
+        """
+        ramps = tuple(load for bus in case.loads if isinstance(load := self.load[bus], LoadRamp))
+        if len(ramps) < len(case.loads):
+            raise InputError(f"instance {self.id}", "load", "must be ramps, not points, for this")
+        return ramps
+
     def p_initial(self, case: Case) -> Array:
         """Generator power at t = 0 (the paper's P_0), shape (n_gen,), pu."""
         return np.array([self.initial.power[g] for g in case.generators])
@@ -206,7 +217,7 @@ class Instance(Record):
         return np.array([self.initial.omega[g] for g in case.generators])
 
     def theta_initial(self, case: Case) -> Array | None:
-        """Angles at t = 0 relative to the slack, shape (n_gen,), rad; None where the power flow gives them."""
+        """Given angles at t = 0 relative to the slack, shape (n_gen,), rad; None: the power flow's."""
         if self.initial.theta is None:
             return None
         return np.array([self.initial.theta[g] for g in case.generators])

@@ -32,10 +32,7 @@ class Inputs:
     def of(case: Case, instances: Sequence[Instance]) -> Inputs:
         """Stack instances."""
         machines = (case.slack, *case.generators)
-        ramps = [
-            [(r.initial, r.start, r.duration, r.rate) for r in (i.load[bus] for bus in case.loads)]
-            for i in instances
-        ]
+        ramps = [[(r.initial, r.start, r.duration, r.rate) for r in i.ramps(case)] for i in instances]
         return Inputs(
             np.array(ramps),
             np.array([[i.cost[bus] for bus in machines] for i in instances]),

@@ -216,10 +216,9 @@ def _spread(terms: pd.DataFrame) -> float:
 def parameters_figure(case: Case, instances: Sequence[Instance]) -> Figure:
     """Distribution of the sampled parameters with the sampler's ranges dotted (paper, Table III)."""
     ranges = case.sampling
-    ramps = [i.load[bus] for i in instances for bus in case.loads]
-    relative = np.array(
-        [i.load[bus].initial / nominal - 1 for i in instances for bus, nominal in _nominal(case)], dtype=float
-    )
+    ramps = [ramp for i in instances for ramp in i.ramps(case)]
+    initial = np.array([[ramp.initial for ramp in i.ramps(case)] for i in instances])
+    relative = (initial / case.load_nominal - 1).ravel()
     rate = np.array([ramp.rate for ramp in ramps])
     least, largest = float(case.load_rate[0].min()), float(case.load_rate[1].max())
     panels: list[tuple[str, Array, tuple[float, ...]]] = [

@@ -1,1 +1,1 @@
-"""Strict JSON, arrays, typed CSV, atomic writes, paths, and the one error that means bad input; knows no grid."""
+"""Strict JSON, arrays, typed CSV, paths, atomic writes, and the error that means bad input; knows no grid."""

@@ -161,6 +161,8 @@ class Table(Generic[T]):
     def format_row(self, row: T, header: Sequence[str], others: Mapping[str, str] | None = None) -> str:
         """One row as a line of CSV under a header, which may have columns that are not declared here.
 
+        Line breaks within a text become spaces, so that a file that ends without one has a torn last row.
+
         Args:
             others: cells of those columns by name; empty where not given.
         """
@@ -190,7 +192,7 @@ def records(text: str, source: str | Path) -> list[tuple[int, list[str]]]:
     Raises:
         InputError: it is not CSV.
     """
-    reader = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""))
+    reader = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""), strict=True)
     try:
         found = [(reader.line_num, cells) for cells in reader]
     except csv.Error as error:
@@ -210,7 +212,9 @@ def csv_line(cells: Sequence[str]) -> str:
 def _text(value: Any) -> str:
     if value is None:
         return ""
-    return repr(float(value)) if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return repr(float(value))
+    return " ".join(str(value).splitlines()) if isinstance(value, str) else str(value)
 
 
 def _column(field: dataclasses.Field[Any], hint: Any) -> Column:

@@ -26,7 +26,7 @@ class Ship:
 
 
 SHIPS = Table(Ship)
-BRIG = Ship("brig", 2, 0.1 + 0.2, True, 'comma, "quote"\nand line', 3)
+BRIG = Ship("brig", 2, 0.1 + 0.2, True, 'comma, "quote"', 3)
 HEADER = "name,masts,length_m,afloat,note,crew\n"
 
 
@@ -44,6 +44,10 @@ def test_rows_survive_to_the_last_digit(length: float | None, tmp_path: Path) ->
     SHIPS.write(tmp_path / "ships.csv", ships)
     assert SHIPS.read(tmp_path / "ships.csv") == ships
     assert (tmp_path / "ships.csv").read_text().startswith(HEADER)
+
+
+def test_a_row_is_one_line() -> None:
+    assert SHIPS.format([Ship("brig", 2, note="one\ntwo\r\nthree")]) == HEADER + "brig,2,,,one two three,1\n"
 
 
 def test_columns_of_other_versions_do_no_harm(tmp_path: Path) -> None:

@@ -72,15 +72,16 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
 
     Args:
         case: name of a shipped case, or a benchmark's folder.
-        split: `test`, `train` or `all`.
+        split: `test`, `train`, `validation` (drawn afresh) or `all`.
         limit: only the first so many.
 
     Raises:
         InputError: there is no such case or split, or a file is missing or wrong.
     """
     from ded_bench.problem.benchmark import select_split
+    from ded_bench.truth.servable import servable
 
-    return [instance for instance, _ in select_split(case, split, limit).instances]
+    return [instance for instance, _ in select_split(case, split, limit, servable).instances]
 
 
 def instances_frame(instances: list[Instance]) -> pd.DataFrame:

@@ -154,9 +154,10 @@ def _score_folder(a: argparse.Namespace) -> int:
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance`, checked against the physics, or of `--split`."""
     from ded_bench.truth.network import check_servable
+    from ded_bench.truth.servable import servable
 
     if not a.instance:
-        return select_split(a.case or DEFAULT_CASE, a.split, a.limit)
+        return select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
     chosen = select_files(a.instance, Case.load(a.case) if a.case else None)
     for path, (instance, _) in zip(a.instance, chosen.instances, strict=True):
         check_servable(chosen.case, instance, str(path))

@@ -34,6 +34,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score_many
+from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import SimulationError
 
 REFERENCE = "ded-ko-knots"
@@ -239,7 +240,7 @@ def judge(
     indices: tuple[int, ...],
 ) -> pd.DataFrame:
     """Answer some instances with both methods and re-simulate; one row each, without fingerprint."""
-    instances = [next(sample_instances(case, CERTIFICATE_SEED + seed, 1, i)) for i in indices]
+    instances = [next(sample_instances(case, CERTIFICATE_SEED + seed, 1, i, servable)) for i in indices]
     plain = _plain(settings)
     schedules = [
         *_schedules(case, method, regime, settings, instances),

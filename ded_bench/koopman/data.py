@@ -10,8 +10,9 @@ import numpy as np
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
+from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import simulate_many
 
 #: Range of a uniform draw.
@@ -55,7 +56,7 @@ def sample_trajectories(
 ) -> Trajectories:
     """Simulate `count` fresh instances under the kinds of schedules in `mix` (default: all) in turn."""
     mix = mix or list(KINDS)
-    instances = [sample_instance(case, KOOPMAN_SEED + seed, i) for i in range(first, first + count)]
+    instances = list(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable))
     kinds = [mix[i % len(mix)] for i in range(count)]
     schedules = []
     for i, (instance, kind) in enumerate(zip(instances, kinds, strict=True)):

@@ -10,7 +10,13 @@ from typing import Literal, get_args
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, load_instances
-from ded_bench.problem.sampling import VALIDATION_SEED, load_manifest, load_split, sample_instances
+from ded_bench.problem.sampling import (
+    VALIDATION_SEED,
+    Servable,
+    load_manifest,
+    load_split,
+    sample_instances,
+)
 
 SplitName = Literal["test", "train", "validation", "all"]
 #: What `--split` may say; `all` are the instances that are files.
@@ -36,12 +42,15 @@ def problem_folder(name: str | Path, case: Case) -> Path:
     return path.parent if path.is_file() else SHIPPED_CASES / case.id
 
 
-def select_split(name: str | Path, split: str = "test", limit: int | None = None) -> Selection:
+def select_split(
+    name: str | Path, split: str = "test", limit: int | None = None, servable: Servable | None = None
+) -> Selection:
     """Choose the first `limit` instances of a split, in the order of their ids.
 
     Args:
         name: a shipped case, a benchmark's folder, or its case.json.
         split: `test`, `train`, `validation` (drawn afresh, see `validation_instances`) or `all`.
+        servable: tells which instances the power flow can serve, where some are drawn.
 
     Raises:
         InputError: there is no such case or split, or a file is missing or wrong.
@@ -50,7 +59,8 @@ def select_split(name: str | Path, split: str = "test", limit: int | None = None
     folder = problem_folder(name, case)
     if split == "validation":
         manifest = load_manifest(folder)
-        drawn = validation_instances(case, VALIDATION_COUNT if limit is None else limit)
+        count = VALIDATION_COUNT if limit is None else limit
+        drawn = validation_instances(case, count, servable=servable)
         return Selection(case, tuple((i, split) for i in drawn), manifest.version if manifest else "")
     known = load_split(folder)
     named = {"train": known.train, "test": known.test, "all": known.train + known.test}
@@ -61,12 +71,14 @@ def select_split(name: str | Path, split: str = "test", limit: int | None = None
     return _selection(case, instances, folder)
 
 
-def validation_instances(case: Case, count: int, first: int = 0) -> list[Instance]:
+def validation_instances(
+    case: Case, count: int, first: int = 0, servable: Servable | None = None
+) -> list[Instance]:
     """Draw validation instances `first` to `first + count - 1` of a case, `<case>-v0000` and so on.
 
     Weights, prices, steps and variants are chosen on them; they are no part of the benchmark.
     """
-    drawn = sample_instances(case, VALIDATION_SEED, count, first)
+    drawn = sample_instances(case, VALIDATION_SEED, count, first, servable)
     return [
         instance.model_copy(update={"id": f"{case.id}-v{index:04d}"})
         for index, instance in enumerate(drawn, start=first)

@@ -140,8 +140,8 @@ def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkey
     regime = max(threebus.regimes, key=threebus.omega_bound)
     plain = certificate.sample_instances
 
-    def renamed(case, master, count, first):
-        for instance in plain(case, master, count, first):
+    def renamed(case, master, count, first, servable):
+        for instance in plain(case, master, count, first, servable):
             name = {0: "raise", 1: "apart"}.get(first, "calm")
             yield instance.model_copy(update={"id": f"{name}-{first}"})
 

@@ -20,6 +20,7 @@ from ded_bench.problem.sampling import (
     KOOPMAN_SEED,
     POLICY_SEED,
     draw_split,
+    drawn_with_redraws,
     load_manifest,
     load_split,
     sample_instance,
@@ -61,7 +62,7 @@ def draws_of(case, instances) -> dict[str, tuple[np.ndarray, float, float]]:
         "P_0 of loads": (relative, -ranges.load_relative, ranges.load_relative),
         "t_0": (np.array([ramp.start for ramp in ramps]), *ranges.start_s),
         "d": (np.array([ramp.duration for ramp in ramps]), *ranges.duration_s),
-        "|r|": (moving, *ranges.rate_pu_per_s),
+        "|r|": (moving, *case.load_rate[:, 0]),
         "omega_0": (field(instances, lambda i: i.initial.omega.values()), *ranges.omega_rad_per_s),
         "c": (field(instances, lambda i: i.cost.values()), *ranges.cost),
     }
@@ -256,6 +257,59 @@ def test_committed_split_is_400_to_100_and_disjoint(written):
     # Positions of a random fifth: a Kolmogorov-Smirnov test sees any cluster.
     positions = [names.index(name) for name in split.test]
     assert kstest(positions, "uniform", args=(0, COUNT)).pvalue > 1e-3
+
+
+def test_the_ninebus_files_are_those_of_the_first_release(written):
+    """Cases and samplers may learn; results on the 9-bus grid stay comparable."""
+    assert written[1].version == "1-127371476e0f"
+
+
+@pytest.fixture(scope="module")
+def turning(threebus, alter):
+    """The chain in case/2, with ramps that turn every fourth load or so into a source."""
+    data = json.loads(threebus.model_dump_json(by_alias=True))
+    return {
+        schema: alter(threebus, schema=schema, sampling=data["sampling"] | {"rate_pu_per_s": [0.1, 1.5]})
+        for schema in ("ded-bench/case/1", "ded-bench/case/2")
+    }
+
+
+def test_loads_that_change_their_sign_are_drawn_again(turning):
+    """In case/2; the others, and all other numbers but the power that depends on them, stay as they are."""
+    before, after = (list(drawn_with_redraws(turning[schema], 5, 200)) for schema in sorted(turning))
+    case = turning["ded-bench/case/2"]
+    changed = []
+    for (old, none), (new, redraws) in zip(before, after, strict=True):
+        assert none == 0
+        assert (new.p_load(case) <= 0).all()
+        changed.append(bool((old.p_load(case) > 0).any()))
+        assert (redraws > 0) == changed[-1] == (new != old)
+        assert (new.cost, new.initial.omega) == (old.cost, old.initial.omega)
+    assert 0.1 < np.mean(changed) < 0.9
+    assert max(redraws for _, redraws in after) > 1
+
+
+def test_relative_rates_are_fractions_of_the_nominal_load(threebus, alter):
+    """Per second, of either sign."""
+    data = json.loads(threebus.model_dump_json(by_alias=True))["sampling"]
+    del data["rate_pu_per_s"]
+    case = alter(threebus, schema="ded-bench/case/2", sampling=data | {"rate_relative_per_s": [0.01, 0.02]})
+    rates = field(sample_instances(case, 1, 200), lambda i: [i.load["town"].rate])
+    sizes = np.abs(rates[rates != 0] / case.load_nominal)
+    assert sizes.min() >= 0.01
+    assert sizes.max() <= 0.02
+    assert set(np.sign(rates)) == {-1.0, 0.0, 1.0}
+
+
+def test_the_number_of_test_instances_can_be_said(threebus, tmp_path):
+    """Else a fifth; never more than there are."""
+    names = [f"x-{i:04d}" for i in range(50)]
+    assert len(draw_split(names, 3, 13).test) == 13
+    assert set(draw_split(names, 3).test) < set(draw_split(names, 3, 13).test)
+    write_benchmark(threebus, 6, 1, tmp_path, n_test=4)
+    assert len(load_split(tmp_path).test) == 4
+    with pytest.raises(InputError, match="7 of 6 instances cannot be for testing"):
+        write_benchmark(threebus, 6, 1, tmp_path, n_test=7)
 
 
 def test_splits_depend_on_the_seed_alone(tmp_path):

@@ -31,6 +31,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
 from ded_bench.truth.network import Network
+from ded_bench.truth.servable import servable
 
 #: Fresh instances, epochs over them, batch size.
 FRESH, EPOCHS, BATCH = 64_000, 32, 128
@@ -159,7 +160,7 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     if fresh:
         fresh = fresh if seconds is None else min(fresh, math.ceil(FRESH_PER_SECOND * seconds))
-        drawn = list(sample_instances(case, POLICY_SEED + seed, fresh))
+        drawn = list(sample_instances(case, POLICY_SEED + seed, fresh, servable=servable))
         held_out = list(instances)
     else:
         order = torch.randperm(len(instances), generator=generator).tolist()

@@ -23,6 +23,8 @@ GROUP = ["regime", "method", "settings"]
 HEAD = [*GROUP, "title"]
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
 SUCCESS = (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)
+#: Split of the instances that choices are made on.
+VALIDATION = "validation"
 #: Settings whose name starts so are short trainings, to be compared with each other only.
 STUDY = "study"
 #: Settings whose name starts so solve full DED from another starting point.
@@ -51,10 +53,23 @@ def is_apart(slug: str) -> bool:
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that the tables are about: the test instances if there are any, else all."""
+    """The rows that the tables are about: the test instances if there are any, else all but validation."""
+    frame = scoring_rows(frame)
     frame = frame[~frame["settings"].map(is_apart).astype(bool)]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
+
+
+def validation_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows that choices are made on: nothing else is read from them."""
+    chosen: pd.DataFrame = frame[frame["split"] == VALIDATION]
+    return chosen
+
+
+def scoring_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """All rows but those of validation instances, on which methods were chosen."""
+    chosen: pd.DataFrame = frame[frame["split"] != VALIDATION]
+    return chosen
 
 
 def coverage(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
@@ -113,29 +128,31 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
     to compare with. `success_rate` is what solvers claim, `correct_rate` and `strict_rate` what the
     scorer found (`feasible`, `feasible_strict`); all three are shares of all rows.
     """
-    rows = []
-    for regime, method, settings, group in groups(gaps(frame)):
-        paired = group.dropna(subset=["gap_percent"])
-        failures = int(group["objective"].isna().sum())
-        row: dict[str, object] = {
-            "regime": regime,
-            "method": method,
-            "settings": settings,
-            "title": title(method, settings),
-            "rows": len(group),
-            "n": len(paired),
-            "failures": failures,
-            "unpaired": len(group) - failures - len(paired),
-            "success_rate": float(group["status"].isin([str(s) for s in SUCCESS]).mean()),
-            "correct_rate": float((group["feasible"] == True).mean()),  # noqa: E712  (empty is not True)
-            "strict_rate": float((group["feasible_strict"] == True).mean()),  # noqa: E712
-        }
-        row |= _spread("gap_percent", paired["gap_percent"])
-        row["cost_ratio"] = _ratio(paired["objective"].sum(), paired["reference"].sum())
-        for name in VIOLATIONS:
-            row |= _spread(name, group[name].dropna())
-        rows.append(row)
-    return table(rows, SUMMARY_COLUMNS)
+    rows = [
+        dict(zip(HEAD, (regime, method, settings, title(method, settings)), strict=True)) | statistics(group)
+        for regime, method, settings, group in groups(gaps(frame))
+    ]
+    return table(rows, [*HEAD, *statistics(gaps(frame[:0]))])
+
+
+def statistics(group: pd.DataFrame) -> dict[str, object]:
+    """Counts, rates and spreads of rows with their gaps (see `summary`); missing where there are no rows."""
+    paired = group.dropna(subset=["gap_percent"])
+    failures = int(group["objective"].isna().sum())
+    found: dict[str, object] = {
+        "rows": len(group),
+        "n": len(paired),
+        "failures": failures,
+        "unpaired": len(group) - failures - len(paired),
+        "success_rate": float(group["status"].isin([str(s) for s in SUCCESS]).mean()),
+        "correct_rate": float((group["feasible"] == True).mean()),  # noqa: E712  (empty is not True)
+        "strict_rate": float((group["feasible_strict"] == True).mean()),  # noqa: E712
+    }
+    found |= _spread("gap_percent", paired["gap_percent"])
+    found["cost_ratio"] = _ratio(paired["objective"].sum(), paired["reference"].sum())
+    for name in VIOLATIONS:
+        found |= _spread(name, group[name].dropna())
+    return found
 
 
 def table_times(frame: pd.DataFrame) -> pd.DataFrame:
@@ -302,13 +319,6 @@ def table(rows: list[dict[str, object]], columns: Sequence[str]) -> pd.DataFrame
 
 
 SPREAD = ("mean", "median", "p95", "max")
-SUMMARY_COLUMNS = [
-    *HEAD,
-    *("rows", "n", "failures", "unpaired", "success_rate", "correct_rate", "strict_rate"),
-    *(f"gap_percent_{part}" for part in SPREAD),
-    "cost_ratio",
-    *(f"{name}_{part}" for name in VIOLATIONS for part in SPREAD),
-]
 TIME_COLUMNS = [
     *HEAD,
     *("n", "workers"),

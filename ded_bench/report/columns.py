@@ -1,33 +1,123 @@
-"""Which columns the report prints, under which headings, and how to read them."""
+"""Every column that the report prints, declared once: name, heading, unit, format, source of its value.
+
+A column with a `value` computes it from what a line of its table is about; any other names a column of the
+frame that the table prints.
+"""
 
 from __future__ import annotations
 
-from ded_bench.report.render import Column
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from ded_bench.evaluate.summary import HEAD
+from ded_bench.report.paper import Line
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a printed table.
+
+    Attributes:
+        name: in the frame and in the CSV file.
+        text: what stands above it, without the unit.
+        unit: printed after the text, in brackets.
+        form: format of its floats.
+        value: computes a cell from a line of Tables V and VI.
+    """
+
+    name: str
+    text: str
+    unit: str = ""
+    form: str = ".3g"
+    value: Callable[[Line], object] | None = None
+
+    @property
+    def heading(self) -> str:
+        """What stands above the column."""
+        return f"{self.text} ({self.unit})" if self.unit else self.text
+
+    def cell(self, value: object) -> str:
+        """The printed value; a missing number is a dash."""
+        if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA:
+            return "–"
+        if isinstance(value, float):
+            text = format(value, self.form)
+            return text.replace("%", " %")
+        return str(value)
+
+
+def tabulate(columns: Sequence[Column], lines: Sequence[Line]) -> pd.DataFrame:
+    """The frame of Table V or VI: what each line is about, then every column that has a `value`."""
+    computed = {column.name: column.value for column in columns if column.value}
+    rows = [
+        [getattr(line, name) for name in HEAD] + [value(line) for value in computed.values()]
+        for line in lines
+    ]
+    return pd.DataFrame(rows, columns=[*HEAD, *computed])
+
 
 _HEAD = (Column("regime", "Regime"), Column("title", "Method"))
+_FREQUENCY = (
+    Column("freq_violation_hz_mean", "frequency mean", "Hz"),
+    Column("freq_violation_hz_max", "frequency max", "Hz"),
+)
 _SPREAD = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
+
+
+def _papers(name: str, text: str, unit: str = "") -> Column:
+    """A number of the paper, printed as it prints it."""
+    return Column(f"paper_{name}", text, unit, "g", value=lambda line: line.papers(name))
+
+
+def _statistic(name: str, text: str | None = None, unit: str = "", of: str = "") -> Column:
+    return Column(name, text or name, unit, value=lambda line: line.statistics[of or name])
+
+
+def _verdict(what: str, name: str) -> Column:
+    """How the mean of a violation stands against the paper's."""
+    return Column(
+        f"against_paper_{what}",
+        f"{what} against the paper",
+        value=lambda line: line.verdict(line.statistics[f"{name}_mean"], name, line.statistics["failures"]),
+    )
+
 
 TABLE_V = (
     *_HEAD,
-    Column("increase_percent", "% increase in obj. over DED"),
-    Column("paper_increase_percent", "paper's %", "g"),
-    Column("solve_s", "Sol. time (s)"),
-    Column("paper_solve_s", "paper's time (s)", "g"),
-    Column("n", "n"),
-    Column("failures", "failures"),
-    Column("ahead_increase", "objective ahead of paper"),
-    Column("ahead_time", "time ahead of paper"),
+    Column("increase_percent", "% increase in obj. over DED", value=lambda line: line.increase_percent),
+    _papers("increase_percent", "paper's %"),
+    Column("solve_s", "Sol. time", "s", value=lambda line: line.timing.get("solve_s", math.nan)),
+    _papers("solve_s", "paper's time", "s"),
+    _statistic("n"),
+    _statistic("failures"),
+    Column(
+        "against_paper_increase",
+        "objective against the paper",
+        value=lambda line: line.verdict(
+            line.increase_percent, "increase_percent", line.statistics["failures"]
+        ),
+    ),
+    Column(
+        "against_paper_time",
+        "time against the paper",
+        value=lambda line: line.verdict(
+            line.timing.get("solve_s", math.nan), "solve_s", line.timing.get("failures", 0)
+        ),
+    ),
 )
 TABLE_VI = (
     *_HEAD,
-    Column("freq_violation_hz", "freq. const. viol. (Hz)"),
-    Column("paper_freq_violation_hz", "paper's (Hz)", "g"),
-    Column("ramp_violation", "ramp const. viol. (pu)"),
-    Column("paper_ramp_violation", "paper's (pu)", "g"),
-    Column("n", "n"),
-    Column("failures", "failures"),
-    Column("ahead_frequency", "frequency ahead of paper"),
-    Column("ahead_ramp", "ramp ahead of paper"),
+    _statistic("freq_violation_hz", "freq. const. viol.", "Hz", of="freq_violation_hz_mean"),
+    _papers("freq_violation_hz", "paper's", "Hz"),
+    _statistic("ramp_violation", "ramp const. viol.", "pu", of="ramp_violation_mean"),
+    _papers("ramp_violation", "paper's", "pu"),
+    Column("n", "n", value=lambda line: line.statistics["rows"] - line.statistics["failures"]),
+    _statistic("failures"),
+    _verdict("frequency", "freq_violation_hz"),
+    _verdict("ramp", "ramp_violation"),
 )
 GAPS = (
     *_HEAD,
@@ -36,31 +126,30 @@ GAPS = (
     Column("failures", "failures"),
     Column("unpaired", "without DED"),
     *(Column(f"gap_percent_{part}", heading) for part, heading in _SPREAD),
-    Column("cost_ratio", "ratio of summed costs", ".6f"),
+    Column("cost_ratio", "ratio of summed costs", form=".6f"),
 )
 RATES = (
     *_HEAD,
     Column("rows", "rows"),
-    Column("success_rate", "success (claimed)", ".1%"),
-    Column("correct_rate", "feasible (verified)", ".1%"),
-    Column("strict_rate", "strictly feasible (verified)", ".1%"),
+    Column("success_rate", "success (claimed)", form=".1%"),
+    Column("correct_rate", "feasible (verified)", form=".1%"),
+    Column("strict_rate", "strictly feasible (verified)", form=".1%"),
 )
 COVERAGE = (
     *RATES,
     Column("failures", "failures"),
-    Column("gap_percent_mean", "gap mean (%)"),
-    Column("gap_percent_max", "gap max (%)"),
-    Column("freq_violation_hz_mean", "frequency mean (Hz)"),
-    Column("freq_violation_hz_max", "frequency max (Hz)"),
+    Column("gap_percent_mean", "gap mean", "%"),
+    Column("gap_percent_max", "gap max", "%"),
+    *_FREQUENCY,
 )
 VIOLATIONS = (
     *_HEAD,
-    *(Column(f"freq_violation_hz_{part}", f"frequency {heading} (Hz)") for part, heading in _SPREAD),
-    Column("ramp_violation_mean", "ramp mean (pu)"),
+    *(Column(f"freq_violation_hz_{part}", f"frequency {heading}", "Hz") for part, heading in _SPREAD),
+    Column("ramp_violation_mean", "ramp mean", "pu"),
     Column("ramp_violation_max", "ramp max"),
-    Column("bound_violation_mean", "bounds mean (pu)"),
+    Column("bound_violation_mean", "bounds mean", "pu"),
     Column("bound_violation_max", "bounds max"),
-    Column("initial_violation_mean", "initial mean (pu)"),
+    Column("initial_violation_mean", "initial mean", "pu"),
     Column("initial_violation_max", "initial max"),
 )
 CLAIMS = (
@@ -102,11 +191,11 @@ WORST = (
     *_HEAD,
     Column("worst_by", "by"),
     Column("instance", "instance"),
-    Column("gap_percent", "gap (%)"),
-    Column("freq_violation_hz", "frequency (Hz)"),
-    Column("ramp_violation", "ramp (pu)"),
-    Column("bound_violation", "bounds (pu)"),
-    Column("initial_violation", "initial (pu)"),
+    Column("gap_percent", "gap", "%"),
+    Column("freq_violation_hz", "frequency", "Hz"),
+    Column("ramp_violation", "ramp", "pu"),
+    Column("bound_violation", "bounds", "pu"),
+    Column("initial_violation", "initial", "pu"),
     Column("excess", "× tolerance"),
 )
 STARTS = (
@@ -114,8 +203,8 @@ STARTS = (
     Column("start", "starting point"),
     Column("n", "n"),
     Column("same", "the same optimum"),
-    Column("lowest_percent", "lowest change (%)"),
-    Column("highest_percent", "highest change (%)"),
+    Column("lowest_percent", "lowest change", "%"),
+    Column("highest_percent", "highest change", "%"),
     Column("iterations", "iterations, median"),
     Column("iterations_cold", "of the cold start"),
 )
@@ -125,7 +214,7 @@ TRAINING = (
     Column("epochs", "epochs"),
     Column("instances", "instances"),
     Column("held_out", "held out"),
-    Column("held_out_loss", "held-out loss", ".6g"),
+    Column("held_out_loss", "held-out loss", form=".6g"),
     Column("parameters", "parameters"),
     Column("model", "Koopman model"),
     Column("seed", "seed"),
@@ -139,18 +228,16 @@ MODELS = (
     Column("model", "Koopman model"),
     Column("n", "n"),
     Column("failures", "failures"),
-    *(Column(f"gap_percent_{part}", f"gap {heading} (%)") for part, heading in _SPREAD),
-    Column("freq_violation_hz_mean", "frequency mean (Hz)"),
-    Column("freq_violation_hz_max", "frequency max (Hz)"),
+    *(Column(f"gap_percent_{part}", f"gap {heading}", "%") for part, heading in _SPREAD),
+    *_FREQUENCY,
 )
 ABLATION = (
     Column("regime", "Regime"),
     Column("change", "what differs"),
     Column("n", "n"),
-    *(Column(f"gap_percent_{part}", f"gap {heading} (%)") for part, heading in _SPREAD if part != "median"),
-    Column("freq_violation_hz_mean", "frequency mean (Hz)"),
-    Column("freq_violation_hz_max", "frequency max (Hz)"),
-    Column("seconds", "training (s)"),
+    *(Column(f"gap_percent_{part}", f"gap {heading}", "%") for part, heading in _SPREAD if part != "median"),
+    *_FREQUENCY,
+    Column("seconds", "training", "s"),
     Column("epochs", "epochs"),
     Column("steps", "steps"),
     Column("instances", "instances"),
@@ -162,34 +249,15 @@ CERTIFICATE = (
     Column("successes", "successes"),
     Column("meets_limits", "meet every limit"),
     Column("near_reference", "within the gap"),
-    Column("clopper_pearson", "Clopper–Pearson", ".2%"),
-    Column("hoeffding", "Hoeffding", ".2%"),
-    Column("tolerance_hz", "tolerance (Hz)"),
-    Column("tolerance_pu", "tolerance (pu)"),
-    Column("gap_percent", "gap (%)"),
+    Column("clopper_pearson", "Clopper–Pearson", form=".2%"),
+    Column("hoeffding", "Hoeffding", form=".2%"),
+    Column("tolerance_hz", "tolerance", "Hz"),
+    Column("tolerance_pu", "tolerance", "pu"),
+    Column("gap_percent", "gap", "%"),
     Column("reference", "gap over"),
     Column("delta", "δ"),
     Column("seed", "master seed"),
     Column("artifacts", "case, policy and models"),
     Column("host", "host"),
     Column("date", "date"),
-)
-
-EXPLANATION = (
-    "**Objective and violations are re-simulated**: every schedule is integrated on the true swing "
-    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_DED − 1) over "
-    "the `n` instances where both have a score; violations are means of each instance's maximum over time "
-    "and generators.",
-    "**Failures** are rows without a schedule or a score. They enter no mean, and a method with failures is "
-    "never ahead of the paper.",
-    "**Ahead of paper** compares our number with the paper's: yes if below, equal if the same. The paper's "
-    "times are from another machine, and its instances are other draws from the same ranges.",
-    "**DED's optima are local**: the problem is not convex, so a method may come out below zero; DED also "
-    "breaks the tight frequency bound slightly, since backward Euler is not exact.",
-    "**Success** is what a method claims, **feasible** what the scorer found: frequency within 1e-4 Hz, "
-    "power limits within 1e-6 pu (strictly: 1e-6 Hz and 1e-8 pu).",
-    "**The ratio of summed costs** is ΣJ / ΣJ_DED over the same `n` instances: dear instances weigh more in "
-    "it than in the mean of the gaps.",
-    "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
-    "taken while several workers shared the machine and stand in the details only.",
 )

@@ -7,7 +7,8 @@ import math
 from collections.abc import Sequence
 
 from ded_bench.evaluate.compare import Change, Comparison, name_of
-from ded_bench.report.render import Column, to_markdown
+from ded_bench.report.columns import Column
+from ded_bench.report.render import to_markdown
 
 #: Rows that a section of the printed comparison names; the rest are counted.
 SHOWN = 10

@@ -6,12 +6,32 @@ from pathlib import Path
 
 import pandas as pd
 
+from ded_bench.evaluate.summary import REFERENCE
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import load_manifest, load_split
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5
+#: How the tables are to be read.
+EXPLANATION = (
+    "**Objective and violations are re-simulated**: every schedule is integrated on the true swing "
+    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_DED − 1) over "
+    "the `n` instances where both have a score; violations are means of each instance's maximum over time "
+    "and generators.",
+    "**Failures** are rows without a schedule or a score. They enter no mean, and a method with failures is "
+    "never ahead of the paper.",
+    "**Against the paper**: ahead if our number is lower than the paper's, behind if it is higher. The "
+    "paper's times are from another machine, and its instances are other draws from the same ranges.",
+    "**DED's optima are local**: the problem is not convex, so a method may come out below zero; DED also "
+    "breaks the tight frequency bound slightly, since backward Euler is not exact.",
+    "**Success** is what a method claims, **feasible** what the scorer found: frequency within 1e-4 Hz, "
+    "power limits within 1e-6 pu (strictly: 1e-6 Hz and 1e-8 pu).",
+    "**The ratio of summed costs** is ΣJ / ΣJ_DED over the same `n` instances: costly instances weigh more "
+    "in it than in the mean of the gaps.",
+    "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
+    "taken while several workers shared the machine and stand in the details only.",
+)
 
 
 def data_notes(
@@ -34,7 +54,8 @@ def data_notes(
         manifest, n_test = None, 0
     if not len(everything):
         notes.append(
-            f"No rows yet: `ded-bench solve --case {case.id} --method ded --regime NO,TO` makes some."
+            f"No rows yet: `ded-bench solve --case {case.id} --method {REFERENCE[0]} "
+            f"--regime {','.join(case.regimes)}` makes some."
         )
     if len(versions) > 1:
         notes.append(

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.report.render import Column, to_html, to_markdown
+from ded_bench.report.columns import Column
+from ded_bench.report.render import to_html, to_markdown
 
 
 @dataclass(frozen=True)

@@ -1,153 +1,150 @@
-"""The paper's Tables V and VI, with the paper's numbers beside ours."""
+"""A paper's numbers beside ours: `paper.json` in a case's folder, and the lines of its Tables V and VI."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
+from pydantic import Field
 
-from ded_bench.evaluate.summary import GROUP, HEAD, REFERENCE, groups, table, title
-from ded_bench.problem.case import Case
+from ded_bench.evaluate.summary import GROUP, REFERENCE, gaps, groups, statistics, title
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record
+from ded_bench.problem.case import Case, Name, NonNegative, Number
 
-
-class PaperRow(NamedTuple):
-    """One method of the paper's Tables V and VI; None where the paper says NA."""
-
-    increase_percent: float | None
-    solve_s: float
-    freq_violation_hz: float
-    ramp_violation: float
+DEFAULT = "default"
 
 
-#: Fingerprint of the paper's grid, limits and sampling ranges: its numbers are about no other case.
-PAPER_CASE = "a0fa08e05e5d"
-#: The numbers of the paper's Tables V (Average Solution Time and Change in Objective) and VI (Average
-#: maximum constraint violation over Test Problems), by (regime, method).
-PAPER: dict[tuple[str, str], PaperRow] = {
-    ("NO", "DED"): PaperRow(None, 32.34, 0.0, 1.84e-9),
-    ("NO", "DED-KO"): PaperRow(0.094, 17.34, 0.0, 2.0e-9),
-    ("NO", "DED-DPC"): PaperRow(1.05, 6.8e-4, 0.0, 1.11e-4),
-    ("TO", "DED"): PaperRow(None, 32.38, 7.5e-5, 1.9e-9),
-    ("TO", "DED-KO"): PaperRow(0.3, 18.8, 0.0013, 1.9e-9),
-    ("TO", "DED-DPC"): PaperRow(5.2, 6.8e-4, 0.0011, 4.2e-5),
-}
-#: Which of our methods answers to which row of the paper, first one present.
-COUNTERPARTS = {"DED": ("ded",), "DED-KO": ("ded-ko",), "DED-DPC": ("ded-dpc", "ded-dpc-paper")}
-#: Rows that Tables V and VI show even before anything was run.
-EXPECTED = ("ded", "ded-ko", "ded-dpc-paper")
+class PaperRow(Record):
+    """What a paper tells of one method in one regime; an increase of None is its NA."""
 
-TABLE_V_COLUMNS = [
-    *HEAD,
-    *("increase_percent", "paper_increase_percent", "solve_s", "paper_solve_s"),
-    *("n", "failures", "ahead_increase", "ahead_time"),
-]
-TABLE_VI_COLUMNS = [
-    *HEAD,
-    *("freq_violation_hz", "paper_freq_violation_hz", "ramp_violation", "paper_ramp_violation"),
-    *("n", "failures", "ahead_frequency", "ahead_ramp"),
-]
+    increase_percent: Number | None
+    solve_s: NonNegative
+    freq_violation_hz: NonNegative
+    ramp_violation: NonNegative
 
 
-def paper_numbers(case: Case) -> Mapping[tuple[str, str], PaperRow]:
-    """The paper's numbers if they are about this case, else none."""
-    return PAPER if case.fingerprint == PAPER_CASE else {}
+class Paper(Record):
+    """The numbers of a paper about one case.
 
-
-def table_v(
-    overview: pd.DataFrame, timing: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
-) -> pd.DataFrame:
-    """The paper's Table V with the paper's numbers beside ours, from a summary of the rows.
-
-    The increase is the mean signed gap over `n` instances; it is not available for DED itself. The
-    time is the median of `solve_s` in the timing table (see `timing.latest_host`), empty without one.
+    Attributes:
+        case_fingerprint: of the case that the numbers are about.
+        methods: by the paper's name of a method, in the order of its tables: ours that answer to it.
+        regimes: rows by regime and the paper's name of the method.
     """
-    rows = []
-    for row, theirs in _paper_rows(overview, paper):
-        increase = row.get("gap_percent_mean", np.nan)
-        if (row["method"], row["settings"]) == REFERENCE:
-            increase = np.nan
-        timed = timing[(timing[GROUP] == [row[name] for name in GROUP]).all(axis=1)]
-        seconds = float(timed["solve_s"].iloc[-1]) if len(timed) else np.nan
-        failures = row["failures"]
-        rows.append(
-            {name: row[name] for name in (*GROUP, "title")}
-            | {
-                "increase_percent": increase,
-                "paper_increase_percent": theirs.increase_percent if theirs else None,
-                "solve_s": seconds,
-                "paper_solve_s": theirs.solve_s if theirs else None,
-                "n": row["n"],
-                "failures": failures,
-                "ahead_increase": _ahead(increase, theirs and theirs.increase_percent, failures),
-                "ahead_time": _ahead(seconds, theirs and theirs.solve_s, int(timed["failures"].sum())),
-            }
+
+    schema_: Literal["ded-bench/paper/1"] = Field(alias="schema")
+    source: str
+    case_fingerprint: str
+    methods: dict[str, tuple[Name, ...]]
+    regimes: dict[Name, dict[str, PaperRow]]
+
+    def rows(self) -> dict[tuple[str, str], PaperRow]:
+        """The paper's rows by regime and our method, in the paper's order."""
+        return {
+            (regime, ours): rows[name]
+            for regime, rows in self.regimes.items()
+            for name, methods in self.methods.items()
+            for ours in methods
+            if name in rows
+        }
+
+
+def read_paper(problems: Path, case: Case) -> Paper | None:
+    """The paper's numbers that lie beside a case's instances; None if there are none.
+
+    Raises:
+        InputError: the file is wrong, or names a regime that the case or a method that the file lacks.
+    """
+    path = problems / "paper.json"
+    if not path.is_file():
+        return None
+    paper = read_record(Paper, path)
+    for regime, rows in paper.regimes.items():
+        if regime not in case.regimes:
+            raise InputError(path, f"regimes.{regime}", f"is no regime of case {case.id}")
+        if unknown := sorted(rows.keys() - paper.methods.keys()):
+            raise InputError(path, f"regimes.{regime}.{unknown[0]}", "is not among the methods")
+    return paper
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """What a line of Tables V and VI is made from.
+
+    Attributes:
+        rows: results with their gaps (see `summary.gaps`); none if nobody ran the method yet.
+        statistics: see `summary.statistics`.
+        timing: median and quartiles of the times alone on a machine, by column; empty if not timed.
+        paper: the paper's numbers, if the method answers to one of its rows.
+    """
+
+    regime: str
+    method: str
+    settings: str
+    rows: pd.DataFrame
+    statistics: Mapping[str, Any]
+    timing: Mapping[str, Any]
+    paper: PaperRow | None
+
+    @property
+    def title(self) -> str:
+        """The method as tables name it."""
+        return title(self.method, self.settings)
+
+    @property
+    def increase_percent(self) -> float:
+        """Mean signed gap to the reference method; not available for that method itself."""
+        if (self.method, self.settings) == REFERENCE:
+            return math.nan
+        return float(self.statistics["gap_percent_mean"])
+
+    def papers(self, name: str) -> float:
+        """A number of the paper; missing if it tells none."""
+        value = getattr(self.paper, name, None)
+        return math.nan if value is None else float(value)
+
+    def verdict(self, ours: float, name: str, failures: int) -> str:
+        """How a number of ours stands against the paper's: ahead if it is lower.
+
+        A mean over the instances that did not fail is never ahead. Empty where either number is missing.
+        """
+        theirs = self.papers(name)
+        if math.isnan(ours) or math.isnan(theirs):
+            return ""
+        if failures or ours > theirs:
+            return "behind"
+        return "ahead" if ours < theirs else "equal"
+
+
+def paper_lines(frame: pd.DataFrame, timing: pd.DataFrame, paper: Paper | None) -> list[Line]:
+    """The lines of Tables V and VI: in each regime the paper's rows first, then all others.
+
+    Args:
+        frame: rows of the results table.
+        timing: one row per (regime, method, settings), of one host.
+        paper: its rows are there even if nobody ran the method yet.
+    """
+    theirs = paper.rows() if paper else {}
+    parts = {(regime, method, settings): rows for regime, method, settings, rows in groups(gaps(frame))}
+    keys = [(regime, method, DEFAULT) for regime, method in theirs]
+    keys += [key for key in parts if key not in keys]
+    timings = {
+        tuple(row[name] for name in GROUP): {str(name): value for name, value in row.items()}
+        for row in timing.to_dict("records")
+    }
+    none = gaps(frame[:0])
+    return [
+        Line(
+            *key,
+            rows=parts.get(key, none),
+            statistics=statistics(parts.get(key, none)),
+            timing=timings.get(key, {}),
+            paper=theirs.get(key[:2]) if key[2] == DEFAULT else None,
         )
-    return table(rows, TABLE_V_COLUMNS)
-
-
-def table_vi(overview: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]) -> pd.DataFrame:
-    """The paper's Table VI from a summary: mean of each instance's largest violation."""
-    rows = []
-    for row, theirs in _paper_rows(overview, paper):
-        freq = row.get("freq_violation_hz_mean", np.nan)
-        ramp = row.get("ramp_violation_mean", np.nan)
-        failures = row["failures"]
-        rows.append(
-            {name: row[name] for name in (*GROUP, "title")}
-            | {
-                "freq_violation_hz": freq,
-                "paper_freq_violation_hz": theirs.freq_violation_hz if theirs else None,
-                "ramp_violation": ramp,
-                "paper_ramp_violation": theirs.ramp_violation if theirs else None,
-                "n": row["rows"] - failures,
-                "failures": failures,
-                "ahead_frequency": _ahead(freq, theirs and theirs.freq_violation_hz, failures),
-                "ahead_ramp": _ahead(ramp, theirs and theirs.ramp_violation, failures),
-            }
-        )
-    return table(rows, TABLE_VI_COLUMNS)
-
-
-def _paper_rows(
-    overview: pd.DataFrame, paper: Mapping[tuple[str, str], PaperRow]
-) -> Iterator[tuple[dict[str, Any], PaperRow | None]]:
-    """Rows of the summary and of the paper side by side; rows that nobody ran yet have n = 0."""
-    rows = {tuple(str(row[name]) for name in GROUP): row for row in overview.to_dict("records")}
-    order = [(regime, method, settings) for regime, method, settings, _ in groups(overview)]
-    missing = [
-        (regime, method, "default")
-        for regime in dict.fromkeys(regime for regime, _ in paper)
-        for method in EXPECTED
-        if (regime, method, "default") not in rows
+        for key in sorted(keys, key=lambda key: key[0])
     ]
-    everything = pd.DataFrame([*order, *missing], columns=GROUP)
-    for regime, method, settings, _ in groups(everything):
-        row: dict[str, Any] = dict(zip(GROUP, (regime, method, settings), strict=True))
-        row |= {"title": title(method, settings), "rows": 0, "n": 0, "failures": 0}
-        row |= {str(name): value for name, value in rows.get((regime, method, settings), {}).items()}
-        yield row, _theirs(regime, method, settings, rows, paper)
-
-
-def _theirs(
-    regime: str,
-    method: str,
-    settings: str,
-    rows: Mapping[tuple[str, ...], object],
-    paper: Mapping[tuple[str, str], PaperRow],
-) -> PaperRow | None:
-    for name, ours in COUNTERPARTS.items():
-        present = [m for m in ours if (regime, m, "default") in rows] or list(ours[-1:])
-        if settings == "default" and method == present[0]:
-            return paper.get((regime, name))
-    return None
-
-
-def _ahead(ours: object, theirs: float | None, failures: object) -> str:
-    """Whether a number is below the paper's; a mean over survivors never is."""
-    if theirs is None or not isinstance(ours, float) or np.isnan(ours):
-        return ""
-    if failures:
-        return "no"
-    return "yes" if ours < theirs else "equal" if ours == theirs else "no"

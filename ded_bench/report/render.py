@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import pandas as pd
+
+from ded_bench.report.columns import Column
 
 #: Cells with more characters may be broken into lines.
 LONG, WORDS = 32, ' class="words"'
 #: The column that stays in sight when a narrow screen is scrolled sideways.
 LABEL = "title"
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column of a printed table: which of the frame's, under which heading, in which format."""
-
-    name: str
-    heading: str
-    form: str = ".3g"
-
-    def cell(self, value: object) -> str:
-        """The printed value; a missing number is a dash."""
-        if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA:
-            return "–"
-        if isinstance(value, float):
-            text = format(value, self.form)
-            return text.replace("%", " %")
-        return str(value)
 
 
 def rows_of(frame: pd.DataFrame, columns: Sequence[Column]) -> list[list[str]]:

@@ -23,9 +23,11 @@ from ded_bench.evaluate.summary import (
     coverage,
     groups,
     judged_rows,
+    scoring_rows,
     summary,
     table_times,
     title,
+    validation_rows,
     worst,
 )
 from ded_bench.evaluate.timing import latest_host, read_timing, timing_frame
@@ -37,7 +39,6 @@ from ded_bench.report.columns import (
     CERTIFICATE,
     CLAIMS,
     COVERAGE,
-    EXPLANATION,
     GAPS,
     LOADED_TIMES,
     MODELS,
@@ -49,10 +50,12 @@ from ded_bench.report.columns import (
     TRAINING,
     VIOLATIONS,
     WORST,
+    Column,
+    tabulate,
 )
 from ded_bench.report.figures.plan import first_settings
 from ded_bench.report.gallery import Gallery, draw
-from ded_bench.report.notes import data_notes, named
+from ded_bench.report.notes import EXPLANATION, data_notes, named
 from ded_bench.report.page import (
     Block,
     Heading,
@@ -63,8 +66,8 @@ from ded_bench.report.page import (
     render_html,
     render_markdown,
 )
-from ded_bench.report.paper import paper_numbers, table_v, table_vi
-from ded_bench.report.render import Column, to_latex, to_markdown
+from ded_bench.report.paper import Line, paper_lines, read_paper
+from ded_bench.report.render import to_latex, to_markdown
 from ded_bench.run.environment import environment, now
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Results
@@ -92,11 +95,16 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
     frame = judged_rows(everything)
     timings = timing_frame(read_timing(folder / "timing.csv"))
     timing = latest_host(timings[timings["case"] == case.id])
-    frames = _frames(case, folder, frame, everything, timing)
+    paper = read_paper(problems, case)
+    ours = paper if paper and paper.case_fingerprint == case.fingerprint else None
+    lines = paper_lines(main_rows(frame), timing, ours)
+    frames = _frames(folder, frame, everything, lines)
     gallery = draw(case, results, frame, timing, problems, pool)
     rows_from = rows_caption(frame, everything)
     files = _write_tables(folder, frames, rows_from, timing)
     notes = data_notes(frame, everything, frames["summary"], timings, timing, case, problems)
+    if paper and not ours:
+        notes.append("The paper's numbers are about another version of the case and left out.")
     blocks = [
         *_opening(case, everything, frames["summary"], [*notes, *gallery.notes]),
         *_results(frames, rows_from, timing, gallery),
@@ -110,22 +118,21 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
 
 
 def _frames(
-    case: Case, folder: Path, frame: pd.DataFrame, everything: pd.DataFrame, timing: pd.DataFrame
+    folder: Path, frame: pd.DataFrame, everything: pd.DataFrame, lines: Sequence[Line]
 ) -> dict[str, pd.DataFrame]:
     """All tables by the name of their file."""
-    paper = paper_numbers(case)
-    overview, overall = summary(frame), summary(everything)
+    overview, overall = summary(frame), summary(scoring_rows(everything))
     frames = {
-        "table_v": table_v(main_rows(overview), timing, paper),
-        "table_vi": table_vi(main_rows(overview), paper),
+        "table_v": tabulate(TABLE_V, lines),
+        "table_vi": tabulate(TABLE_VI, lines),
         "summary": overview,
         "claims": claims(frame),
         "times_under_load": table_times(frame),
         "worst": worst(frame),
         "training": training_table(folder, [c.name for c in TRAINING[1:-1]]),
         "models": model_table(overview),
-        "ablation": ablation_table(overall, folder),
-        "starts": starts_table(everything),
+        "ablation": ablation_table(summary(validation_rows(everything)), folder),
+        "starts": starts_table(scoring_rows(everything)),
     }
     return frames | {"coverage": coverage(overall, overview)}
 

@@ -1,4 +1,4 @@
-"""Gaps, rates, profiles and the paper's tables, on small tables with answers worked out by hand."""
+"""Gaps, rates and profiles, on small tables with answers worked out by hand."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from ded_bench.evaluate.summary import (
     groups,
     judged_rows,
     performance_profile,
+    scoring_rows,
     shifted_geometric_mean,
     summary,
     table_times,
     title,
     tradeoff,
+    validation_rows,
     worst,
 )
-from ded_bench.evaluate.timing import TimingRow, timing_frame
 from ded_bench.methods.registry import METHODS
-from ded_bench.problem.case import Case
-from ded_bench.report.paper import EXPECTED, PAPER, paper_numbers, table_v, table_vi
 from ded_bench.run.results import Results, Row
 
-NO_TIMES = timing_frame([])
+NO_TIMES = pd.DataFrame([], columns=["regime", "method", "settings", "solve_s", "failures"])
 
 
 def row(instance: str, method: str, objective: float | None = None, **fields: object) -> Row:
@@ -182,6 +181,14 @@ def test_only_test_rows_count_if_there_are_any() -> None:
     assert len(judged_rows(others)) == 2
 
 
+def test_validation_rows_are_never_judged() -> None:
+    rows = [row("v", "ded", 1.0, split="validation"), row("b", "ded", 2.0, split="train")]
+    assert judged_rows(frame_of(*rows))["instance"].to_list() == ["b"]
+    assert judged_rows(frame_of(rows[0])).empty
+    assert validation_rows(frame_of(*rows))["instance"].to_list() == ["v"]
+    assert scoring_rows(frame_of(*rows))["instance"].to_list() == ["b"]
+
+
 def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
     everything = frame_of(
         row("a", "ded", 1.0),
@@ -257,86 +264,14 @@ def test_table_times_are_quartiles_and_say_how_many_workers() -> None:
     assert math.isnan(times["build_s"])
 
 
-def timed(method: str, regime: str, seconds: float) -> TimingRow:
-    return TimingRow(
-        regime, method, "default", 2, 3, 0, solve_s=seconds, host="here", date="2026-01-01T00:00:00Z"
-    )
-
-
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
-    points = tradeoff(table, timing_frame([timed("ded-ko", "TO", 0.25)])).set_index("method")
+    points = tradeoff(
+        table, pd.DataFrame([["TO", "ded-ko", "default", 0.25, 0]], columns=NO_TIMES.columns)
+    ).set_index("method")
     assert points.loc["ded-ko", "seconds"] == 0.25
     assert points.loc["ded-ko", "alone"]
     assert points.loc["ded", "seconds"] == 1.0
     assert not points.loc["ded", "alone"]
-
-
-def test_table_v_puts_the_papers_numbers_beside_ours(table: pd.DataFrame) -> None:
-    times = timing_frame([timed("ded", "TO", 5.0), timed("ded-ko", "TO", 30.0)])
-    ours = table_v(summary(table), times, PAPER).set_index(["regime", "method"])
-    ded, ko = ours.loc[("TO", "ded")], ours.loc[("TO", "ded-ko")]
-    assert math.isnan(ded["increase_percent"])  # NA, as in the paper
-    assert (ded["solve_s"], ded["paper_solve_s"], ded["ahead_time"]) == (5.0, 32.38, "yes")
-    assert ko["increase_percent"] == pytest.approx(4 / 3)
-    assert (ko["paper_increase_percent"], ko["n"], ko["failures"]) == (0.3, 3, 1)
-    assert (ko["ahead_increase"], ko["ahead_time"]) == ("no", "no")
-
-
-def test_a_method_with_failures_is_never_ahead() -> None:
-    rows = [row("a", "ded", 100.0), row("b", "ded", 100.0), row("a", "ded-ko", 100.1)]
-    assert table_v(summary(frame_of(*rows)), NO_TIMES, PAPER).set_index(["regime", "method"])[
-        "ahead_increase"
-    ]["TO", "ded-ko"] == ("yes")
-    with_failure = table_v(summary(frame_of(*rows, row("b", "ded-ko"))), NO_TIMES, PAPER)
-    assert with_failure.set_index(["regime", "method"])["ahead_increase"]["TO", "ded-ko"] == "no"
-
-
-def test_what_was_not_run_is_an_empty_row_beside_the_papers() -> None:
-    for frame in (frame_of(), frame_of(row("a", "ded", 1.0))):
-        for made in (table_v(summary(frame), NO_TIMES, PAPER), table_vi(summary(frame), PAPER)):
-            rows = set(zip(made["regime"], made["method"], strict=True))
-            assert rows == {(regime, name) for regime in ("NO", "TO") for name in EXPECTED}
-            missing = made[(made["method"] == "ded-ko") & (made["regime"] == "NO")].iloc[0]
-            assert (missing["n"], missing["failures"]) == (0, 0)
-    five = table_v(summary(frame_of()), NO_TIMES, PAPER).set_index(["regime", "method"])
-    assert five.loc[("NO", "ded-dpc-paper"), "paper_increase_percent"] == 1.05
-
-
-def test_the_papers_policy_numbers_stand_beside_our_policy_if_there_is_one() -> None:
-    rows = [row("a", "ded", 1.0), row("a", "ded-dpc-paper", 2.0)]
-    alone = table_v(summary(frame_of(*rows)), NO_TIMES, PAPER).set_index(["regime", "method"])[
-        "paper_increase_percent"
-    ]
-    assert alone["TO", "ded-dpc-paper"] == 5.2
-    both = table_v(summary(frame_of(*rows, row("a", "ded-dpc", 1.5))), NO_TIMES, PAPER)
-    beside = both.set_index(["regime", "method"])["paper_increase_percent"]
-    assert beside["TO", "ded-dpc"] == 5.2
-    assert math.isnan(beside["TO", "ded-dpc-paper"])
-
-
-def test_other_settings_and_other_methods_have_no_counterpart_in_the_paper() -> None:
-    frame = frame_of(row("a", "ded", 1.0), row("a", "ded", 1.0, settings="fast"), row("a", "mine", 1.0))
-    made = table_vi(summary(frame), PAPER)
-    mine = made[(made["method"] == "mine") | (made["settings"] == "fast")]
-    assert len(mine) == 2
-    assert mine["paper_ramp_violation"].isna().all()
-    assert (mine["ahead_ramp"] == "").all()
-
-
-def test_table_vi_means_the_maxima_and_knows_equal(table: pd.DataFrame) -> None:
-    made = table_vi(summary(table), PAPER).set_index(["regime", "method"])
-    ko = made.loc[("TO", "ded-ko")]
-    assert ko["freq_violation_hz"] == pytest.approx((2e-4 + 1e-5) / 4)
-    assert (ko["n"], ko["failures"], ko["ahead_frequency"]) == (4, 1, "no")
-    same = frame_of(row("a", "ded", 1.0, regime="NO", ramp_violation=1.84e-9))
-    ded = table_vi(summary(same), PAPER).set_index(["regime", "method"]).loc[("NO", "ded")]
-    assert (ded["ahead_frequency"], ded["ahead_ramp"]) == ("equal", "equal")
-
-
-def test_the_papers_numbers_belong_to_its_case_only(ninebus: Case, threebus: Case) -> None:
-    assert paper_numbers(ninebus) == PAPER
-    assert paper_numbers(threebus) == {}
-    assert len(table_v(summary(frame_of()), NO_TIMES, {})) == 0
 
 
 def test_an_empty_table_has_its_columns() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ded_bench.files.strict import write_atomically, write_record
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_split, write_benchmark
 from ded_bench.report import gallery
@@ -33,6 +34,7 @@ def problems(ninebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
         split.model_copy(update={"test": tuple(names[:TEST]), "train": tuple(names[TEST:])}),
         folder / "split.json",
     )
+    shutil.copy(SHIPPED_CASES / ninebus.id / "paper.json", folder)
     return folder
 
 

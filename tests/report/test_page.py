@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from ded_bench.report.columns import Column
 from ded_bench.report.page import Heading, Items, Picture, Table, Text, Warnings, render_html, render_markdown
-from ded_bench.report.render import Column, to_html, to_latex, to_markdown
+from ded_bench.report.render import to_html, to_latex, to_markdown
 from tests.reading import Page
 
 FRAME = pd.DataFrame(

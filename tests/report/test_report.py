@@ -160,7 +160,7 @@ def test_printed_numbers_are_the_csvs(report, finished: Path, name: str, columns
             "| Regime" if text.startswith("|") else {"table_v": "**Table V:", "table_vi": "**Table VI:"}[name]
         )
         printed = cells(text, heading)
-        assert len(printed) == len(table) == 6
+        assert len(printed) == len(table) == 8
         for row, (_, numbers) in zip(printed, table.iterrows(), strict=True):
             for cell, column in zip(row, columns, strict=True):
                 value = numbers[column.name]

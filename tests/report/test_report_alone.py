@@ -23,7 +23,7 @@ def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
     assert "run `ded-bench bench`" in text
     assert "`ded-bench train-dpc` trains one" in text
     made = pd.read_csv(tmp_path / "empty" / "tables" / "table_v.csv")
-    assert made["paper_solve_s"].tolist() == [32.34, 17.34, 6.8e-4, 32.38, 18.8, 6.8e-4]
+    assert made["paper_solve_s"].tolist() == [32.34, 17.34, *[6.8e-4] * 2, 32.38, 18.8, *[6.8e-4] * 2]
     assert (made["n"] == 0).all()
     assert all(path.is_file() for path in files)
 

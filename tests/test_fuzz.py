@@ -33,7 +33,8 @@ from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc_paper import paper_policy
-from ded_bench.methods.dpc_paper.paper_loss import knot_times
+from ded_bench.methods.dpc_paper.paper_features import n_channels
+from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
 from ded_bench.methods.policy_file import Scope
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import Manifest, Split
@@ -98,10 +99,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     scope = Scope(case, "TO", instance.horizon_s)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        plain = paper_policy.PaperNetwork(paper_policy.n_channels(case), case.p_min, case.p_max)
-        response = Response.make(case, knot_times(instance.horizon_s, dpc_policy.N_KNOTS))
+        plain = PaperNetwork(n_channels(case), case.p_min, case.p_max)
+        response = Response.make(case, case.knot_times(instance.horizon_s))
         network = StagedNetwork(case, response, 2, 4, (1, 2))
-    paper_policy.Policy(case, "TO", 0.05, plain, {"seed": 0}).save(folder / "paper.safetensors")
+    paper_policy.Policy(scope, plain, {"seed": 0}).save(folder / "paper.safetensors")
     dpc_policy.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
     return folder
 

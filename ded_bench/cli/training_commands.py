@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import sys
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ded_bench.cli.arguments import (
     DEFAULT_CASE,
@@ -18,11 +21,9 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.surrogates import TRAINED, default_results, search_folders
+from ded_bench.methods.registry import trainable
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_commands(commands: Any) -> None:
@@ -37,9 +38,9 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_train_ko)
 
     p = command(commands, "train-dpc", "train a policy on the training instances")
-    p.add_argument("--method", default="ded-dpc", help="ded-dpc or ded-dpc-paper")
+    p.add_argument("--method", choices=trainable(), default="ded-dpc")
     p.add_argument("--settings", default="default", help="slug of the training settings")
-    p.add_argument("--regime", required=True, metavar="R", help="NO or TO")
+    p.add_argument("--regime", required=True, metavar="R", help="one of the case's")
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
     p.add_argument("--seed", type=natural, default=0)
@@ -71,6 +72,7 @@ def _train_ko(a: argparse.Namespace) -> int:
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0
+    _check_writable(out)
     model = (identify if a.kind == "koopman" else identify_paper)(case, a.seed)
     model.save(out)
     table = rollout_table(case, [linear_model(case), model], held_out(case, a.seed))
@@ -81,16 +83,15 @@ def _train_ko(a: argparse.Namespace) -> int:
 
 
 def _train_dpc(a: argparse.Namespace) -> int:
-    import torch
-
     from ded_bench.koopman.surrogates import find_model
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
+    from ded_bench.methods.solution import Settings
+    from ded_bench.methods.training_record import LOSSES, TrainingOptions
 
     method = get_method(a.method)
-    train, choices = method.train, method.settings
-    if a.settings not in choices:
-        raise InputError("--settings", a.settings, f"unknown (known: {', '.join(choices)})")
+    setting: dict[str, Any] = dict(method.options(Settings(a.settings)))
+    setting |= {"epochs": a.epochs} if a.epochs else {}
     case = Case.load(a.case)
     case.check_regimes([a.regime])
     results = a.results or default_results(case)
@@ -100,17 +101,23 @@ def _train_dpc(a: argparse.Namespace) -> int:
         return 0
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
-    torch.set_num_threads(1)  # these networks gain nothing from more, and results then repeat anywhere
-    options: dict[str, Any] = dict(choices[a.settings])
-    options |= {"seed": a.seed, "seconds": a.seconds, "device": a.device, "resume": a.resume}
-    options |= {"epochs": a.epochs} if a.epochs else {}
-    policy = train(case, a.regime, instances, model, out, **options)
-    facts = policy.training
-    print(
-        f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s, "
-        f"held-out loss {facts['held_out_loss']:.6g}"
-    )
+    _check_writable(out)
+    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume)
+    facts = method.train(case, a.regime, instances, model, out, options, **setting).training
+    losses = [f", {name.replace('_', ' ')} {facts[name]:.6g}" for name in LOSSES if name in facts]
+    print(f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}")
     return 0
+
+
+def _check_writable(out: Path) -> None:
+    """Raise InputError unless a file can be made where the training will write; it may take hours."""
+    try:
+        if out.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out.parent).close()
+    except OSError as error:
+        raise InputError(out, "", f"cannot be written ({error.strerror})") from None
 
 
 def _rollouts(a: argparse.Namespace) -> int:

@@ -19,8 +19,9 @@ from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import Compiled, Outcome, compile_model, fix
+from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
+from ded_bench.solvers.outcome import Compiled, Outcome
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import simulate

@@ -19,8 +19,9 @@ from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import Compiled, compile_model, fix, reset
+from ded_bench.solvers.compile import compile_model, fix, reset
 from ded_bench.solvers.ipopt import LINEAR_OPTIONS
+from ded_bench.solvers.outcome import Compiled
 from ded_bench.truth.network import Network
 
 #: Solver and its options by settings slug; the default is the fastest of those tried.

@@ -26,7 +26,7 @@ from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import GrowingProgram
+from ded_bench.solvers.highs import GrowingProgram
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 

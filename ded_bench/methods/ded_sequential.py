@@ -18,9 +18,9 @@ import scipy.sparse as sp
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import solve_form
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.outcome import Outcome
+from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network, PowerFlowError
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,20 +95,6 @@ def load_weights(network: nn.Module, arrays: dict[str, np.ndarray], path: str | 
     import torch  # here only: who asks for a policy's name or header does without it
 
     network.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
-
-
-@contextlib.contextmanager
-def reading_checkpoint(path: Path) -> Iterator[None]:
-    """Whatever fails inside, from opening the file to filling the networks, is the checkpoint's fault.
-
-    Raises:
-        InputError: it is no checkpoint, or one of another training.
-    """
-    try:
-        yield
-    except Exception:  # of pickle, zipfile and torch alike
-        problem = "is no checkpoint of this training; remove it, or train without --resume"
-        raise InputError(path, "", problem) from None
 
 
 def weights_fingerprint(network: nn.Module) -> str:

@@ -2,61 +2,24 @@
 
 A method's module offers `prepare(case, regime, settings) -> (instance -> Solution)` and `SETTINGS`, a
 mapping from the slugs of its settings to keyword options. If it depends on a trained model or policy,
-it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is trained
-itself, its line here names the module whose `train` does it (see `Trainer`); `ded-bench train-dpc` finds
-it there.
+it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy
+to be trained, its line here names the module whose `train` does it (see `training_record`), and
+`ded-bench train-dpc` knows it.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.model import Koopman
 from ded_bench.methods import plugin
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
-
-
-class TrainedPolicy(Protocol):
-    """What a training returns, after it has written the policy's file."""
-
-    @property
-    def training(self) -> Mapping[str, Any]:
-        """Facts for the header: at least `epochs` (done) and `seconds` (spent)."""
-
-
-class Trainer(Protocol):
-    """`train` of a method's training module."""
-
-    def __call__(
-        self,
-        case: Case,
-        regime: str,
-        instances: Sequence[Instance],
-        model: Koopman,
-        out: Path,
-        *,
-        seed: int,
-        seconds: float | None,
-        device: str,
-        resume: bool,
-        **options: Any,
-    ) -> TrainedPolicy:
-        """Train on instances that share one time grid, and write `out` and its history.
-
-        Args:
-            seconds: end after so much training time, s; None: train for all epochs.
-            device: "cpu" or "cuda".
-            resume: go on from the checkpoint beside `out`, if there is one.
-            options: those of the method's setting, and perhaps `epochs`.
-        """
 
 
 @dataclass(frozen=True)
@@ -73,10 +36,22 @@ class Method:
         return plugin.load(self.module) if ":" in self.module else importlib.import_module(self.module)
 
     @property
-    def settings(self) -> Mapping[str, Any]:
-        """The settings this method knows, by slug."""
-        known: Mapping[str, Any] = self._loaded.SETTINGS
+    def settings(self) -> Mapping[str, Mapping[str, Any]]:
+        """The settings this method knows: options by slug."""
+        known: Mapping[str, Mapping[str, Any]] = self._loaded.SETTINGS
         return known
+
+    def options(self, settings: Settings) -> Mapping[str, Any]:
+        """The options that the settings' name stands for.
+
+        Raises:
+            InputError: this method has no such settings (names those it has).
+        """
+        known = self.settings
+        if settings.name not in known:
+            problem = f"unknown to method {self.name} (known: {', '.join(known)})"
+            raise InputError("--settings", settings.name, problem)
+        return known[settings.name]
 
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance after another.
@@ -84,7 +59,7 @@ class Method:
         Raises:
             InputError: unknown settings, or a model or policy that does not fit.
         """
-        self._check(settings)
+        self.options(settings)  # says what is wrong with them
         solver: Solver = self._loaded.prepare(case, regime, settings)
         return solver
 
@@ -94,7 +69,7 @@ class Method:
         Raises:
             InputError: unknown settings, or a model or policy that is missing or does not fit.
         """
-        self._check(settings)
+        self.options(settings)  # says what is wrong with them
         find = getattr(self._loaded, "artifacts", None)
         return tuple(find(case, regime, settings)) if find else ()
 
@@ -109,11 +84,6 @@ class Method:
             raise InputError("--method", self.name, f"is not trained (known: {', '.join(trainable())})")
         trainer: Trainer = importlib.import_module(self.trainer).train
         return trainer
-
-    def _check(self, settings: Settings) -> None:
-        if settings.name not in self.settings:
-            known = ", ".join(self.settings)
-            raise InputError("--settings", settings.name, f"unknown to method {self.name} (known: {known})")
 
 
 METHODS: dict[str, Method] = {

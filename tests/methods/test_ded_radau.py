@@ -27,7 +27,7 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import CasadiIpopt
+from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
 from ded_bench.truth.score import score
 from ded_bench.truth.simulate import simulate

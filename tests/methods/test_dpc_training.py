@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,18 @@ from ded_bench.methods.dpc.inputs import Inputs, sequence_groups
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import SETTINGS, DispatchPolicy
 from ded_bench.methods.dpc.training import train
+from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.problem.case import Case
 from tests.methods.test_dpc import some_instances, tensors
 
 
 def short_training(case: Case, out: Path, **options: object) -> DispatchPolicy:
     """A few epochs on few instances."""
-    defaults = {"seed": 3, "epochs": 6, "fresh": 300}
+    given = {"seed": 3, "epochs": 6, "fresh": 300} | options
+    names = {field.name for field in dataclasses.fields(TrainingOptions)} & given.keys()
+    common = TrainingOptions(**{name: given.pop(name) for name in names})
     regime = next(iter(case.regimes))
-    return train(case, regime, some_instances(case, 10), linear_model(case), out, **(defaults | options))
+    return train(case, regime, some_instances(case, 10), linear_model(case), out, common, **given)
 
 
 def history_of(case: Case, out: Path, **options: object) -> pd.Series:

@@ -148,64 +148,6 @@ def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) ->
 
 
 @compiled
-def power_flow(
-    wanted: Array, free: Indices, ends: Indices, coupling: Array, mismatch: float, steps: int, theta: Array
-) -> None:
-    """`truth.swing.Network.power_flow` of one instance after another.
-
-    Newton's method from θ = 0; where a power flow is stable, its Jacobian is positive definite.
-
-    Args:
-        wanted: injections at the buses whose angles are free, (batch, n_free), pu.
-        ends: the buses at the ends of each line, (n_line, 2); `coupling`: b_ij.
-        theta: receives angles, (batch, n_bus), rad; NaN where no stable solution was found.
-    """
-    n = len(free)
-    place = np.full(theta.shape[1], -1)
-    for k in range(n):
-        place[free[k]] = k
-    off, jacobian = np.empty(n), np.empty((n, n))
-    for b in range(len(theta)):
-        angle, solved = theta[b], False
-        angle[:] = 0.0
-        for _ in range(steps):
-            off[:], jacobian[:] = -wanted[b], 0.0
-            stable = True
-            for i in range(len(ends)):
-                across = angle[ends[i, 0]] - angle[ends[i, 1]]
-                flow, slope = coupling[i] * np.sin(across), coupling[i] * np.cos(across)
-                stable = stable and abs(across) < 0.5 * np.pi
-                first, second = place[ends[i, 0]], place[ends[i, 1]]
-                if first >= 0:
-                    off[first] += flow
-                    jacobian[first, first] += slope
-                if second >= 0:
-                    off[second] -= flow
-                    jacobian[second, second] += slope
-                if first >= 0 and second >= 0:
-                    jacobian[first, second] -= slope
-                    jacobian[second, first] -= slope
-            if not stable:
-                break
-            solved = np.abs(off).max() < mismatch
-            if solved:
-                break
-            for k in range(n):  # elimination, then substitution
-                for r in range(k + 1, n):
-                    factor = jacobian[r, k] / jacobian[k, k]
-                    off[r] -= factor * off[k]
-                    for c in range(k + 1, n):
-                        jacobian[r, c] -= factor * jacobian[k, c]
-            for k in range(n - 1, -1, -1):
-                for c in range(k + 1, n):
-                    off[k] -= jacobian[k, c] * off[c]
-                off[k] /= jacobian[k, k]
-                angle[free[k]] -= off[k]
-        if not solved:
-            angle[:] = np.nan
-
-
-@compiled
 def answer(
     p_gen: Array,
     constants: Array32,

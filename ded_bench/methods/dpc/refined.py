@@ -6,14 +6,12 @@ import dataclasses
 import time
 from typing import Any
 
-import numba
-import numpy as np
-
 from ded_bench.koopman.surrogates import find_model
 from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.refinement import STEPS, Refiner
+from ded_bench.methods.policy_solver import VERSION, warmed_up
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -36,7 +34,7 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return the refined policy as a method; condensing and factorising are done once, here."""
+    """Return the refined policy as a method; condensing and factorising are done once per time grid."""
     policy = dpc_policy.find_policy(case, regime, _plain(settings))
     model = find_model(case, settings.model, settings.search)
     steps: int = SETTINGS[settings.name]["steps"]
@@ -53,10 +51,9 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         schedule = Schedule(policy.knots, refiner(inputs, policy.powers(inputs), steps)[0])
         schedule.at(instance.grid)
         elapsed = time.perf_counter() - started
-        version = f"numba {numba.__version__}, numpy {np.__version__}"
-        return Solution(Status.POLICY, schedule, steps, solve_s=elapsed, solver_version=version)
+        return Solution(Status.POLICY, schedule, steps, solve_s=elapsed, solver_version=VERSION)
 
-    return solve
+    return warmed_up(solve, policy.scope)
 
 
 def _plain(settings: Settings) -> Settings:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import math
 import time
 from collections.abc import Sequence
@@ -12,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.inputs import Channels, Inputs
@@ -25,8 +22,9 @@ from ded_bench.methods.dpc.loss import Objective, coarse_free_response, coarse_s
 from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.policy import METHOD, DispatchPolicy
 from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc_paper.paper_loss import full_precision
-from ded_bench.methods.policy_file import Scope, reading_checkpoint
+from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
+from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
@@ -123,36 +121,31 @@ class Loss:
         return cost, (omega.abs() / self.omega_bound - (1.0 - margin)).relu()
 
 
-@full_precision
+@repeatable()
 def train(
     case: Case,
     regime: str,
     instances: Sequence[Instance],
     model: Koopman,
     out: Path,
+    options: TrainingOptions,
+    /,
     *,
-    seed: int = 0,
     epochs: int = EPOCHS,
-    seconds: float | None = None,
-    device: str = "cpu",
-    resume: bool = False,
     fresh: int = FRESH,
     **variant: Any,
 ) -> DispatchPolicy:
-    """Train a policy.
+    """Train a policy; see `training_record.Trainer`.
 
-    With fresh instances, those given choose the best weights and are never trained on. The loss
-    history is written beside the policy as `<name>.history.csv`, the state to resume from as
-    `<name>.checkpoint.pt`.
+    With fresh instances, those given choose the best weights and are never trained on.
 
     Args:
         instances: share one time grid and horizon.
-        seconds: training time after which to end, with the schedule of the learning rate fitted to it.
-        resume: go on from the checkpoint if there is one.
+        options: the schedule of the learning rate is fitted to its seconds, if given.
         fresh: how many instances to draw; 0 trains on four fifths of those given.
         variant: fields of `Variant`.
     """
-    chosen = Variant(**variant)
+    chosen, seed, seconds, device = Variant(**variant), options.seed, options.seconds, options.device
     first = instances[0]
     scope = Scope(case, regime, first.horizon_s)
     response = Response.make(case, case.knot_times(first.horizon_s))
@@ -186,8 +179,8 @@ def train(
         network.normalise(channels[0])
     network.hide(chosen.blind)
     network.to(device)
-    run = _Run(network, loss, generator, chosen, out.with_suffix(".checkpoint.pt"), len(data))
-    if resume:
+    run = _Run(network, loss, generator, chosen, checkpoint_file(out), len(data))
+    if options.resume and run.checkpoint.is_file():
         run.load(device)
     run.go(data, check, epochs, seconds, f"{METHOD} {regime}")
     network.load_state_dict(run.best_weights)
@@ -211,7 +204,7 @@ def train(
     }
     policy = DispatchPolicy(scope, network.cpu().eval(), training)
     policy.save(out)
-    write_atomically(out.with_suffix(".history.csv"), pd.DataFrame(run.history).to_csv(index=False))
+    write_history(out, run.history)
     return policy
 
 
@@ -308,17 +301,15 @@ class _Run:
     def _save(self) -> None:
         state: dict[str, Any] = {name: getattr(self, name) for name in PROGRESS}
         state |= {name: getattr(self, name).state_dict() for name in ("network", "average", "optimiser")}
-        state["generator"] = self.generator.get_state()
-        buffer = io.BytesIO()
-        torch.save(state, buffer)
-        write_atomically(self.checkpoint, buffer.getvalue())
+        save_checkpoint(self.checkpoint, state | {"generator": self.generator.get_state()})
 
     def load(self, device: str) -> None:
-        """Go on from the checkpoint, if there is one."""
-        if not self.checkpoint.is_file():
-            return
-        with reading_checkpoint(self.checkpoint):
-            state = torch.load(self.checkpoint, weights_only=True, map_location=device)
+        """Go on from the checkpoint.
+
+        Raises:
+            InputError: it is no checkpoint, or one of another training.
+        """
+        with reading_checkpoint(self.checkpoint, device) as state:
             for name in ("network", "average", "optimiser"):
                 getattr(self, name).load_state_dict(state[name])
             for name in PROGRESS:

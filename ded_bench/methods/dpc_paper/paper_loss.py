@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,14 +13,6 @@ from ded_bench.problem.case import Array, Case
 
 #: Weights of the penalty terms (paper, section on the implementation).
 Q_OMEGA, Q_RAMP, Q_INITIAL = 1e3, 1e2, 1e4
-#: For functions that train: a GPU convolves in single precision, as the CPU does (its default keeps ten
-#: bits), and the same way every time.
-full_precision = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)
-
-
-def knot_times(horizon_s: float, n_knots: int) -> Array:
-    """The policy's time points, evenly spaced, not rounded to the grid, shape (n_knots,), s."""
-    return np.linspace(0.0, horizon_s, n_knots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +65,7 @@ def loss_terms(
     cost_slack: Tensor,
     p_initial: Tensor,
     omega_bound: float,
-    ramp: float,
+    ramp: Tensor,
 ) -> dict[str, Tensor]:
     """The six terms of the paper's eq. (DPC_loss) for each instance, weighted, shape (batch,) each.
 
@@ -86,15 +77,15 @@ def loss_terms(
         cost_slack: (batch,).
         p_initial: P_0, (batch, n_gen), pu.
         omega_bound: rad/s.
-        ramp: ε_rmp, pu per step.
+        ramp: ε_rmp of each generator, (n_gen,), pu per step.
     """
     step = p_gen.diff(dim=2)
     return {
         "objective": (cost_gen * p_gen.sum(dim=2)).sum(dim=1) + cost_slack * p_slack.abs().sum(dim=1),
         "omega above": Q_OMEGA * _squared_excess(omega - omega_bound),
         "omega below": Q_OMEGA * _squared_excess(-omega - omega_bound),
-        "ramp down": Q_RAMP * _squared_excess(-step - ramp),
-        "ramp up": Q_RAMP * _squared_excess(step - ramp),
+        "ramp down": Q_RAMP * _squared_excess(-step - ramp[:, None]),
+        "ramp up": Q_RAMP * _squared_excess(step - ramp[:, None]),
         "initial": Q_INITIAL * (p_gen[:, :, 0] - p_initial).square().sum(dim=1),
     }
 

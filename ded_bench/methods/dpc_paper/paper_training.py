@@ -1,39 +1,55 @@
-"""Train the paper's DED-DPC policy: AdamW on its loss, best weights on held-out instances kept."""
+"""Train the paper's DED-DPC policy by AdamW on its loss, eq. (DPC_loss).
+
+From the paper: network, loss and weights, 50 knots, AdamW at a constant learning rate of 5e-4, the 400
+training instances, raw inputs. The paper leaves open and we chose on a fifth of the training instances,
+held out: batches of BATCH instances, EPOCHS epochs, gradients as they are (neither scaled nor clipped),
+weights as after the last step. What a `Recipe` adds beyond that is off by default.
+"""
 
 from __future__ import annotations
 
-import io
+import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
-from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.condensed import free_response
 from ded_bench.koopman.model import Koopman
-from ded_bench.methods.dpc_paper.paper_features import Features
-from ded_bench.methods.dpc_paper.paper_loss import Condensed, full_precision, knot_times, loss_terms
-from ded_bench.methods.dpc_paper.paper_policy import METHOD, N_KNOTS, PaperNetwork, Policy, n_channels
-from ded_bench.methods.policy_file import reading_checkpoint
+from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
+from ded_bench.methods.dpc_paper.paper_loss import Condensed, loss_terms
+from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
+from ded_bench.methods.dpc_paper.paper_policy import METHOD, Policy
+from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
+from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.truth.network import Network
 
 LEARNING_RATE = 5e-4
-BATCH, EPOCHS, VALIDATE_EVERY = 8, 900, 10
-#: What is validated and kept is an exponential average of the weights over about 2,000 steps:
-#: at a constant learning rate the last iterate wanders.
-AVERAGING = 0.9995
-#: Fraction of the training instances that choose the best weights and are never trained on.
-HELD_OUT = 0.2
+BATCH, EPOCHS = 8, 900
+#: Epochs between two rows of the history.
+REPORT_EVERY = 10
+PROGRESS = ("epoch", "spent", "history", "lowest", "kept")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the policy is trained; what the paper does not do is off."""
+
+    epochs: int = EPOCHS
+    batch: int = BATCH
+    normalise: bool = False  # inputs to mean 0 and deviation 1
+    averaging: float = 0.0  # decay per step of an exponential average of the weights; 0: the last weights
+    held_out: float = 0.0  # fraction of the instances that choose the best weights; 0: the last weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,163 +57,194 @@ class Batch:
     """Instances as tensors, ready for the loss."""
 
     channels: Tensor  # (batch, n_channels, n_knots)
-    free: Tensor  # (batch, n_gen + 1, n_points)
-    cost_gen: Tensor
-    cost_slack: Tensor
-    p_initial: Tensor
+    free: Tensor  # (batch, n_gen + 1, n_points): free response, rad/s and pu
+    cost_gen: Tensor  # (batch, n_gen)
+    cost_slack: Tensor  # (batch,)
+    p_initial: Tensor  # (batch, n_gen), pu
 
     @staticmethod
     def of(case: Case, model: Koopman, instances: Sequence[Instance], device: str) -> Batch:
         """Features and free responses of instances with one time grid."""
         network = Network(case)
-        features = Features.of(network, instances, knot_times(instances[0].horizon_s, N_KNOTS))
-        p_load = np.stack([i.p_load(case) for i in instances])
-        free = free_response(model, model.initial(network, instances), p_load)
-        arrays = (features.channels(), free, features.cost[:, 1:], features.cost[:, 0], features.p_initial)
+        arrays = (
+            channels(network, instances, case.knot_times(instances[0].horizon_s)),
+            free_response(
+                model, model.initial(network, instances), np.stack([i.p_load(case) for i in instances])
+            ),
+            np.stack([i.cost_gen(case) for i in instances]),
+            np.array([i.cost_slack(case) for i in instances]),
+            np.stack([i.p_initial(case) for i in instances]),
+        )
         return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32, device=device) for a in arrays))
 
     def __len__(self) -> int:
         return len(self.channels)
 
     def __getitem__(self, rows: Tensor) -> Batch:
-        return Batch(
-            self.channels[rows],
-            self.free[rows],
-            self.cost_gen[rows],
-            self.cost_slack[rows],
-            self.p_initial[rows],
-        )
+        return Batch(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
-def policy_loss(
-    network: PaperNetwork, condensed: Condensed, batch: Batch, omega_bound: float, ramp: float
-) -> dict[str, Tensor]:
-    """Mean of each term of the paper's loss over a batch."""
-    knots = network(batch.channels)
-    omega, p_slack = condensed.rollout(batch.free, knots)
-    terms = loss_terms(
-        omega,
-        p_slack,
-        condensed.powers(knots),
-        batch.cost_gen,
-        batch.cost_slack,
-        batch.p_initial,
-        omega_bound,
-        ramp,
-    )
-    return {name: value.mean() for name, value in terms.items()}
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """The paper's loss of a network over a batch."""
+
+    condensed: Condensed
+    omega_bound: float  # rad/s
+    ramp: Tensor  # (n_gen,), pu per step
+
+    def __call__(self, network: PaperNetwork, batch: Batch) -> dict[str, Tensor]:
+        """Mean of each term over the batch."""
+        knots = network(batch.channels)
+        omega, p_slack = self.condensed.rollout(batch.free, knots)
+        powers, costs = self.condensed.powers(knots), (batch.cost_gen, batch.cost_slack)
+        terms = loss_terms(omega, p_slack, powers, *costs, batch.p_initial, self.omega_bound, self.ramp)
+        return {name: value.mean() for name, value in terms.items()}
 
 
-@full_precision
+@repeatable()
 def train(
     case: Case,
     regime: str,
     instances: Sequence[Instance],
     model: Koopman,
     out: Path,
-    *,
-    seed: int = 0,
-    epochs: int = EPOCHS,
-    seconds: float | None = None,
-    device: str = "cpu",
-    resume: bool = False,
+    options: TrainingOptions,
+    /,
+    **setting: Any,
 ) -> Policy:
-    """Train the paper's policy on instances that share one time grid.
-
-    A fifth of the instances is held out to choose the best weights. The loss history is written
-    beside the policy as `<name>.history.csv`, the state to resume from as `<name>.checkpoint.pt`.
+    """Train the paper's policy; see `training_record.Trainer`.
 
     Args:
-        seconds: stop after this much training time, whatever `epochs` says.
-        resume: go on from the checkpoint if there is one.
+        instances: share one time grid.
+        setting: fields of `Recipe`.
     """
-    generator = torch.Generator().manual_seed(seed)
-    order = torch.randperm(len(instances), generator=generator).tolist()
-    n_held = max(1, round(HELD_OUT * len(instances)))
-    held_out = Batch.of(case, model, [instances[i] for i in order[:n_held]], device)
-    data = Batch.of(case, model, [instances[i] for i in order[n_held:]] or list(instances), device)
-    first = instances[0]
-    knots = knot_times(first.horizon_s, N_KNOTS)
-    condensed = Condensed.make(case, model, first.grid, knots, torch.float32).to(device)
-    bound, ramp = case.omega_bound(regime), case.ramp_pu_per_s * first.dt_s
-
+    recipe, first = Recipe(**setting), instances[0]
+    generator = torch.Generator().manual_seed(options.seed)
+    seen, checked = _split(instances, recipe.held_out, generator)
+    data = Batch.of(case, model, seen, options.device)
+    held_out = Batch.of(case, model, checked, options.device) if checked else None
+    condensed = Condensed.make(case, model, first.grid, case.knot_times(first.horizon_s), torch.float32).to(
+        options.device
+    )
+    ramp = torch.as_tensor(case.ramp * first.dt_s, dtype=torch.float32, device=options.device)
+    loss = Loss(condensed, case.omega_bound(regime), ramp)
     with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        network = PaperNetwork(n_channels(case), case.p_min, case.p_max).to(device)
-    network.normalise(data.channels)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE)
-    average = get_ema_multi_avg_fn(AVERAGING)  # type: ignore[no-untyped-call]
-    averaged = AveragedModel(network, multi_avg_fn=average)
-    validated = cast(PaperNetwork, averaged.module)
-    history: list[dict[str, float]] = []
-    best, best_weights = float("inf"), network.state_dict()
-    epoch, spent = 0, 0.0
-    checkpoint = out.with_suffix(".checkpoint.pt")
-    if resume and checkpoint.is_file():
-        with reading_checkpoint(checkpoint):
-            state = torch.load(checkpoint, weights_only=True, map_location=device)
-            network.load_state_dict(state["network"])
-            averaged.load_state_dict(state["averaged"])
-            optimiser.load_state_dict(state["optimiser"])
-            generator.set_state(state["generator"].cpu())
-            best, best_weights = state["best"], state["best_weights"]
-            epoch, spent, history = state["epoch"], state["spent"], state["history"]
-
-    started = time.perf_counter() - spent
-    with tqdm(total=epochs, initial=epoch, unit="epoch", disable=None, desc=f"{METHOD} {regime}") as bar:
-        while epoch < epochs and (seconds is None or time.perf_counter() - started < seconds):
-            for rows in torch.split(torch.randperm(len(data), generator=generator), BATCH):
-                terms = policy_loss(network, condensed, data[rows], bound, ramp)
-                optimiser.zero_grad()
-                loss = torch.stack(list(terms.values())).sum()
-                torch.autograd.backward(loss)
-                optimiser.step()
-                averaged.update_parameters(network)
-            epoch += 1
-            bar.update()
-            if epoch % VALIDATE_EVERY and epoch < epochs:
-                continue
-            with torch.no_grad():
-                terms = policy_loss(validated, condensed, held_out, bound, ramp)
-            value = float(sum(terms.values()))
-            spent = time.perf_counter() - started
-            history.append(
-                {"epoch": epoch, "seconds": spent, "training": loss.item(), "held out": value}
-                | {name: term.item() for name, term in terms.items()}
-            )
-            if value < best:
-                best = value
-                best_weights = {name: v.clone() for name, v in validated.state_dict().items()}
-            bar.set_postfix_str(f"held out {value:.2f}, best {best:.2f}")
-            state = {
-                "network": network.state_dict(),
-                "averaged": averaged.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "generator": generator.get_state(),
-                "best": best,
-                "best_weights": best_weights,
-                "epoch": epoch,
-                "spent": spent,
-                "history": history,
-            }
-            buffer = io.BytesIO()
-            torch.save(state, buffer)
-            write_atomically(checkpoint, buffer.getvalue())
-    network.load_state_dict(best_weights)
+        torch.manual_seed(options.seed)
+        network = PaperNetwork(n_channels(case), case.p_min, case.p_max).to(options.device)
+    if recipe.normalise:
+        network.normalise(data.channels)
+    run = _Run(network, loss, generator, recipe, checkpoint_file(out))
+    if options.resume and run.checkpoint.is_file():
+        run.load(options.device)
+    run.go(data, held_out, options.seconds, f"{METHOD} {regime}")
+    network.load_state_dict(run.kept)
     training = {
-        "seed": seed,
-        "epochs": epoch,
-        "seconds": spent,
+        "seed": options.seed,
+        "epochs": run.epoch,
+        "seconds": run.spent,
         "instances": len(data),
-        "held_out": len(held_out),
-        "held_out_loss": best,
+        "held_out": 0 if held_out is None else len(held_out),
         "parameters": sum(p.numel() for p in network.parameters()),
+        "recipe": dataclasses.asdict(recipe),
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
         "torch": torch.__version__,
-        "device": device,
+        "device": options.device,
     }
-    policy = Policy(case, regime, first.horizon_s, network.cpu().eval(), training)
+    training["training_loss" if held_out is None else "held_out_loss"] = run.lowest
+    policy = Policy(Scope(case, regime, first.horizon_s), network.cpu().eval(), training)
     policy.save(out)
-    write_atomically(out.with_suffix(".history.csv"), pd.DataFrame(history).to_csv(index=False))
+    write_history(out, run.history)
     return policy
+
+
+def _split(
+    instances: Sequence[Instance], fraction: float, generator: torch.Generator
+) -> tuple[list[Instance], list[Instance]]:
+    """Instances to train on, and those held out."""
+    if not fraction:
+        return list(instances), []
+    order = torch.randperm(len(instances), generator=generator).tolist()
+    n_held = max(1, round(fraction * len(instances)))
+    held_out = [instances[i] for i in order[:n_held]]
+    return [instances[i] for i in order[n_held:]] or held_out, held_out
+
+
+class _Run:
+    """The state of one training: network, average of its weights, optimiser, progress."""
+
+    def __init__(
+        self, network: PaperNetwork, loss: Loss, generator: torch.Generator, recipe: Recipe, checkpoint: Path
+    ) -> None:
+        self.network, self.loss, self.generator = network, loss, generator
+        self.recipe, self.checkpoint = recipe, checkpoint
+        self.optimiser = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE)
+        average = get_ema_multi_avg_fn(recipe.averaging)  # type: ignore[no-untyped-call]
+        self.averaged = AveragedModel(network, multi_avg_fn=average)  # the network itself, if the decay is 0
+        self.epoch, self.spent = 0, 0.0
+        self.history: list[dict[str, float]] = []
+        self.lowest, self.kept = float("inf"), network.state_dict()  # decisive loss, and weights to keep
+
+    def go(self, data: Batch, held_out: Batch | None, seconds: float | None, title: str) -> None:
+        """Train until the epochs are done or the time is over; one epoch at least."""
+        started, epochs = time.perf_counter() - self.spent, self.recipe.epochs
+        with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
+            while self.epoch < epochs:
+                terms = self._train_epoch(data)
+                self.epoch += 1
+                self.spent = time.perf_counter() - started
+                bar.update()
+                over = seconds is not None and self.spent >= seconds
+                if over or self.epoch % REPORT_EVERY == 0 or self.epoch == epochs:
+                    bar.set_postfix_str(f"loss {self._report(terms, held_out):.2f}")
+                    self._save()
+                if over:
+                    break
+
+    def _train_epoch(self, data: Batch) -> dict[str, float]:
+        """One pass over the data; returns the mean of each term, every batch as it was seen."""
+        total: dict[str, float] = {}
+        for rows in torch.split(torch.randperm(len(data), generator=self.generator), self.recipe.batch):
+            terms = self.loss(self.network, data[rows])
+            self.optimiser.zero_grad()
+            torch.autograd.backward(torch.stack(list(terms.values())).sum())
+            self.optimiser.step()
+            self.averaged.update_parameters(self.network)
+            for name, value in terms.items():
+                total[name] = total.get(name, 0.0) + value.item() * len(rows) / len(data)
+        return total
+
+    def _report(self, terms: dict[str, float], held_out: Batch | None) -> float:
+        """Add a row to the history and choose the weights to keep; returns the loss that decides."""
+        row = {"epoch": self.epoch, "seconds": self.spent, "training": sum(terms.values())}
+        network = cast(PaperNetwork, self.averaged.module)
+        if held_out is not None:
+            with torch.no_grad():
+                terms = {name: term.item() for name, term in self.loss(network, held_out).items()}
+            row["held out"] = sum(terms.values())
+        self.history.append(row | terms)
+        decisive = row["held out" if held_out is not None else "training"]
+        if held_out is None or decisive < self.lowest:
+            self.lowest = decisive
+            self.kept = {name: value.clone() for name, value in network.state_dict().items()}
+        return decisive
+
+    def _save(self) -> None:
+        state: dict[str, Any] = {name: getattr(self, name) for name in PROGRESS}
+        parts = (("network", self.network), ("averaged", self.averaged), ("optimiser", self.optimiser))
+        state |= {name: part.state_dict() for name, part in parts}
+        save_checkpoint(self.checkpoint, state | {"generator": self.generator.get_state()})
+
+    def load(self, device: str) -> None:
+        """Go on from the checkpoint.
+
+        Raises:
+            InputError: it is no checkpoint, or one of another training.
+        """
+        with reading_checkpoint(self.checkpoint, device) as state:
+            self.network.load_state_dict(state["network"])
+            self.averaged.load_state_dict(state["averaged"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.generator.set_state(state["generator"].cpu())
+            for name in PROGRESS:
+                setattr(self, name, state[name])

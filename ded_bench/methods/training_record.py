@@ -1,0 +1,90 @@
+"""What a trained method offers and leaves behind: its `train`, facts, the history of its loss.
+
+Beside a policy `p.safetensors` lie `p.history.csv` and `p.checkpoint.pt`, the state to go on from. The
+history has one row per look at the loss, and columns
+
+* `epoch`, counted from 1, and `seconds`, the training time until then;
+* `training` and `held out`, the loss on what is trained on and on what is not, empty if not taken;
+* and any others, which are terms of the loss or what else the method wants to show over time.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from ded_bench.files.strict import write_atomically
+from ded_bench.koopman.model import Koopman
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+
+#: First columns of every history.
+HISTORY = ("epoch", "seconds", "training", "held out")
+#: Facts that tell how good the policy that was kept is; a training has at least one of them.
+LOSSES = ("training_loss", "held_out_loss")
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What the caller of a training decides, whatever the method."""
+
+    seed: int = 0
+    seconds: float | None = None  # end after so much training time; None: train for all epochs
+    device: str = "cpu"  # or "cuda"
+    resume: bool = False  # go on from the checkpoint, if there is one
+
+
+class TrainedPolicy(Protocol):
+    """What a training returns, after it has written the policy's file."""
+
+    @property
+    def training(self) -> Mapping[str, Any]:
+        """Facts of the training: `epochs` (done), `seconds` (spent), one of `LOSSES`, and any others."""
+
+
+class Trainer(Protocol):
+    """`train` of a method's training module."""
+
+    def __call__(
+        self,
+        case: Case,
+        regime: str,
+        instances: Sequence[Instance],
+        model: Koopman,
+        out: Path,
+        options: TrainingOptions,
+        /,
+        **setting: Any,
+    ) -> TrainedPolicy:
+        """Train a policy on a Koopman model; write it to `out`, and its history beside it.
+
+        Args:
+            instances: of the case, all on one time grid.
+            setting: options that the method's setting names, and perhaps `epochs`.
+
+        Raises:
+            InputError: the checkpoint to go on from belongs to another training.
+        """
+
+
+def checkpoint_file(policy: Path) -> Path:
+    """Where the state of a policy's training lies."""
+    return policy.with_suffix(".checkpoint.pt")
+
+
+def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:
+    """Write the history of a policy's training, see the top of this module.
+
+    Args:
+        rows: numbers by column; `epoch` and `seconds` are needed.
+    """
+    columns = dict.fromkeys([*HISTORY, *(name for row in rows for name in row)])
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(policy.with_suffix(".history.csv"), text.getvalue())

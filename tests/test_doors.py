@@ -16,7 +16,7 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.evaluate.summary import summary
-from ded_bench.evaluate.timing import read_timing, timing_frame
+from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import write_benchmark
 from ded_bench.report.paper import table_v, table_vi
@@ -131,7 +131,7 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
         out,
     )
     assert command(*bench)[0] == 0
-    frame, timing = Results(out).frame(), timing_frame(read_timing(out / "timing.csv"))
+    frame, timing = Results(out).frame(), timing_summary(read_timing(out / "timing.csv"))
     five = table_v(summary(frame), timing, {}).set_index(["regime", "title"])
     six = table_vi(summary(frame), {}).set_index(["regime", "title"])
     for regime in ("NO", "TO"):
@@ -168,9 +168,12 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
     assert "my_dispatch.solve: not timed, since no method has this name\n" in err
     bench = ("bench", "--case", problem, "--results", "out", "--instances", "1", "--repeats", "1")
     assert command(*bench, "--method", "my_dispatch:solve")[0] == 1  # its TO has nothing to time
-    times = {row.regime: row for row in read_timing(Path("out/timing.csv"))}
-    assert times["NO"].solve_s > 0
-    assert "returned nothing" in times["TO"].error
+    times = {(row.regime, row.round): row for row in read_timing(Path("out/timing.csv"))}
+    assert sorted(times) == [("NO", 0), ("NO", 1), ("TO", 0), ("TO", 1)]
+    assert times["NO", 1].solve_s > 0
+    assert times["NO", 1].schedule_difference_pu == 0.0
+    assert times["NO", 0].instance != times["NO", 1].instance
+    assert "returned nothing" in times["TO", 1].error
 
 
 def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
@@ -198,7 +201,7 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     assert (
         f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     )
-    assert "mine" in set(table_v(summary(Results(out).frame()), timing_frame([]), {})["title"])
+    assert "mine" in set(table_v(summary(Results(out).frame()), timing_summary([]), {})["title"])
     for wrong in (
         score,  # no name
         (*score, "--name", "ded"),

@@ -25,7 +25,7 @@ import torch
 
 from ded_bench.cli import commands
 from ded_bench.evaluate.summary import claims, summary, table_times, worst
-from ded_bench.evaluate.timing import TimingRow, format_timing, read_timing
+from ded_bench.evaluate.timing import TIMING, TimingRow, read_timing
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
 from ded_bench.koopman.linear import linear_model
@@ -89,8 +89,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     claimed = {("NO", "ded"): "Optimal", ("TO", "ded"): "Optimal", ("TO", "ded-dpc"): "Policy"}
     rows = [scored(Row(instance.id, "test", *key, "default", status)) for key, status in claimed.items()]
     (folder / "results.csv").write_text(format_rows(rows))
-    timing = [TimingRow(r, "ded", "default", 1, 2, 0, solve_s=0.1, host="here") for r in case.regimes]
-    (folder / "timing.csv").write_text(format_timing(timing))
+    timed = ("ded", "default", instance.id, "Optimal")
+    TIMING.write(folder / "timing.csv", [TimingRow("x", 1, r, *timed, solve_s=0.1) for r in case.regimes])
     rng = np.random.default_rng(0)
     mlp = tuple((0.1 * rng.normal(size=(n, m)), rng.normal(size=n)) for n, m in ((4, 3), (3, 4)))
     model = linear_model(case)

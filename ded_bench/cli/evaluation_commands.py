@@ -7,7 +7,7 @@ import os
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ded_bench.cli.arguments import (
     DEFAULT_CASE,
@@ -20,25 +20,24 @@ from ded_bench.cli.arguments import (
     positive_number,
 )
 from ded_bench.files.errors import InputError
+from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.koopman.surrogates import default_results, search_folders
 from ded_bench.methods.solution import Settings
-from ded_bench.problem.benchmark import problem_folder, select_split
+from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.run.pool import Workers
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
-    p = command(commands, "bench", "time methods, each alone on the machine, one thread")
+    p = command(commands, "bench", "time methods in turns, alone on the machine, one thread")
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
     p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
     p.add_argument("--repeats", type=positive, help="solves of each; default: by the method's speed")
-    p.add_argument("--force", action="store_true", help="time again what timing.csv holds")
+    p.add_argument("--force", action="store_true", help="time again what the table holds")
     p.add_argument("--results", type=Path, help="results folder")
+    p.add_argument("--out", type=Path, help="table of the run; default: timing.csv in the results folder")
     p.set_defaults(run=_bench)
 
     p = command(commands, "certify", "certify a policy on fresh instances")
@@ -75,38 +74,40 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.timing import bench_folder, choose_sample, runs_of
+    from ded_bench.evaluate.timing import bench, choose_sample, runs_of, timing_summary
     from ded_bench.methods.registry import get_method, registered
     from ded_bench.run.results import Results
 
     chosen = select_split(a.case)
     case = chosen.case
-    folder = a.results or default_results(case)
-    rows = Results(folder).rows
+    results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
-    runs = runs_of(rows, Settings(search=search_folders(case, folder)), methods)
+    jobs = runs_of(results.rows, Settings(search=search_folders(case, results.folder)), methods)
     if not a.method:
-        for name in sorted({key.method for key in rows} - set(methods)):
+        for name in sorted({key.method for key in results.rows} - set(methods)):
             print(f"ded-bench: {name}: not timed, since no method has this name", file=sys.stderr)
-    if not runs:
-        raise InputError(folder, "", "holds no rows of these methods to time; run `ded-bench solve` first")
-    failures = 0
-    for method, regimes, settings in runs:
-        for row in bench_folder(
-            folder,
-            case,
-            choose_sample([instance for instance, _ in chosen.instances], a.instances),
-            [method],
-            regimes,
-            settings,
-            repeats=a.repeats,
-            force=a.force,
-            problems_version=chosen.version,
-        ):
-            median = f"{row.solve_s:.6f} s" if row.solve_s is not None else row.error
-            print(f"{row.method:<16} {row.settings:<12} {row.regime:<4} {median}", flush=True)
-            failures += row.solve_s is None
-    return 1 if failures else 0
+    if not jobs:
+        raise InputError(
+            results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
+        )
+    rows = bench(
+        case,
+        choose_sample([instance for instance, _ in chosen.instances], a.instances),
+        jobs,
+        a.out or ResultsFolder(results.folder).timing,
+        warm_up=validation_instances(case, 1)[0],
+        results=results,
+        rounds=a.repeats,
+        force=a.force,
+        problems_version=chosen.version,
+    )
+    failed = 0
+    for row in timing_summary(rows).to_dict("records"):
+        timed = row["solve_s"] == row["solve_s"]
+        said = f"{row['solve_s']:.6f} s, {row['repeats']} rounds" if timed else row["error"]
+        print(f"{row['method']:<16} {row['settings']:<12} {row['regime']:<4} {said}", flush=True)
+        failed += not timed
+    return 1 if failed else 0
 
 
 def _certify(a: argparse.Namespace) -> int:

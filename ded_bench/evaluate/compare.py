@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench.evaluate.summary import GROUP, gaps, groups, table, title
-from ded_bench.evaluate.timing import latest_host, read_timing, timing_frame
+from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.errors import InputError
 from ded_bench.run.results import Key, Results, Row
 
@@ -153,7 +153,7 @@ def _summary(a: Path, b: Path) -> pd.DataFrame:
     x, y = (frame.loc[common] for frame in frames)
     timings = []
     for folder in (a, b):
-        timing = latest_host(timing_frame(read_timing(folder / "timing.csv")))
+        timing = timing_summary(read_timing(folder / "timing.csv"))
         timings.append(timing.set_index(GROUP)["solve_s"])
     rows = []
     for regime, method, settings, part in groups(x.reset_index(drop=True)):

@@ -1,22 +1,25 @@
-"""Times of methods alone on the machine: one process, one thread, warmed up; Table V's time column.
+"""Times of methods alone on the machine, in turns: one process and thread each, one computing at a time.
 
-`timing.csv` holds one row per (regime, method, settings, host). Times of the results table, taken
+Every method and regime keeps a process of its own, which answers a warm-up instance first. Then come
+rounds over the timed instances; on each instance all methods answer, one after the other, in an order that
+rotates. What disturbs the machine for a while thus disturbs all methods alike. `timing.csv` holds one row
+per call and one run: a new run replaces the table when it is complete. Times of the results table, taken
 while several workers share the machine, never enter it.
 """
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import dataclasses
+import functools
 import hashlib
-import io
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,161 +27,264 @@ from tqdm import tqdm
 
 from ded_bench.evaluate.summary import is_apart, quartiles
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.table import Table, cell
 from ded_bench.koopman.surrogates import MODELS
 from ded_bench.methods.registry import Method, get_method, registered
-from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.run.code import code_of_method
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import LARGEST, Key, read_table
+from ded_bench.run.results import Key, Results
 from ded_bench.run.tasks import failed
 
 #: Instances that are timed, unless the caller says otherwise.
 SAMPLE = 10
-#: Without a number of repeats, a method is repeated until this much solve time is spent, at most so often.
-BUDGET_S, MAX_REPEATS = 2.0, 200
+#: A method takes part in further rounds while all its rounds together stay within so many seconds, at most
+#: in so many rounds. The first round of all instances is always run.
+BUDGET_S, MAX_ROUNDS = 30.0, 10
+#: Round of a process's first call, on the warm-up instance; it enters no median.
+WARM_UP = 0
 PARTS = ("build_s", "setup_s", "solve_s")
+
+
+class Job(NamedTuple):
+    """A method that is timed, in one regime."""
+
+    method: str
+    regime: str
+    settings: Settings
 
 
 @dataclass(frozen=True)
 class TimingRow:
-    """Median and quartiles of one method over instances × repeats, wall-clock seconds.
+    """One call of one method, wall-clock seconds.
 
-    `first_build_s` and `first_setup_s` are what the untimed first solve of the process paid once.
-    `load_average` is the machine's, when the timing of this row began: at most about 1 if it was alone.
+    `call_s` is the whole call as its process saw it, `load_average` the machine's over the last minute,
+    when the call ended: at most about 1 if bench was alone. `schedule_difference_pu` is max |ΔP| between
+    this call's schedule and the one that the results folder keeps.
     """
 
+    run: str
+    round: int = cell(lowest=0)
     regime: str
     method: str
     settings: str
-    instances: int
-    repeats: int
-    failures: int
-    solve_s: float | None = None
-    solve_s_q1: float | None = None
-    solve_s_q3: float | None = None
-    build_s: float | None = None
-    build_s_q1: float | None = None
-    build_s_q3: float | None = None
-    setup_s: float | None = None
-    setup_s_q1: float | None = None
-    setup_s_q3: float | None = None
-    first_build_s: float | None = None
-    first_setup_s: float | None = None
-    load_average: float | None = None
+    instance: str
+    status: str
+    build_s: float | None = cell(default=None, lowest=0)
+    setup_s: float | None = cell(default=None, lowest=0)
+    solve_s: float | None = cell(default=None, lowest=0)
+    call_s: float | None = cell(default=None, lowest=0)
+    schedule_difference_pu: float | None = cell(default=None, lowest=0)
+    load_average: float | None = cell(default=None, lowest=0)
     error: str = ""
+    model: str = ""
+    policy: str = ""
+    code: str = ""
     case: str = ""
     problems_version: str = ""
     version: str = ""
     solver_version: str = ""
     host: str = ""
     date: str = ""
-    fingerprint: str = ""
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
-        """What makes a row unique."""
-        return self.regime, self.method, self.settings, self.host
+    def key(self) -> tuple[int, str, str, str, str]:
+        """What makes a row unique within its run."""
+        return self.round, self.regime, self.method, self.settings, self.instance
 
 
-COLUMNS = tuple(field.name for field in dataclasses.fields(TimingRow))
-_TYPES = {field.name: str(field.type).removesuffix(" | None") for field in dataclasses.fields(TimingRow)}
-_OPTIONAL = {field.name for field in dataclasses.fields(TimingRow) if "None" in str(field.type)}
+TIMING: Table[TimingRow] = Table(TimingRow)
 
 
-def bench_methods(
+def bench(
     case: Case,
     instances: Sequence[Instance],
-    methods: Sequence[str],
-    regimes: Sequence[str],
-    settings: Settings,
-    repeats: int | None = None,
+    jobs: Sequence[Job],
+    path: Path,
     *,
-    kept: Sequence[TimingRow] = (),
-    problems_version: str = "",
-    on_row: Callable[[TimingRow], None] = lambda row: None,
-) -> list[TimingRow]:
-    """Time methods one after the other, each in a fresh process with one thread.
-
-    Args:
-        repeats: how often every instance is solved; None: chosen by the method's speed.
-        kept: rows of earlier runs; those made here for the same inputs are not timed again.
-        on_row: called with every new row as soon as it exists.
-
-    Returns:
-        One row per method and regime, old and new.
-
-    Raises:
-        InputError: no instance, unknown method, regime or settings, or a missing model or policy.
-    """
-    if not instances:
-        raise InputError("instances", "", "at least one is needed to time a method")
-    case.check_regimes(regimes)
-    jobs = []
-    for method in methods:
-        for regime in regimes:
-            artifacts = get_method(method).artifacts(case, regime, settings)
-            parts = [case.fingerprint, *(i.fingerprint for i in instances)]
-            parts += [regime, method, settings.slug, *(a.fingerprint for a in artifacts), str(repeats)]
-            jobs.append((method, regime, hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]))
-    known = {(row.key, row.fingerprint): row for row in kept if not row.error}
-    rows = []
-    with tqdm(jobs, unit="method", disable=None, desc="bench") as bar:
-        for method, regime, fingerprint in bar:
-            bar.set_postfix_str(f"{method} {regime}")
-            key = (regime, method, settings.slug, host())
-            row = known.get((key, fingerprint))
-            if row is None:
-                row = _row(case, instances, method, regime, settings, repeats)
-                row = dataclasses.replace(row, fingerprint=fingerprint, problems_version=problems_version)
-                on_row(row)
-            rows.append(row)
-    return rows
-
-
-def bench_folder(
-    folder: Path,
-    case: Case,
-    instances: Sequence[Instance],
-    methods: Sequence[str],
-    regimes: Sequence[str],
-    settings: Settings,
-    *,
-    repeats: int | None = None,
+    warm_up: Instance,
+    results: Results | None = None,
+    rounds: int | None = None,
     force: bool = False,
     problems_version: str = "",
 ) -> list[TimingRow]:
-    """Time methods and keep the rows in `<folder>/timing.csv`, saved one by one.
+    """Time methods in turns and keep every call in a table.
 
-    Rows of the same method, inputs and host stay as they are unless `force`.
+    A run that was interrupted goes on where it was; its rows lie beside the table until it is complete. A
+    complete run of the same methods, instances and host is not repeated unless `force`.
+
+    Args:
+        path: of the table, which holds one run.
+        warm_up: answered first by each process, untimed; none of the timed instances.
+        results: where schedules are kept that those computed here are compared with.
+        rounds: how often every method answers every instance; None: chosen by its speed (see `rounds_of`).
+
+    Returns:
+        All rows of the run, in the order in which they were made.
+
+    Raises:
+        InputError: no instance, no method, an unknown method, regime or settings, a missing model or policy,
+            or a table of a run of other methods.
     """
-    path = folder / "timing.csv"
-    table = {row.key: row for row in read_timing(path)}
+    if not instances or not jobs:
+        raise InputError("instances", "", "at least one instance and one method are needed")
+    if warm_up.id in {instance.id for instance in instances}:
+        raise InputError(f"instance {warm_up.id}", "", "cannot be timed, since it warms up")
+    case.check_regimes([job.regime for job in jobs])
+    facts = {job: _facts(case, job) | {"problems_version": problems_version} for job in jobs}
+    run = _run_id(case, instances, facts, rounds)
+    there = read_timing(path)
+    if not force and there and {row.run for row in there} == {run}:
+        return there
+    others = {_name(row) for row in there} - {_name_of(job) for job in jobs}
+    if others:
+        method, _, regime = sorted(others)[0]
+        raise InputError(
+            path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
+        )
+    partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+    kept = [] if force else [row for row in read_timing(partial) if row.run == run]
+    with contextlib.ExitStack() as stack:
+        turns = _Turns(case, run, facts, {job: stack.enter_context(Workers(1)) for job in jobs}, results)
+        rows = _go(turns, instances, warm_up, kept, rounds, partial)
+    TIMING.write(path, rows)
+    partial.unlink(missing_ok=True)
+    return rows
 
-    def save(row: TimingRow) -> None:
-        table[row.key] = row
-        write_atomically(path, format_timing(list(table.values())))
 
-    kept = [] if force else list(table.values())
-    return bench_methods(
-        case,
-        instances,
-        methods,
-        regimes,
-        settings,
-        repeats,
-        kept=kept,
-        problems_version=problems_version,
-        on_row=save,
-    )
+def rounds_of(rows: Iterable[TimingRow]) -> int:
+    """How many rounds a method takes part in, from its calls of the first round, which are warm.
+
+    As many as fit into BUDGET_S, from 1 to MAX_ROUNDS; 1 if a call failed.
+    """
+    first = list(rows)
+    if any(row.call_s is None or row.error for row in first):
+        return 1
+    spent = sum(row.call_s or 0.0 for row in first)
+    return max(1, min(MAX_ROUNDS, int(BUDGET_S / max(spent, 1e-9))))
+
+
+class _Turns:
+    """The processes of a run, and what its rows have in common."""
+
+    def __init__(
+        self,
+        case: Case,
+        run: str,
+        facts: Mapping[Job, Mapping[str, str]],
+        pools: Mapping[Job, Workers],
+        results: Results | None,
+    ) -> None:
+        self.case, self.run, self.facts, self.pools, self.results = case, run, facts, pools, results
+        self.warm: set[Job] = set()
+
+    def call(self, job: Job, round_: int, instance: Instance) -> TimingRow:
+        """One answer of one method as a row."""
+        arguments = (self.case, job.method, job.regime, job.settings, instance)
+        ((_, answer),) = self.pools[job].imap([(timed, arguments)], [None])
+        solution, seconds = answer if isinstance(answer, tuple) else (failed(answer), None)
+        if seconds is None:  # its process may have been replaced
+            self.warm.discard(job)
+        facts: dict[str, Any] = {name: getattr(solution, name) for name in PARTS} | dict(self.facts[job])
+        return TimingRow(
+            run=self.run,
+            round=round_,
+            regime=job.regime,
+            method=job.method,
+            settings=job.settings.slug,
+            instance=instance.id,
+            status=str(solution.status),
+            call_s=seconds,
+            schedule_difference_pu=self._difference(job, instance, solution.schedule),
+            load_average=os.getloadavg()[0],
+            error=_problem(solution),
+            solver_version=solution.solver_version,
+            date=now(),
+            **facts,
+        )
+
+    def _difference(self, job: Job, instance: Instance, schedule: Schedule | None) -> float | None:
+        kept = self._kept(Key(instance.id, job.regime, job.method, job.settings.slug), instance)
+        return None if schedule is None or kept is None else largest_difference(schedule, kept)
+
+    def _kept(self, key: Key, instance: Instance) -> Schedule | None:
+        if self.results is None or not self.results.schedule_path(key).is_file():
+            return None
+        return self.results.schedule(key, self.case, instance)
+
+
+def _go(
+    turns: _Turns,
+    instances: Sequence[Instance],
+    warm_up: Instance,
+    kept: Sequence[TimingRow],
+    rounds: int | None,
+    partial: Path,
+) -> list[TimingRow]:
+    """Run what is not kept yet, and save after every instance of every round."""
+    rows = {row.key: row for row in kept}
+    jobs = list(turns.facts)
+    turn = 0
+    for round_ in range(1, (rounds or MAX_ROUNDS) + 1):
+        present = [job for job in jobs if round_ <= (rounds or _rounds_of(job, rows, round_))]
+        for instance in tqdm(instances, unit="instance", disable=None, desc=f"bench, round {round_}"):
+            turn += 1
+            shift = turn % len(present) if present else 0
+            for job in present[shift:] + present[:shift]:
+                key = (round_, job.regime, job.method, job.settings.slug, instance.id)
+                if key in rows:
+                    continue
+                if job not in turns.warm:
+                    turns.warm.add(job)
+                    first = turns.call(job, WARM_UP, warm_up)
+                    rows.setdefault(first.key, first)
+                rows[key] = turns.call(job, round_, instance)
+            TIMING.write(partial, rows.values())
+    return list(rows.values())
+
+
+def _rounds_of(job: Job, rows: Mapping[Any, TimingRow], round_: int) -> int:
+    if round_ == 1:
+        return 1
+    return rounds_of(row for row in rows.values() if row.round == 1 and _name(row) == _name_of(job))
+
+
+def timed(
+    case: Case, method: str, regime: str, settings: Settings, instance: Instance
+) -> tuple[Solution, float]:
+    """Answer one instance in this process; returns the solution and the seconds of the whole call."""
+    solve = _prepared(case, method, regime, settings)
+    started = time.perf_counter()
+    solution = solve(instance)
+    elapsed = time.perf_counter() - started
+    if solution.solve_s is None:  # a method that does not time itself is timed as a whole
+        solution = dataclasses.replace(solution, solve_s=elapsed)
+    return solution, elapsed
+
+
+@functools.lru_cache(maxsize=1)
+def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+    solve = get_method(method).prepare(case, regime, settings)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    return solve
+
+
+def largest_difference(a: Schedule, b: Schedule) -> float:
+    """max |ΔP| of two schedules over their common span, pu; both are linear between their points."""
+    times = np.union1d(a.t, b.t)
+    times = times[times <= min(a.t[-1], b.t[-1])]
+    return float(np.abs(a.at(times) - b.at(times)).max())
 
 
 def runs_of(
     keys: Iterable[Key], settings: Settings, methods: Mapping[str, Method] | None = None
-) -> list[tuple[str, list[str], Settings]]:
-    """What a results table holds, to be timed: (method, regimes, settings), in the methods' order.
+) -> list[Job]:
+    """What a results table holds, to be timed, in the methods' order.
 
     Rows of studies are not timed. Rows of other methods, and of models given as a file, cannot be run
     again from their key alone and are left out.
@@ -191,7 +297,7 @@ def runs_of(
     found: dict[tuple[str, str], set[str]] = {}
     for key in keys:
         found.setdefault((key.method, key.settings), set()).add(key.regime)
-    runs = []
+    jobs = []
     for method in methods:
         for slug in sorted(slug for name, slug in found if name == method and not is_apart(slug)):
             known = methods[method].settings
@@ -200,8 +306,8 @@ def runs_of(
             ]
             match = next((choice for choice in choices if choice.slug == slug), None)
             if match is not None:
-                runs.append((method, sorted(found[method, slug]), match))
-    return runs
+                jobs += [Job(method, regime, match) for regime in sorted(found[method, slug])]
+    return jobs
 
 
 def choose_sample(instances: Sequence[Instance], count: int = SAMPLE) -> list[Instance]:
@@ -211,43 +317,65 @@ def choose_sample(instances: Sequence[Instance], count: int = SAMPLE) -> list[In
     return [instances[i] for i in np.linspace(0, len(instances) - 1, count).round().astype(int)]
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Raw times of one method, made in its own process."""
+def read_timing(path: Path) -> list[TimingRow]:
+    """Read a timing table; no rows if there is no such file.
 
-    first: Solution
-    solutions: tuple[Solution, ...]  # without their schedules
-    repeats: int
-    load_average: float
+    Raises:
+        InputError: a column is missing, or a value is wrong; names line and column.
+    """
+    return TIMING.read(path) if path.exists() else []
 
 
-def measure(
-    case: Case,
-    instances: Sequence[Instance],
-    method: str,
-    regime: str,
-    settings: Settings,
-    repeats: int | None,
-) -> Measured:
-    """Solve every instance `repeats` times in this process, after one solve that is not timed."""
-    load_average = os.getloadavg()[0]
-    solve = get_method(method).prepare(case, regime, settings)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
+def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
+    """Median and quartiles per (regime, method, settings) over instances and rounds, s.
 
-    def timed(instance: Instance) -> Solution:
-        started = time.perf_counter()
-        solution = solve(instance)
-        elapsed = time.perf_counter() - started
-        # A method that does not time itself is timed as a whole.
-        seconds = elapsed if solution.solve_s is None else solution.solve_s
-        return dataclasses.replace(solution, schedule=None, solve_s=seconds, error=_problem(solution))
+    The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
+    enter no median. `load_average` is the median of the calls', `schedule_difference_pu` the largest.
+    """
+    parts: dict[tuple[str, ...], list[TimingRow]] = {}
+    for row in rows:
+        parts.setdefault((row.regime, row.method, row.settings), []).append(row)
+    found = [_summary(calls) for calls in parts.values()]
+    frame = pd.DataFrame(found, columns=list(SUMMARY_COLUMNS))
+    numbers = [name for name in SUMMARY_COLUMNS if name.endswith(("_s", "_q1", "_q3", "_pu", "_average"))]
+    return frame.astype(dict.fromkeys(numbers, "float64"))
 
-    first = timed(instances[0])
-    if repeats is None:
-        repeats = max(1, min(MAX_REPEATS, int(BUDGET_S / max((first.solve_s or 0.0) * len(instances), 1e-9))))
-    solutions = [timed(instance) for _ in range(repeats) for instance in instances]
-    return Measured(first, tuple(solutions), repeats, load_average)
+
+_NAMES = ("case", "problems_version", "version", "solver_version", "host", "date", "model", "policy", "code")
+SUMMARY_COLUMNS = (
+    *("regime", "method", "settings", "instances", "repeats", "failures"),
+    *(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3")),
+    *(f"first_{name}" for name in PARTS),
+    *("load_average", "schedule_difference_pu", "error", "run", *_NAMES),
+)
+
+
+def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
+    first = next((row for row in calls if row.round == WARM_UP), None)
+    warm = [row for row in calls if row.round != WARM_UP]
+    good = [row for row in warm if not row.error]
+    last = calls[-1]
+    errors = [row.error for row in warm if row.error]
+    facts: dict[str, Any] = {
+        "regime": last.regime,
+        "method": last.method,
+        "settings": last.settings,
+        "instances": len({row.instance for row in warm}),
+        "repeats": max((row.round for row in warm), default=0),
+        "failures": len(errors),
+        "load_average": float(np.median(_values(warm, "load_average") or [np.nan])),
+        "schedule_difference_pu": max(_values(warm, "schedule_difference_pu"), default=None),
+        "error": "" if good or not errors else errors[0],
+        "run": last.run,
+    }
+    facts |= {f"first_{name}": getattr(first, name, None) for name in PARTS}
+    for name in PARTS:
+        facts |= quartiles(name, np.array(_values(good, name), dtype=float))
+    return facts | {name: getattr(last, name) for name in _NAMES}
+
+
+def _values(rows: Sequence[TimingRow], name: str) -> list[float]:
+    return [value for row in rows if (value := getattr(row, name)) is not None]
 
 
 def _problem(solution: Solution) -> str:
@@ -256,94 +384,31 @@ def _problem(solution: Solution) -> str:
     return solution.error or solution.status.sentence
 
 
-def _row(
-    case: Case,
-    instances: Sequence[Instance],
-    method: str,
-    regime: str,
-    settings: Settings,
-    repeats: int | None,
-) -> TimingRow:
-    call = (measure, (case, instances, method, regime, settings, repeats))
-    with Workers(1) as pool:
-        (_, answer), *_ = pool.imap([call], [method])
-    facts: dict[str, Any] = {"case": case.id, "version": version(), "host": host(), "date": now()}
-    row = TimingRow(regime, method, settings.slug, len(instances), 0, len(instances), **facts)
-    if not isinstance(answer, Measured):
-        return dataclasses.replace(row, error=failed(answer).error)
-    good = [s for s in answer.solutions if not s.error]
-    errors = [s.error for s in answer.solutions if s.error]
-    spread: dict[str, Any] = {}
-    for part in PARTS:
-        values = np.array([v for s in good if (v := getattr(s, part)) is not None], dtype=float)
-        spread |= quartiles(part, values) if len(values) else {}
-    return dataclasses.replace(
-        row,
-        repeats=answer.repeats,
-        failures=len(errors),
-        first_build_s=answer.first.build_s,
-        first_setup_s=answer.first.setup_s,
-        load_average=answer.load_average,
-        error="" if good else errors[0],
-        solver_version=answer.first.solver_version,
-        **spread,
-    )
+def _name(row: TimingRow) -> tuple[str, str, str]:
+    return row.method, row.settings, row.regime
 
 
-def latest_host(timing: pd.DataFrame) -> pd.DataFrame:
-    """The rows of one host only, the one timed last: times of several are never mixed."""
-    if not len(timing):
-        return timing
-    newest = timing.sort_values("date", kind="stable")["host"].iloc[-1]
-    chosen: pd.DataFrame = timing[timing["host"] == newest]
-    return chosen
+def _name_of(job: Job) -> tuple[str, str, str]:
+    return job.method, job.settings.slug, job.regime
 
 
-def timing_frame(rows: Sequence[TimingRow]) -> pd.DataFrame:
-    """The timing table, typed columns; empty cells are missing values."""
-    frame = pd.DataFrame([dataclasses.astuple(row) for row in rows], columns=list(COLUMNS))
-    for name, kind in _TYPES.items():
-        if kind == "float":
-            frame[name] = frame[name].astype("float64")
-    return frame
+def _facts(case: Case, job: Job) -> dict[str, str]:
+    """What the rows of one method and regime have in common."""
+    method = get_method(job.method)
+    used = method.artifacts(case, job.regime, job.settings)
+    named = {
+        kind: ", ".join(f"{a.name} {a.fingerprint}" for a in used if a.kind == kind)
+        for kind in ("model", "policy")
+    }
+    made_by = {"code": code_of_method(method, used), "version": version(), "host": host()}
+    return named | made_by | {"case": case.id}
 
 
-def format_timing(rows: Sequence[TimingRow]) -> str:
-    """Rows as CSV text; floats keep every digit, missing values are empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows:
-        writer.writerow(["" if value is None else str(value) for value in dataclasses.astuple(row)])
-    return text.getvalue()
-
-
-def read_timing(path: Path) -> list[TimingRow]:
-    """Read a timing table; no rows if there is no such file.
-
-    Raises:
-        InputError: a column is missing or unknown, or a value is wrong; names line and column.
-    """
-    if not path.exists():
-        return []
-    return [
-        TimingRow(**{name: _parse(cell, name, path, number) for name, cell in cells.items()})
-        for number, cells in read_table(path, COLUMNS)
-    ]
-
-
-def _parse(cell: str, name: str, path: Path, line: int) -> Any:
-    kind = _TYPES[name]
-    if kind == "str":
-        if not cell and name in ("regime", "method", "settings", "host"):
-            raise InputError(path, f"line {line}, {name}", "must not be empty")
-        return cell
-    if not cell and name in _OPTIONAL:
-        return None
-    try:
-        value = int(cell) if kind == "int" else float(cell)
-        if not 0 <= value <= LARGEST:
-            raise ValueError
-        return value
-    except ValueError:
-        raise InputError(path, f"line {line}, {name}", f"{cell[:30]!r} is not a valid value") from None
+def _run_id(
+    case: Case, instances: Sequence[Instance], facts: Mapping[Job, Mapping[str, str]], rounds: int | None
+) -> str:
+    """Twelve hex digits that change with all that a run's times depend on, but the day."""
+    parts = [case.fingerprint, *(i.fingerprint for i in instances), str(rounds)]
+    for job, fact in facts.items():
+        parts += [*_name_of(job), str(job.settings.time_limit_s), *map(str, sorted(fact.items()))]
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]

@@ -119,7 +119,7 @@ class Table(Generic[T]):
 
     def check_header(self, cells: Sequence[str], source: str | Path) -> tuple[str, ...]:
         """Return the names of a header; InputError if a required column is missing or any is there twice."""
-        found = f"found: {', '.join(cells)[:100] or 'nothing'}"
+        found = f"found: {repr(', '.join(cells)[:100])[1:-1] or 'nothing'}"
         for column in self.columns:
             if column.required and column.name not in cells:
                 raise InputError(source, column.name, f"required column is missing ({found})")

@@ -102,7 +102,7 @@ def draw(
 
     Args:
         frame: the rows that the report is about.
-        timing: the timing rows of one host.
+        timing: the summary of the timing table.
         problems: folder of the benchmark's instances.
         pool: processes that draw; this one does, if there are none.
     """

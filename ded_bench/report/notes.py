@@ -86,7 +86,7 @@ def data_notes(
     elif (timing["load_average"] > BUSY).any():
         notes.append("Some methods were timed while the machine was busy (see the column load).")
     if len(timings) > len(timing):
-        notes.append(f"Times of other hosts or cases are left out: {len(timings) - len(timing)} rows.")
+        notes.append(f"Times of other cases are left out: {len(timings) - len(timing)} rows.")
     stale = sorted(set(timing["problems_version"]) - set(versions)) if versions else []
     if stale:
         notes.append(f"Times were taken on problem version {', '.join(map(named, stale))}.")

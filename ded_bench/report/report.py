@@ -30,7 +30,7 @@ from ded_bench.evaluate.summary import (
     validation_rows,
     worst,
 )
-from ded_bench.evaluate.timing import latest_host, read_timing, timing_frame
+from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.case import Case
@@ -93,8 +93,8 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
     everything = results.frame()
     everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
     frame = judged_rows(everything)
-    timings = timing_frame(read_timing(folder / "timing.csv"))
-    timing = latest_host(timings[timings["case"] == case.id])
+    timings = timing_summary(read_timing(folder / "timing.csv"))
+    timing = timings[timings["case"] == case.id]
     paper = read_paper(problems, case)
     ours = paper if paper and paper.case_fingerprint == case.fingerprint else None
     lines = paper_lines(main_rows(frame), timing, ours)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ded_bench.evaluate.compare import Tolerance, compare
-from ded_bench.evaluate.timing import TimingRow, format_timing
+from ded_bench.evaluate.timing import TIMING, TimingRow
 from ded_bench.files.errors import InputError
 from ded_bench.report.comparison import to_json, to_text
 from ded_bench.run.results import Results, Row
@@ -155,8 +155,8 @@ def test_long_lists_are_cut_and_the_largest_change_comes_first(folders) -> None:
 def test_times_taken_alone_are_told_where_both_have_them(folders) -> None:
     a, b = folders(BASE)
     for folder, seconds in ((a, 2.0), (b, 5.0)):
-        timed = TimingRow("TO", "ded", "default", 1, 1, 0, solve_s=seconds, case="grid", host="h", date="d")
-        (folder / "timing.csv").write_text(format_timing([timed]))
+        timed = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", solve_s=seconds, case="grid")
+        TIMING.write(folder / "timing.csv", [timed])
     summary = compare(a, b).summary.set_index("method")
     assert summary.loc["ded", "time_ratio_alone"] == 2.5
     assert summary["time_ratio_alone"].isna().to_list() == [False, True]

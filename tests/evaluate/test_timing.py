@@ -8,49 +8,40 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from ded_bench.evaluate import timing
 from ded_bench.evaluate.timing import (
-    COLUMNS,
-    MAX_REPEATS,
+    MAX_ROUNDS,
+    TIMING,
+    Job,
     TimingRow,
-    bench_folder,
-    bench_methods,
+    bench,
     choose_sample,
-    format_timing,
-    latest_host,
-    measure,
+    largest_difference,
     read_timing,
+    rounds_of,
     runs_of,
-    timing_frame,
+    timed,
+    timing_summary,
 )
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import METHODS, Method
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.results import Key
+from ded_bench.run.results import Key, Results
 from ded_bench.solvers.status import Status
 
-ROW = TimingRow(
-    "TO",
-    "ded",
-    "default",
-    10,
-    1,
-    0,
-    3.5,
-    3.25,
-    4.0,
-    host="here",
-    date="2026-01-01T00:00:00Z",
-    fingerprint="x",
-)
+ROW = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", build_s=0.5, solve_s=3.5, host="here")
+TO = Job("fake", "TO", Settings())
+BOTH = [Job("fake", "NO", Settings()), TO]
 
 
 class Inline:
@@ -74,7 +65,7 @@ class Inline:
 
 
 @pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     """A registered method `fake` that answers with `module.times` in turn; its artifact can change."""
     module = types.ModuleType("fake_method")
     module.SETTINGS = {"default": None, "other": None}
@@ -87,7 +78,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
         def solve(instance: Instance) -> Solution:
             seconds = module.times[len(module.calls) % len(module.times)]
             module.calls.append(instance.id)
-            if isinstance(seconds, Exception):
+            if isinstance(seconds, BaseException):
                 raise seconds
             if seconds == "none":
                 return Solution(Status.INFEASIBLE, error="no way")
@@ -100,7 +91,9 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
     monkeypatch.setattr(timing, "Workers", Inline)
-    return module
+    timing._prepared.cache_clear()
+    yield module
+    timing._prepared.cache_clear()
 
 
 @pytest.fixture
@@ -108,192 +101,217 @@ def instances(threebus: Case) -> list[Instance]:
     return [sample_instance(threebus, 1, i) for i in range(3)]
 
 
-def test_the_first_solve_is_a_warm_up(fake, threebus: Case, instances: list[Instance]) -> None:
+@pytest.fixture
+def run(fake, threebus: Case, instances: list[Instance], tmp_path: Path) -> Callable[..., list[TimingRow]]:
+    """`run(jobs, rounds=1, ...)`: bench of the fake method on three instances."""
+    warm_up = validation_instances(threebus, 1)[0]
+
+    def bench_fake(jobs: list[Job], **options: object) -> list[TimingRow]:
+        arguments = {"rounds": 1, "warm_up": warm_up} | options
+        return bench(threebus, instances, jobs, tmp_path / "timing.csv", **arguments)
+
+    return bench_fake
+
+
+def test_the_first_call_of_a_process_is_on_another_instance(fake, run, instances) -> None:
     fake.times = [100.0, 1.0, 2.0, 3.0]
-    measured = measure(threebus, instances, "fake", "TO", Settings(), repeats=1)
-    assert measured.first.solve_s == 100.0
-    assert [s.solve_s for s in measured.solutions] == [1.0, 2.0, 3.0]
-    assert fake.calls == [instances[0].id, *(i.id for i in instances)]
-    assert all(s.schedule is None for s in measured.solutions)  # schedules would clog the pipe
+    rows = run([TO])
+    assert [row.round for row in rows] == [0, 1, 1, 1]
+    assert [row.instance for row in rows] == fake.calls
+    assert fake.calls == ["threebus-v0000", *(i.id for i in instances)]  # each once, the warm-up never again
+    summary = timing_summary(rows).iloc[0]
+    assert (summary["solve_s"], summary["first_solve_s"]) == (2.0, 100.0)
+    with pytest.raises(InputError, match="warms up"):
+        run([TO], warm_up=instances[0])
 
 
-def test_median_and_quartiles_over_instances_and_repeats(fake, threebus, instances) -> None:
+def test_methods_take_turns_in_an_order_that_rotates(fake, run, instances) -> None:
+    rows = [row for row in run(BOTH, rounds=2) if row.round]
+    assert [row.round for row in rows] == [1] * 6 + [2] * 6
+    assert [row.instance for row in rows[::2]] == [i.id for i in instances] * 2
+    assert all(a.instance == b.instance for a, b in zip(rows[::2], rows[1::2], strict=True))
+    assert [row.regime for row in rows[::2]] == ["TO", "NO", "TO", "NO", "TO", "NO"]
+
+
+def test_every_job_has_a_process_of_its_own(fake, run, monkeypatch) -> None:
+    made: list[Inline] = []
+
+    class Counted(Inline):
+        def __init__(self, count: int) -> None:
+            super().__init__(count)
+            made.append(self)
+
+    monkeypatch.setattr(timing, "Workers", Counted)
+    run(BOTH, rounds=2)
+    assert len(made) == 2
+
+
+def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     fake.times = [9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    (row,) = bench_methods(threebus, instances, ["fake"], ["TO"], Settings(), repeats=2)
-    assert (row.solve_s_q1, row.solve_s, row.solve_s_q3) == (2.25, 3.5, 4.75)
-    assert (row.instances, row.repeats, row.failures) == (3, 2, 0)
-    assert (row.first_build_s, row.build_s) == (0.1, 0.1)
-    assert row.setup_s is None  # the method does not tell: not available, not zero
-    assert row.load_average is not None
+    summary = timing_summary(run([TO], rounds=2))
+    (row,) = summary.to_dict("records")
+    assert (row["solve_s_q1"], row["solve_s"], row["solve_s_q3"]) == (2.25, 3.5, 4.75)
+    assert (row["instances"], row["repeats"], row["failures"]) == (3, 2, 0)
+    assert (row["first_build_s"], row["build_s"]) == (0.1, 0.1)
+    assert np.isnan(row["setup_s"])  # the method does not tell: not available, not zero
+    assert row["load_average"] >= 0
+    assert row["policy"] == "fake one"
+    assert not len(timing_summary([]))
 
 
-@pytest.mark.parametrize(("seconds", "repeats"), [(30.0, 1), (0.1, 6), (1e-6, MAX_REPEATS)])
-def test_fast_methods_are_repeated_more_often(fake, threebus, instances, seconds, repeats) -> None:
-    fake.times = [seconds]
-    (row,) = bench_methods(threebus, instances, ["fake"], ["TO"], Settings())
-    assert row.repeats == repeats
+@pytest.mark.parametrize(
+    ("seconds", "rounds"), [([5.0, 7.0], 2), ([20.0, 30.0], 1), ([0.1, 0.1], MAX_ROUNDS), ([0.0], MAX_ROUNDS)]
+)
+def test_rounds_fill_the_budget(seconds: list[float], rounds: int) -> None:
+    assert rounds_of(dataclasses.replace(ROW, call_s=s) for s in seconds) == rounds
+
+
+def test_fast_methods_take_part_in_more_rounds(fake, run) -> None:
+    assert max(row.round for row in run([TO], rounds=None)) == MAX_ROUNDS
+    fake.times = ["none"]
+    assert max(row.round for row in run([TO], rounds=None, force=True)) == 1  # failures are not repeated
 
 
 def test_a_method_that_does_not_time_itself_is_timed(fake, threebus, instances) -> None:
     fake.times = [None]
-    (row,) = bench_methods(threebus, instances, ["fake"], ["TO"], Settings(), repeats=1)
-    assert row.solve_s is not None
-    assert 0 < row.solve_s < 1
+    solution, seconds = timed(threebus, "fake", "TO", Settings(), instances[0])
+    assert solution.solve_s == seconds
+    assert 0 < seconds < 1
 
 
 def test_torch_uses_one_thread(fake, threebus, instances) -> None:
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        measure(threebus, instances, "fake", "TO", Settings(), repeats=1)
+        timed(threebus, "fake", "TO", Settings(), instances[0])
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
 
 
-def test_failed_solves_are_counted_and_not_timed(fake, threebus, instances) -> None:
+def test_failed_calls_are_counted_and_enter_no_median(fake, run) -> None:
     fake.times = [1.0, 1.0, "none", 3.0]
-    (row,) = bench_methods(threebus, instances, ["fake"], ["TO"], Settings(), repeats=1)
-    assert (row.failures, row.solve_s, row.error) == (1, 2.0, "")
+    row = timing_summary(run([TO])).iloc[0]
+    assert (row["failures"], row["solve_s"], row["error"]) == (1, 2.0, "")
 
 
 @pytest.mark.parametrize("times", [["none"], [RuntimeError("broken")]])
-def test_a_method_that_only_fails_is_a_row_with_its_error(fake, threebus, instances, times) -> None:
+def test_a_method_that_only_fails_is_rows_with_its_error(fake, run, times) -> None:
     fake.times = times
-    (row,) = bench_methods(threebus, instances, ["fake"], ["TO"], Settings(), repeats=1)
-    assert row.solve_s is None
-    assert row.failures == 3
-    assert ("no way" in row.error) or ("broken" in row.error)
+    row = timing_summary(run([TO])).iloc[0]
+    assert np.isnan(row["solve_s"])
+    assert row["failures"] == 3
+    assert ("no way" in row["error"]) or ("broken" in row["error"])
 
 
-def test_finished_rows_are_not_timed_again(fake, threebus, instances, tmp_path: Path) -> None:
-    def bench(**options: object) -> int:
-        fake.calls.clear()
-        bench_folder(tmp_path, threebus, instances, ["fake"], ["NO", "TO"], Settings(), repeats=1, **options)
-        return len(fake.calls)
-
-    assert bench() == 2 * 4
-    first = (tmp_path / "timing.csv").read_bytes()
-    assert bench() == 0
-    assert (tmp_path / "timing.csv").read_bytes() == first
-    assert bench(force=True) == 2 * 4
-    fake.artifact_name = "another policy"
-    assert bench() == 2 * 4
-    assert len(read_timing(tmp_path / "timing.csv")) == 2  # replaced, not added
+def test_what_is_timed_is_compared_with_what_is_kept(
+    fake, run, threebus: Case, instances: list[Instance], tmp_path: Path
+) -> None:
+    results = Results(tmp_path)
+    kept = Schedule(np.array([0.0, instances[1].horizon_s]), np.array([[0.0], [0.25]]))
+    kept.write(results.schedule_path(Key(instances[1].id, "TO", "fake", "default")), threebus.generators)
+    rows = run([TO], results=results)
+    assert [row.schedule_difference_pu for row in rows] == [None, None, 0.25, None]
+    assert timing_summary(rows)["schedule_difference_pu"].to_list() == [0.25]
 
 
-def test_rows_of_other_hosts_and_errors_do_not_count_as_finished(fake, threebus, instances, tmp_path) -> None:
-    options = {"repeats": 1}
-    (row,) = bench_folder(tmp_path, threebus, instances, ["fake"], ["TO"], Settings(), **options)
-    for other in (dataclasses.replace(row, host="elsewhere"), dataclasses.replace(row, error="broken")):
-        fake.calls.clear()
-        (tmp_path / "timing.csv").write_text(format_timing([other]))
-        bench_folder(tmp_path, threebus, instances, ["fake"], ["TO"], Settings(), **options)
-        assert fake.calls
-    assert len(read_timing(tmp_path / "timing.csv")) == 1  # the error is replaced, where it was made
+def test_schedules_on_different_points_are_compared_everywhere() -> None:
+    peak = Schedule(np.array([0.0, 1.0, 2.0]), np.array([[0.0], [1.0], [0.0]]))
+    flat = Schedule(np.array([0.0, 2.0]), np.array([[0.0], [0.0]]))
+    assert largest_difference(peak, flat) == largest_difference(flat, peak) == 1.0
+    assert largest_difference(peak, peak) == 0.0
 
 
-def test_rows_are_saved_one_by_one(fake, threebus, instances, tmp_path, monkeypatch) -> None:
-    """What was timed before an interruption is there, and is not timed again."""
-    interrupted = []
-
-    class Stops(Inline):
-        def imap(self, calls, labels) -> Iterator[tuple[object, object]]:
-            if fake.calls and not interrupted:
-                interrupted.append(True)
-                raise KeyboardInterrupt
-            return super().imap(calls, labels)
-
-    monkeypatch.setattr(timing, "Workers", Stops)
-    with pytest.raises(KeyboardInterrupt):
-        bench_folder(tmp_path, threebus, instances, ["fake"], ["NO", "TO"], Settings(), repeats=1)
-    assert [row.regime for row in read_timing(tmp_path / "timing.csv")] == ["NO"]
+def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
+    first = run(BOTH)
+    assert read_timing(tmp_path / "timing.csv") == first
     fake.calls.clear()
-    bench_folder(tmp_path, threebus, instances, ["fake"], ["NO", "TO"], Settings(), repeats=1)
-    assert len(fake.calls) == 4
-    assert [row.regime for row in read_timing(tmp_path / "timing.csv")] == ["NO", "TO"]
+    assert run(BOTH) == first
+    assert not fake.calls
+    run(BOTH, force=True)
+    assert len(fake.calls) == 2 * 4
+    fake.artifact_name = "another policy"
+    again = run(BOTH)
+    assert len(fake.calls) == 4 * 4
+    assert {row.run for row in again}.isdisjoint(row.run for row in first)
+    assert read_timing(tmp_path / "timing.csv") == again  # replaced as a whole
+
+
+def test_a_run_of_some_methods_does_not_replace_one_of_more(fake, run, tmp_path: Path) -> None:
+    run(BOTH)
+    before = (tmp_path / "timing.csv").read_bytes()
+    with pytest.raises(InputError, match="fake in NO"):
+        run([TO])
+    assert (tmp_path / "timing.csv").read_bytes() == before
+    run([*BOTH, Job("fake", "TO", Settings("other"))])  # more methods: all are timed anew
+    assert len(timing_summary(read_timing(tmp_path / "timing.csv"))) == 3
+
+
+def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
+    """What was timed is kept beside the table, which stays as it was until the run is complete."""
+    fake.times = [1.0] * 5 + [KeyboardInterrupt()]
+    with pytest.raises(KeyboardInterrupt):
+        run(BOTH)
+    assert not (tmp_path / "timing.csv").exists()
+    assert len(read_timing(tmp_path / "timing.partial.csv")) == 4  # one instance by both, and their warm-ups
+    fake.times = [2.0]
+    timing._prepared.cache_clear()
+    rows = run(BOTH)
+    assert [row.solve_s for row in rows] == [1.0] * 4 + [2.0] * 4
+    assert len({row.key for row in rows}) == len(rows) == 8
+    assert [path.name for path in tmp_path.iterdir()] == ["timing.csv"]
 
 
 @pytest.mark.parametrize(
-    ("methods", "regimes", "settings"),
-    [(["nope"], ["TO"], "default"), (["fake"], ["XX"], "default"), (["fake"], ["TO"], "nope")],
+    "job", [("nope", "TO", "default"), ("fake", "XX", "default"), ("fake", "TO", "nope")]
 )
-def test_bad_input(fake, threebus, instances, methods, regimes, settings) -> None:
+def test_bad_input(fake, run, threebus, tmp_path, job) -> None:
     with pytest.raises(InputError):
-        bench_methods(threebus, instances, methods, regimes, Settings(name=settings))
+        run([Job(job[0], job[1], Settings(job[2]))])
     with pytest.raises(InputError, match="at least one"):
-        bench_methods(threebus, [], ["fake"], ["TO"], Settings())
+        run([])
 
 
 def test_full_ded_in_a_process_of_its_own(threebus: Case, tmp_path: Path) -> None:
-    """The real thing: build and set-up of the first solve cost more than those of the timed ones."""
-    instance = sample_instance(threebus, 1, 0).model_copy(update={"horizon_s": 1.0})
-    rows = bench_folder(
-        tmp_path, threebus, [instance], ["ded"], ["TO"], Settings(), repeats=2, problems_version="v"
+    """The real thing: build and set-up of the first call cost more than those of the timed ones."""
+    instance, warm_up = (
+        sample_instance(threebus, 1, i).model_copy(update={"horizon_s": 1.0}) for i in range(2)
+    )
+    rows = bench(
+        threebus,
+        [instance],
+        [Job("ded", "TO", Settings())],
+        tmp_path / "timing.csv",
+        warm_up=warm_up,
+        rounds=2,
+        problems_version="v",
     )
     assert rows == read_timing(tmp_path / "timing.csv")
-    (row,) = rows
-    assert (row.failures, row.error, row.repeats, row.problems_version) == (0, "", 2, "v")
-    assert row.solve_s is not None
-    assert 0 < row.solve_s < 30
-    assert row.first_build_s is not None
-    assert row.build_s is not None
-    assert row.first_build_s > row.build_s
-    assert "ipopt" in row.solver_version
-
-
-def test_round_trip(tmp_path: Path) -> None:
-    path = tmp_path / "timing.csv"
-    rows = [ROW, dataclasses.replace(ROW, regime="NO", solve_s=1 / 3, error='a, "b"\nc', load_average=None)]
-    path.write_text(format_timing(rows))
-    assert read_timing(path) == rows
-    assert read_timing(tmp_path / "none.csv") == []
+    (row,) = timing_summary(rows).to_dict("records")
+    assert (row["failures"], row["error"], row["repeats"], row["problems_version"]) == (0, "", 2, "v")
+    assert 0 < row["solve_s"] < 30
+    assert row["first_build_s"] > row["build_s"]
+    assert "ipopt" in row["solver_version"]
+    assert all(row.call_s > row.solve_s for row in rows)
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (lambda text: text.replace("solve_s,", "", 1), "solve_s"),
-        (lambda text: text.replace("regime,", "regime,extra,", 1), "extra"),
-        (lambda text: text.replace("regime,", "regime,regime,", 1), "regime"),
+        (lambda text: text.replace("round,", "", 1), "round"),
         (lambda text: text.replace(",3.5,", ",nan,"), "solve_s"),
         (lambda text: text.replace(",3.5,", ",-1,"), "solve_s"),
-        (lambda text: text.replace(",10,", ",ten,"), "instances"),
-        (lambda text: text.replace(",10,", ",,"), "instances"),
+        (lambda text: text.replace(",1,", ",one,"), "round"),
         (lambda text: text.replace("TO,", ",", 1), "regime"),
-        (lambda text: text.replace("TO,", "TO,TO,", 1), "line 2"),
-        (lambda text: "", "regime"),
-        (lambda text: text + '"', "line 3"),
     ],
 )
 def test_a_wrong_timing_table_names_the_field(tmp_path: Path, change, field: str) -> None:
     path = tmp_path / "timing.csv"
-    path.write_text(change(format_timing([ROW])))
+    path.write_text(change(TIMING.format([ROW])))
     with pytest.raises(InputError) as caught:
         read_timing(path)
     assert caught.value.source == str(path)
     assert field in caught.value.field
-
-
-def test_a_timing_table_that_is_no_text(tmp_path: Path) -> None:
-    (tmp_path / "timing.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError):
-        read_timing(tmp_path / "timing.csv")
-
-
-def test_only_the_latest_hosts_times_count() -> None:
-    frame = timing_frame(
-        [
-            dataclasses.replace(ROW, host="old", date="2025-01-01T00:00:00Z"),
-            dataclasses.replace(ROW, host="new", date="2026-05-01T00:00:00Z"),
-            dataclasses.replace(ROW, host="new", regime="NO", date="2024-05-01T00:00:00Z"),
-            dataclasses.replace(ROW, host="old", regime="NO", date="2026-04-30T23:59:59Z"),
-        ]
-    )
-    assert set(latest_host(frame)["host"]) == {"new"}
-    assert len(latest_host(frame)) == 2
-    assert len(latest_host(timing_frame([]))) == 0
-    assert list(timing_frame([]).columns) == list(COLUMNS)
 
 
 def test_the_sample_is_spread_and_the_same_every_time(threebus: Case) -> None:
@@ -312,8 +330,8 @@ def test_runs_of_a_results_table(fake) -> None:
         Key("a", "TO", "fake", "default-myfile"),
         Key("a", "TO", "stranger", "default"),
     ]
-    runs = runs_of(keys, Settings(time_limit_s=9.0))
-    assert runs == [
-        ("fake", ["NO", "TO"], Settings(time_limit_s=9.0)),
-        ("fake", ["TO"], Settings(name="other", model="linear", time_limit_s=9.0)),
+    assert runs_of(keys, Settings(time_limit_s=9.0)) == [
+        Job("fake", "NO", Settings(time_limit_s=9.0)),
+        Job("fake", "TO", Settings(time_limit_s=9.0)),
+        Job("fake", "TO", Settings(name="other", model="linear", time_limit_s=9.0)),
     ]

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.evaluate.timing import TimingRow, format_timing
+from ded_bench.evaluate.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.koopman.linear import linear_model
 from ded_bench.problem.case import Case
@@ -89,15 +89,9 @@ def finished(ninebus: Case, problems: Path, tmp_path_factory: pytest.TempPathFac
     rows[lost] = dataclasses.replace(rows[lost], status="TimeLimit", error="time limit", **empty)
     results.schedule_path(rows[lost].key).unlink()
     results.add(rows)
-    timed = TimingRow(
-        "TO", "ded", "default", 10, 1, 0, 3.5, host="h", date="2026-01-01T00:00:00Z", case="9bus"
-    )
-    timed = dataclasses.replace(timed, problems_version=version, load_average=0.9)
-    (folder / "timing.csv").write_text(
-        format_timing(
-            [timed, dataclasses.replace(timed, host="other", solve_s=99.0, date="2025-01-01T00:00:00Z")]
-        )
-    )
+    timed = TimingRow("run", 1, "TO", "ded", "default", "9bus-0000", "Optimal", solve_s=3.5, host="h")
+    timed = dataclasses.replace(timed, case="9bus", problems_version=version, load_average=0.9)
+    TIMING.write(folder / "timing.csv", [timed, dataclasses.replace(timed, case="other", solve_s=99.0)])
     return folder
 
 

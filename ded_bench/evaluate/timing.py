@@ -68,7 +68,7 @@ class TimingRow:
     """
 
     run: str
-    round: int = cell(lowest=0)
+    round: int
     regime: str
     method: str
     settings: str
@@ -327,14 +327,14 @@ def read_timing(path: Path) -> list[TimingRow]:
 
 
 def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
-    """Median and quartiles per (regime, method, settings) over instances and rounds, s.
+    """Median and quartiles per (case, regime, method, settings) over instances and rounds, s.
 
     The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
     enter no median. `load_average` is the median of the calls', `schedule_difference_pu` the largest.
     """
     parts: dict[tuple[str, ...], list[TimingRow]] = {}
     for row in rows:
-        parts.setdefault((row.regime, row.method, row.settings), []).append(row)
+        parts.setdefault((row.case, row.regime, row.method, row.settings), []).append(row)
     found = [_summary(calls) for calls in parts.values()]
     frame = pd.DataFrame(found, columns=list(SUMMARY_COLUMNS))
     numbers = [name for name in SUMMARY_COLUMNS if name.endswith(("_s", "_q1", "_q3", "_pu", "_average"))]

@@ -191,7 +191,7 @@ def test_table_v_is_what_the_rows_say(report, finished: Path) -> None:
             assert row["increase_percent"] == pytest.approx(expected.mean(), rel=1e-12)
             assert row["n"] == len(expected)
     assert made.loc[("NO", "ded-ko"), ["n", "failures"]].to_list() == [TEST - 1, 1]
-    assert made.loc[("TO", "ded"), "solve_s"] == 3.5  # from the latest host, not the other one
+    assert made.loc[("TO", "ded"), "solve_s"] == 3.5  # of this case, not of the other one
     assert np.isnan(made.loc[("NO", "ded"), "solve_s"])
     assert made["paper_solve_s"].notna().all()
 

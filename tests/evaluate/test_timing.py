@@ -91,6 +91,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
     monkeypatch.setattr(timing, "Workers", Inline)
+    monkeypatch.setattr(timing, "code_of_method", lambda method, artifacts: "abc")
     timing._prepared.cache_clear()
     yield module
     timing._prepared.cache_clear()
@@ -155,7 +156,7 @@ def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     assert (row["first_build_s"], row["build_s"]) == (0.1, 0.1)
     assert np.isnan(row["setup_s"])  # the method does not tell: not available, not zero
     assert row["load_average"] >= 0
-    assert row["policy"] == "fake one"
+    assert (row["policy"], row["model"], row["code"]) == ("fake one", "", "abc")
     assert not len(timing_summary([]))
 
 

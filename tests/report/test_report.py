@@ -242,7 +242,7 @@ def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
     ):
         assert fact in text
     assert "| p | 123.5 | 7 |" in text.replace("124", "123.5")
-    assert "Times of other hosts or cases are left out: 1 rows" in text
+    assert "Times of other cases are left out: 1 rows" in text
     assert "No certificate" in text
 
 

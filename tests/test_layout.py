@@ -17,7 +17,7 @@ PACKAGE = Path(ded_bench.__file__).parent
 FLOORS = ("files", "problem", "truth", "koopman", "solvers", "methods", "run", "evaluate", "report", "cli")
 MAX_LINES = 400
 #: What the ground floors may use besides Python's own library: no solver, no model builder, no torch.
-GROUND_LIBRARIES = {"ded_bench", "numpy", "scipy", "pandas", "pydantic", "safetensors"}
+GROUND_LIBRARIES = {"ded_bench", "numpy", "scipy", "pandas", "pydantic", "safetensors", "numba"}
 
 
 def modules() -> dict[str, Path]:

@@ -33,7 +33,7 @@ from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
-from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score_many
+from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score
 from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import SimulationError
 
@@ -289,24 +289,13 @@ def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solve
 def _scores(
     case: Case, instances: list[Instance], schedules: list[Schedule | None], regime: str
 ) -> list[Score | None]:
-    """Scores side by side; None where there is no schedule or the system loses synchronism."""
-    there = [i for i, schedule in enumerate(schedules) if schedule is not None]
-    chosen = [schedule for schedule in schedules if schedule is not None]
-    result: list[Score | None] = [None] * len(instances)
-    try:
-        verdicts = (
-            score_many(case, [instances[i] for i in there], chosen, [regime] * len(there)) if there else []
-        )
-    except SimulationError:
-        if len(instances) == 1:
-            return result
-        return [
-            score
-            for i in range(len(instances))
-            for score in _scores(case, instances[i : i + 1], schedules[i : i + 1], regime)
-        ]
-    for i, verdict in zip(there, verdicts, strict=True):
-        result[i] = verdict
+    """Scores; None where there is no schedule or the system loses synchronism."""
+    result: list[Score | None] = []
+    for instance, schedule in zip(instances, schedules, strict=True):
+        try:
+            result.append(None if schedule is None else score(case, instance, schedule, regime))
+        except SimulationError:
+            result.append(None)
     return result
 
 

@@ -13,7 +13,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.servable import servable
-from ded_bench.truth.simulate import simulate_many
+from ded_bench.truth.simulate import simulate
 
 #: Range of a uniform draw.
 Span = tuple[float, float]
@@ -40,7 +40,7 @@ def trajectories(
     case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
 ) -> Trajectories:
     """Simulate schedules and stack the result."""
-    runs = simulate_many(case, instances, schedules)
+    runs = [simulate(case, *pair) for pair in zip(instances, schedules, strict=True)]
     return Trajectories(
         tuple(instances),
         tuple(kinds),

@@ -40,7 +40,7 @@ from ded_bench.report.page import Block, Picture, Text
 from ded_bench.run.pool import Call, Workers
 from ded_bench.run.results import Key, Results
 from ded_bench.truth.network import Network
-from ded_bench.truth.simulate import SimulationError, Trajectory, bends, simulate_many
+from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
 #: Worst instances are drawn for the page only, at a coarser resolution.
 WORST_DPI = 110
@@ -164,27 +164,16 @@ def _answers(pool: Workers | None, calls: Iterable[Call]) -> Iterator[object]:
 
 
 def _simulations(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
-    """What the figures show, simulated side by side, which costs little more than one.
-
-    Schedules that bend at many points are kept apart: they would force short steps on all others.
-    """
+    """What the figures show, simulated."""
     _read_schedules(gallery, chosen)
-    alike: dict[tuple[int, float, bool], list[Key]] = {}
     for key in filter(gallery.schedules.__contains__, chosen.shown):
-        instance = gallery.instances[key.instance]
-        bent = bends(gallery.schedules[key].at(instance.grid))
-        alike.setdefault((instance.steps, instance.dt_s, 20 * len(bent) > instance.steps), []).append(key)
-    for keys in alike.values():
-        schedules = [gallery.schedules[key] for key in keys]
-        yield simulated, (gallery.case, keys, gallery.posed(keys), schedules)
+        yield simulated, (gallery.case, key, gallery.instances[key.instance], gallery.schedules[key])
 
 
-def simulated(
-    case: Case, keys: list[Key], instances: list[Instance], schedules: list[Schedule]
-) -> dict[Key, Trajectory] | str:
-    """Trajectories of runs, or a note why there are none; in whatever process this is called."""
+def simulated(case: Case, key: Key, instance: Instance, schedule: Schedule) -> dict[Key, Trajectory] | str:
+    """The trajectory of a run, or a note why there is none; in whatever process this is called."""
     try:
-        return dict(zip(keys, simulate_many(case, instances, schedules), strict=True))
+        return {key: simulate(case, instance, schedule)}
     except SimulationError as error:
         return f"Not drawn, since the simulation failed: {error}"
 

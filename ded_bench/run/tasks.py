@@ -18,7 +18,7 @@ from ded_bench.run.environment import host
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError
 from ded_bench.run.shipping import Files, unpacked
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import Score, score_many
+from ded_bench.truth.score import Score, score
 from ded_bench.truth.simulate import SimulationError
 
 if TYPE_CHECKING:
@@ -61,18 +61,15 @@ def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
 
 def score_tasks(
     case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule]
-) -> list[Score | BaseException]:
-    """Score tasks of one time grid side by side; if one loses synchronism, each on its own."""
-    regimes = [task.regime for task in tasks]
-    try:
-        return list(score_many(case, [task.instance for task in tasks], schedules, regimes))
-    except SimulationError as error:
-        if len(tasks) == 1:
-            return [error]
-        middle = len(tasks) // 2
-        return score_tasks(case, tasks[:middle], schedules[:middle]) + score_tasks(
-            case, tasks[middle:], schedules[middle:]
-        )
+) -> list[Score | SimulationError]:
+    """Score tasks one by one; the error stands for those that lose synchronism."""
+    verdicts: list[Score | SimulationError] = []
+    for task, schedule in zip(tasks, schedules, strict=True):
+        try:
+            verdicts.append(score(case, task.instance, schedule, task.regime))
+        except SimulationError as error:
+            verdicts.append(error)
+    return verdicts
 
 
 def failed(error: object) -> Solution:

@@ -17,9 +17,10 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.state import State
+from ded_bench.truth.integrator import Grid
 
-#: Newton stops at this mismatch, pu; doubles resolve f to about 1e-15.
-MISMATCH = 1e-12
+#: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
+MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
 NEWTON_STEPS = 30
 
 
@@ -75,6 +76,17 @@ class Network:
         self.incidence[np.arange(len(ends)), ends[:, 1]] = -1.0
         self.m = np.array([case.machines[g].m for g in case.generators])
         self.d = np.array([case.machines[g].d for g in case.generators])
+        self.mismatch = max(MISMATCH, RESOLUTION * float(self.coupling.max()))
+        self.grid = Grid(
+            self.ends,
+            self.coupling,
+            self.generators,
+            self.algebraic,
+            self.slack,
+            self.m,
+            self.d,
+            self.mismatch,
+        )
         self._outer_algebraic = self._outer(self.algebraic)
         self._outer_unknown = self._outer(self.unknown)
         self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
@@ -140,21 +152,30 @@ class Network:
             PowerFlowError: there are no such angles.
         """
         p_load = instance.p_load(self.case, np.zeros(1))[0]
-        given = instance.theta_initial(self.case)
-        if given is None:
+        theta = instance.theta_initial(self.case)
+        if theta is None:
             return self.power_flow(instance.p_initial(self.case), p_load)
-        theta = np.zeros(self.n_bus)
-        theta[self.generators] = given
-        # Newton's guess: angles that the lines, linearised at zero, would give the other buses.
-        alg, gen = self.algebraic, self.generators
-        wanted = self.load_injections(p_load) - self._flat[np.ix_(alg, gen)] @ given
-        theta[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], wanted)
-        return self.solve_loads(theta, self.load_injections(p_load))[0]
+        state = State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
+        return self.angles(state, p_load)
 
     def initial_state(self, instance: Instance) -> State:
         """The generators at t = 0; raises PowerFlowError where `initial_angles` does."""
         theta = self.initial_angles(instance)[self.generators]
         return State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
+
+    def angles(self, state: State, p_load: Array) -> Array:
+        """Angles of all buses, shape (n_bus,), rad: loads, shape (n_load,), pu, fix those not in the state.
+
+        Raises:
+            PowerFlowError: the loads cannot be served at these angles of the generators.
+        """
+        theta = np.zeros(self.n_bus)
+        theta[self.generators] = state.theta
+        # Newton's guess: angles that the lines, linearised at zero, would give the other buses.
+        alg, gen = self.algebraic, self.generators
+        wanted = self.load_injections(p_load) - self._flat[np.ix_(alg, gen)] @ state.theta
+        theta[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], wanted)
+        return self.solve_loads(theta, self.load_injections(p_load))[0]
 
     def linearise(self, theta: Array) -> Linearisation:
         """Linearise at the angles of an equilibrium, shape (n_bus,)."""
@@ -180,7 +201,7 @@ class Network:
             across = theta @ self.incidence.T
             injections = (np.sin(across) * self.coupling) @ self.incidence
             mismatch = injections[..., rows] - wanted
-            if np.abs(mismatch).max() < MISMATCH:
+            if np.abs(mismatch).max() < self.mismatch:
                 return theta, injections
             jacobian = ((np.cos(across) * self.coupling) @ outer).reshape(*theta.shape[:-1], n, n)
             try:

@@ -5,7 +5,6 @@ It sees an instance and a schedule, never a model, a network or a solver's statu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.simulate import Trajectory, simulate_many
+from ded_bench.truth.simulate import Trajectory, simulate
 
 #: What counts as feasible: excess frequency in Hz, excess of power limits in pu.
 FEASIBLE_HZ, FEASIBLE_PU = 1e-4, 1e-6
@@ -52,19 +51,8 @@ def score(case: Case, instance: Instance, schedule: Schedule, regime: str) -> Sc
         InputError: unknown regime, or the schedule does not span the horizon.
         SimulationError: the system loses synchronism under this schedule.
     """
-    return score_many(case, [instance], [schedule], [regime])[0]
-
-
-def score_many(
-    case: Case, instances: Sequence[Instance], schedules: Sequence[Schedule], regimes: Sequence[str]
-) -> list[Score]:
-    """Simulate schedules side by side and judge each; instances must share one time grid."""
-    case.check_regimes(regimes)
-    trajectories = simulate_many(case, instances, schedules)
-    return [
-        judge(case, instance, trajectory, regime)
-        for instance, trajectory, regime in zip(instances, trajectories, regimes, strict=True)
-    ]
+    case.check_regimes([regime])
+    return judge(case, instance, simulate(case, instance, schedule), regime)
 
 
 def judge(case: Case, instance: Instance, trajectory: Trajectory, regime: str) -> Score:

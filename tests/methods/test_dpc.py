@@ -28,7 +28,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
-from ded_bench.truth.score import score_many
+from ded_bench.truth.score import score
 
 HORIZON = 4.0
 N_KNOTS = 50
@@ -129,7 +129,8 @@ def test_bounds_ramps_and_initial_input_hold_for_any_weights(case: Case, size: f
 def test_the_scorer_finds_no_violation_of_what_holds_by_construction(case: Case) -> None:
     instances = some_instances(case, 4)
     schedules = random_policy(case)(instances)
-    for verdict in score_many(case, instances, schedules, [next(iter(case.regimes))] * 4):
+    for instance, schedule in zip(instances, schedules, strict=True):
+        verdict = score(case, instance, schedule, next(iter(case.regimes)))
         assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) <= 1e-12
 
 

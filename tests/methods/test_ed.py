@@ -13,7 +13,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import score_many
+from ded_bench.truth.score import score
 
 RAMP = 0.05  # pu/s, both cases
 
@@ -55,8 +55,8 @@ def test_limits_hold_and_no_optimality_is_claimed(case: Case) -> None:
     instances = [sample_instance(case, 77, i).model_copy(update={"horizon_s": 2.0}) for i in range(3)]
     for slug in SETTINGS:
         solutions = [prepare(case, "TO", Settings(slug))(instance) for instance in instances]
-        verdicts = score_many(case, instances, [s.schedule for s in solutions], ["TO"] * len(instances))
-        for solution, verdict in zip(solutions, verdicts, strict=True):
+        for instance, solution in zip(instances, solutions, strict=True):
+            verdict = score(case, instance, solution.schedule, "TO")
             assert solution.status == Status.FEASIBLE
             assert solution.solver_objective is None
             assert verdict.ramp_violation < 1e-15  # rounding of powers of about 1 pu

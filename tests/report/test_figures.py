@@ -26,7 +26,7 @@ from ded_bench.report.figures.frequencies import frequency_figure, koopman_figur
 from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
 from ded_bench.report.figures.style import RAD_TO_HZ, Shown, colour, dashes, marker, save_figure, thin
 from ded_bench.report.gallery import rollout
-from ded_bench.truth.simulate import simulate_many
+from ded_bench.truth.simulate import simulate
 
 HORIZON = 2.0
 
@@ -42,7 +42,7 @@ def shown(case: Case, instance: Instance) -> list[Shown]:
     start = instance.p_initial(case)
     ends = np.array([0.0, HORIZON])
     schedules = [Schedule(ends, np.stack([start, start - drop])) for drop in (0.0, 0.05)]
-    runs = simulate_many(case, [instance, instance], schedules)
+    runs = [simulate(case, instance, schedule) for schedule in schedules]
     return [Shown("ded", "default", runs[0]), Shown("ded-dpc-paper", "default", runs[1])]
 
 

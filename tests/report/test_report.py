@@ -28,7 +28,7 @@ from ded_bench.report.report import write_report
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results, Row
 from ded_bench.run.runner import scored_row
-from ded_bench.truth.score import score_many
+from ded_bench.truth.score import score
 from tests.reading import Page
 from tests.report.conftest import TEST, TRAIN
 
@@ -80,7 +80,7 @@ def finished(ninebus: Case, problems: Path, tmp_path_factory: pytest.TempPathFac
                 )
                 schedules.append(dispatch(ninebus, instance, lag))
                 instances.append(instance)
-    scores = score_many(ninebus, instances, schedules, [row.regime for row in rows])
+    scores = [score(ninebus, *run, row.regime) for *run, row in zip(instances, schedules, rows, strict=True)]
     for row, schedule in zip(rows, schedules, strict=True):
         schedule.write(results.schedule_path(row.key), ninebus.generators)
     rows = [scored_row(row, verdict) for row, verdict in zip(rows, scores, strict=True)]

@@ -11,7 +11,7 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.score import Score, judge, score, score_many
+from ded_bench.truth.score import Score, judge, score
 from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
 N = 101
@@ -226,25 +226,6 @@ def test_slow_loads_approach_static_dispatch(case, quiet_instance):
         assert verdict.initial_violation < 1e-12
     assert excess[-1] < 1e-3
     np.testing.assert_allclose([excess[0] / excess[1], excess[1] / excess[2]], 2.0, rtol=0.05)
-
-
-def test_many_equals_one_by_one(case, alter, quiet_instance, constant):
-    """Side by side, also in different regimes, within the simulator's tolerance."""
-    quiet = quiet_instance(case, horizon_s=1.0)
-    pushed = alter(
-        quiet,
-        initial={"power": quiet.initial.power, "omega": dict.fromkeys(case.generators, 0.02)},
-    )
-    instances = [quiet, pushed, pushed]
-    schedules = [constant(quiet, case.p_nominal)] * 2 + [constant(quiet, case.p_nominal + 0.01)]
-    regimes = ["NO", "TO", "NO"]
-    for i, verdict in enumerate(score_many(case, instances, schedules, regimes)):
-        alone = score(case, instances[i], schedules[i], regimes[i])
-        np.testing.assert_allclose(
-            dataclasses.astuple(verdict), dataclasses.astuple(alone), rtol=1e-9, atol=1e-10
-        )
-    with pytest.raises(ValueError, match="argument"):
-        score_many(case, instances, schedules, regimes[:2])
 
 
 # Thresholds.

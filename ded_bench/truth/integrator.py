@@ -1,0 +1,185 @@
+"""The index-1 swing DAE, integrated by an explicit Runge-Kutta method with steps of fixed length; compiled.
+
+The method is whatever tableau is given. At every stage the angles of load and junction buses are solved for
+by Newton's method with a kept inverse of the Jacobian ("chord"), which is renewed where it converges slowly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.problem.case import Array
+from ded_bench.problem.compiled import compiled
+
+Indices = NDArray[np.int_]
+
+#: Newton gives up after so many steps.
+NEWTON_STEPS = 30
+#: The Jacobian is renewed where a step makes the mismatch smaller by less than this factor.
+CONTRACTION = 0.02
+
+
+class Tableau(NamedTuple):
+    """Coefficients of an explicit Runge-Kutta method with s stages."""
+
+    a: Array  # (s, s), strictly lower triangular
+    b: Array  # (s,)
+    c: Array  # (s,)
+
+
+class Grid(NamedTuple):
+    """A lossless network and its machines."""
+
+    lines: Indices  # (n_line, 2): the buses that each joins
+    coupling: Array  # (n_line,), pu
+    generators: Indices  # (n_gen,): their buses
+    algebraic: Indices  # (n_algebraic,): load and junction buses
+    slack: int
+    m: Array  # (n_gen,), s² pu/rad
+    d: Array  # (n_gen,), s pu/rad
+    mismatch: float  # algebraic equations are solved to this, pu
+
+
+class Inputs(NamedTuple):
+    """What drives the grid at the points of time, linear between them."""
+
+    p_gen: Array  # (n, n_gen), pu
+    injection: Array  # (n, n_algebraic), pu
+    dt: float  # s
+
+
+@compiled
+def integrate(
+    tableau: Tableau, grid: Grid, inputs: Inputs, steps: int, theta: Array, omega: Array, p_slack: Array
+) -> int:
+    """Integrate from the first point of time to the last.
+
+    Args:
+        tableau: the method.
+        grid: the network.
+        inputs: powers at n points of time.
+        steps: steps from one point to the next.
+        theta: angles of all buses, (n, n_bus), rad; the first row is given and the others are computed.
+        omega: frequency deviations, (n, n_gen), rad/s; likewise.
+        p_slack: receives the slack's power, (n,), pu.
+
+    Returns:
+        The number of points computed: less than n where the algebraic equations have no solution.
+    """
+    n: int = len(omega)
+    n_gen, n_bus, n_algebraic = omega.shape[1], theta.shape[1], len(grid.algebraic)
+    n_stages = len(tableau.c)
+    h = inputs.dt / steps
+    # Angles at the same stage of the last four steps predict those of the next.
+    recent = np.empty((4, n_stages, n_algebraic))
+    for i in range(n_algebraic):
+        recent[:, :, i] = theta[0, grid.algebraic[i]]
+    angle, f, wanted = theta[0].copy(), np.empty(n_bus), np.empty(n_algebraic)
+    angle_rate, speed_rate = np.empty((n_stages, n_gen)), np.empty((n_stages, n_gen))
+    start, speed = np.empty(n_gen), omega[0].copy()
+    for g in range(n_gen):
+        start[g] = angle[grid.generators[g]]
+    inverse = np.empty((n_algebraic, n_algebraic))
+    _invert(grid, angle, inverse)
+    for k in range(n):
+        for j in range(steps):
+            for s in range(n_stages):
+                inside = (j + tableau.c[s]) / steps
+                for g in range(n_gen):
+                    first, second = start[g], speed[g]
+                    for r in range(s):
+                        first += h * tableau.a[s, r] * angle_rate[r, g]
+                        second += h * tableau.a[s, r] * speed_rate[r, g]
+                    angle[grid.generators[g]] = first
+                    angle_rate[s, g] = second
+                after = min(k + 1, n - 1)
+                for i in range(n_algebraic):
+                    wanted[i] = inputs.injection[k, i]
+                    wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
+                    ahead = 4.0 * (recent[0, s, i] + recent[2, s, i])
+                    ahead -= 6.0 * recent[1, s, i] + recent[3, s, i]
+                    angle[grid.algebraic[i]] = ahead
+                solved = _solve_algebraic(grid, wanted, inverse, angle, f)
+                if not solved:  # a bad guess? from the angles of the step before, then
+                    for i in range(n_algebraic):
+                        angle[grid.algebraic[i]] = recent[0, s, i]
+                    solved = _solve_algebraic(grid, wanted, inverse, angle, f)
+                if not solved:
+                    return k
+                for i in range(n_algebraic):
+                    recent[3, s, i], recent[2, s, i] = recent[2, s, i], recent[1, s, i]
+                    recent[1, s, i] = recent[0, s, i]
+                    recent[0, s, i] = angle[grid.algebraic[i]]
+                if s == 0 and j == 0:
+                    theta[k], omega[k], p_slack[k] = angle, speed, f[grid.slack]
+                    if k == n - 1:
+                        return n
+                for g in range(n_gen):
+                    power = inputs.p_gen[k, g] + inside * (inputs.p_gen[after, g] - inputs.p_gen[k, g])
+                    force = power - f[grid.generators[g]] - grid.d[g] * angle_rate[s, g]
+                    speed_rate[s, g] = force / grid.m[g]
+            for s in range(n_stages):
+                for g in range(n_gen):
+                    start[g] += h * tableau.b[s] * angle_rate[s, g]
+                    speed[g] += h * tableau.b[s] * speed_rate[s, g]
+    return n
+
+
+@compiled
+def _solve_algebraic(grid: Grid, wanted: Array, inverse: Array, angle: Array, f: Array) -> bool:
+    """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
+
+    Returns:
+        Whether there is a solution; if there is none, angles and f mean nothing.
+    """
+    n = len(wanted)
+    correction = np.empty(n)
+    last = np.inf
+    for _ in range(NEWTON_STEPS):
+        f[:] = 0.0
+        for i in range(len(grid.coupling)):
+            near, far = grid.lines[i, 0], grid.lines[i, 1]
+            flow = grid.coupling[i] * np.sin(angle[near] - angle[far])
+            f[near] += flow
+            f[far] -= flow
+        worst = 0.0
+        for i in range(n):
+            worst = max(worst, abs(f[grid.algebraic[i]] - wanted[i]))
+        if worst < grid.mismatch:
+            return True
+        if not worst < np.inf:
+            return False
+        if worst > CONTRACTION * last:
+            _invert(grid, angle, inverse)
+        last = worst
+        correction[:] = 0.0
+        for i in range(n):  # the inverse is symmetric: row after row is the fastest way through it
+            off, row = f[grid.algebraic[i]] - wanted[i], inverse[i]
+            for j in range(n):
+                correction[j] += off * row[j]
+        for i in range(n):
+            angle[grid.algebraic[i]] -= correction[i]
+    return False
+
+
+@compiled
+def _invert(grid: Grid, angle: Array, inverse: Array) -> None:
+    """Set the inverse of the algebraic buses' Jacobian ∂f/∂θ; LinAlgError if it is singular."""
+    place = np.full(len(angle), -1)
+    for i in range(len(grid.algebraic)):
+        place[grid.algebraic[i]] = i
+    jacobian = np.zeros((len(grid.algebraic), len(grid.algebraic)))
+    for i in range(len(grid.coupling)):
+        near, far = place[grid.lines[i, 0]], place[grid.lines[i, 1]]
+        slope = grid.coupling[i] * np.cos(angle[grid.lines[i, 0]] - angle[grid.lines[i, 1]])
+        if near >= 0:
+            jacobian[near, near] += slope
+        if far >= 0:
+            jacobian[far, far] += slope
+        if near >= 0 and far >= 0:
+            jacobian[near, far] -= slope
+            jacobian[far, near] -= slope
+    inverse[:] = np.linalg.inv(jacobian)

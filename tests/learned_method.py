@@ -1,0 +1,70 @@
+"""A trained method in one module: a constant schedule, whose powers are learned (badly)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.koopman.model import Koopman
+from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.policy_file import find_policy_file
+from ded_bench.methods.registry import Method
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.training_record import TrainingOptions, write_history
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+
+SETTINGS = {"default": {}, "cautious": {"share": 0.25}}
+#: The line of the registry.
+LEARNED = Method("learned", "tests.learned_method", "Learned constant", trainer="tests.learned_method")
+
+
+@dataclass(frozen=True)
+class Policy:
+    training: dict[str, Any]
+
+
+def train(
+    case: Case,
+    regime: str,
+    instances: Sequence[Instance],
+    model: Koopman,
+    out: Path,
+    options: TrainingOptions,
+    /,
+    *,
+    epochs: int = 3,
+    share: float = 0.5,
+) -> Policy:
+    """The generators' mean initial powers, approached from their lower limits."""
+    mean = np.mean([i.p_initial(case) for i in instances], axis=0)
+    first = float(np.sum((mean - case.p_min) ** 2))
+    errors = [first * (1.0 - share) ** (2 * epoch) for epoch in range(1, epochs + 1)]
+    power = mean + (case.p_min - mean) * (1.0 - share) ** epochs
+    facts = {"epochs": epochs, "seconds": 0.0, "training_loss": errors[-1], "seed": options.seed}
+    write_arrays(out, {"power": power}, {"training": facts | {"model": model.kind}})
+    write_history(out, [{"epoch": e, "seconds": 0.0, "training": error} for e, error in enumerate(errors, 1)])
+    return Policy(facts)
+
+
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    path = find_policy_file(LEARNED.name, case, regime, settings)
+    power = read_arrays(path)[0]["power"]
+    return Artifact("policy", LEARNED.name, power.tobytes().hex()[:12], path), model_artifact(case, settings)
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    power = read_arrays(find_policy_file(LEARNED.name, case, regime, settings))[0]["power"]
+
+    def solve(instance: Instance) -> Solution:
+        schedule = Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power]))
+        return Solution(Status.POLICY, schedule, solve_s=1e-6)
+
+    return solve

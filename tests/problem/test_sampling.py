@@ -234,15 +234,49 @@ def test_committed_benchmark_is_what_the_sampler_writes(written):
         assert (folder / name).read_bytes() == (committed / name).read_bytes(), name
 
 
-def test_committed_manifest_holds_the_checksums(written):
-    """SHA-256 of each committed file, computed here; the version follows from them."""
-    committed = SHIPPED_CASES / "9bus"
+#: Instances for training and testing of every shipped case.
+SIZES = {
+    "9bus": (400, 100),
+    "two-area": (400, 100),
+    "39bus": (400, 100),
+    "68bus": (150, 50),
+    "140bus": (80, 20),
+}
+
+
+def test_every_shipped_case_has_its_sizes():
+    """A case that is shipped is tested here."""
+    assert {path.parent.name for path in SHIPPED_CASES.glob("*/case.json")} == SIZES.keys()
+    for name, sizes in SIZES.items():
+        split = load_split(SHIPPED_CASES / name)
+        assert (len(split.train), len(split.test)) == sizes
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_committed_manifest_holds_the_checksums(name):
+    """SHA-256 of each committed file, computed here; nothing is missing and nothing else lies there."""
+    committed = SHIPPED_CASES / name
     manifest = load_manifest(committed)
     assert manifest is not None
-    assert manifest == written[1]
-    assert len(manifest.files) == COUNT + 2
+    files = {p.relative_to(committed).as_posix() for p in committed.rglob("*.json")} - {"MANIFEST.json"}
+    assert files == manifest.files.keys()
+    assert len(files) == sum(SIZES[name]) + 2
     for name, digest in manifest.files.items():
         assert hashlib.sha256((committed / name).read_bytes()).hexdigest() == digest, name
+
+
+@pytest.mark.parametrize("name", set(SIZES) - {"9bus"})
+def test_committed_instances_are_drawn_and_keep_the_sign_of_loads(name):
+    """Those that were drawn once are what the sampler draws; in all of them loads stay loads."""
+    folder = SHIPPED_CASES / name
+    instances, case = load_instances(sorted((folder / "instances").iterdir()))
+    drawn = list(drawn_with_redraws(case, SEED, len(instances)))
+    manifest = load_manifest(folder)
+    assert manifest is not None
+    differing = sum(a != b for a, (b, _) in zip(instances, drawn, strict=True))
+    assert differing <= manifest.redraws - sum(redraws for _, redraws in drawn) <= 0.05 * len(instances)
+    ends = np.array([i.p_load(case, np.array([0.0, i.horizon_s])) for i in instances])
+    assert (ends * case.load_nominal >= 0).all()
 
 
 def test_committed_split_is_400_to_100_and_disjoint(written):

@@ -15,7 +15,7 @@ DEFAULT_MODEL = "koopman"
 
 @dataclass(frozen=True)
 class Solution:
-    """One method's answer for one instance. Times are wall-clock seconds, kept apart.
+    """One method's answer for one instance. Times are wall-clock seconds.
 
     `build_s` makes or updates the model, `setup_s` prepares the solver (.nl file, symbolic
     derivatives), `solve_s` is the solver alone, or a policy's inference.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +30,8 @@ from tests.learned_method import LEARNED
 def problem(tmp_path: Path) -> Path:
     """Five instances on the three-bus case."""
     folder = tmp_path / "problem"
-    assert (
-        main(["instances", "--case", str(CASE_FILES["threebus"]), "--count", "5", "--out", str(folder)]) == 0
-    )
+    case = str(CASE_FILES["threebus"])
+    assert main(["instances", "--case", case, "--count", "5", "--out", str(folder)]) == 0
     return folder
 
 
@@ -94,6 +95,14 @@ def test_the_command_names_what_it_trains(out: Path, problem: Path, capsys) -> N
             main(arguments)
         told = "".join(capsys.readouterr())
         assert all(name in told for name in trainable())
+
+
+def test_help_does_without_torch() -> None:
+    code = "import sys; from ded_bench.cli import main\ntry: main(['train-dpc', '--help'])\n"
+    code += "except SystemExit: sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "ded-dpc-paper" in done.stdout
 
 
 def test_a_place_that_cannot_be_written_is_told_before_the_training(problem: Path, out: Path, capsys) -> None:

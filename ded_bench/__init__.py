@@ -57,7 +57,9 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a class when it is first asked for."""
+    """Import a class when it is first asked for, and look up the version."""
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("ded-bench")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)

@@ -154,7 +154,8 @@ def damaged_table(text: str, rng: random.Random) -> Mutant:
     else:
         rows[0][column] = rng.choice([f"{name}_mw", name.upper() + "!", "", "time (ms)", rows[0][0]])
         names = (name, rows[0][column])
-    return Mutant("\n".join(map(",".join, rows)).encode("utf-8", "surrogatepass"), names)
+    whole = "".join(",".join(row) + "\n" for row in rows)
+    return Mutant(whole.encode("utf-8", "surrogatepass"), names)
 
 
 def damaged_arrays(data: bytes, rng: random.Random) -> Mutant:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -14,11 +15,12 @@ import numpy as np
 import psutil
 import pytest
 
+import ded_bench
 from ded_bench.cli import main
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.results import Results
+from ded_bench.run.results import Results, Row
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
 
@@ -209,10 +211,76 @@ def test_errors_do_not_depend_on_the_working_directory(instance_file: Path, tmp_
     assert json.loads(done.stdout)["initial_violation"] == 0.0
 
 
+def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys) -> None:
+    """Exit code 0 if every kept schedule says what its row says, else 1 and a line for each that does not."""
+    out = tmp_path / "out"
+    assert main([*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]) == 0
+    results = Results(out)
+    first, second, *_ = results.rows.values()
+    results.schedule_path(first.key).unlink()
+    check = ["score", "--results", str(out), "--case", str(problem)]
+    capsys.readouterr()
+    assert main(check) == 0
+    said = capsys.readouterr().out
+    summary = f"4 rows checked in {results.path}, 0 differences, 1 rows without a kept schedule\n"
+    assert said == summary
+    results.add([dataclasses.replace(second, objective=second.objective * (1 + 1e-8))])
+    assert main([*check, "--json"]) == 1
+    out_text, err = capsys.readouterr()
+    assert len([json.loads(line) for line in out_text.splitlines()]) == 4
+    assert f"ded default NO {second.instance}: objective" in err
+    assert main([*check, "--update"]) == 0
+    assert main(check) == 0
+    again = [*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]
+    capsys.readouterr()
+    assert main(again) == 0  # a scored row is finished, though its schedule is not kept
+    assert "5 were there already" in capsys.readouterr().err
+
+
+def test_a_results_folder_that_cannot_be_checked(problem: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "empty").mkdir()
+    for folder in ("nowhere", "file", "empty"):
+        assert folder in refused(capsys, "score", "--results", tmp_path / folder)
+    (tmp_path / "empty" / "results.csv").write_text("a,b\n1,2\n")
+    assert "(found: a, b)" in refused(capsys, "score", "--results", tmp_path / "empty")
+    Results(tmp_path / "odd").add([Row("x", "test", "NO", "ded", "default", "Optimal", case="atlantis")])
+    assert "atlantis" in refused(capsys, "score", "--results", tmp_path / "odd")
+    assert "--update" in refused(capsys, "score", "--schedule", "a.csv", "--regime", "NO", "--update")
+    assert "--regime" in refused(capsys, "score", "--schedule", "a.csv")
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "/proc/none"])
+def test_a_folder_that_cannot_be_made(place: str, instance_file: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / place
+    assert str(place) in refused(capsys, *SOLVE, "--instance", instance_file, "--out", out)
+    assert place in refused(capsys, "train-ko", "--case", CASE_FILES["threebus"].parent, "--out", out / "k")
+
+
+def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp_path: Path, capsys) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    line = refused(capsys, *SOLVE, "--instance", instance_file, "--out", tmp_path / "out")
+    assert line == "ded-bench: No space left on device\n"
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"ded-bench {ded_bench.__version__}\n"
+    assert ded_bench.__version__.count(".") == 2
+
+
 def test_every_command_has_help() -> None:
     overview = run_cli("--help").stdout
     assert len(overview.splitlines()) < 24  # one screen, with the prompt
     assert max(map(len, overview.splitlines())) <= 80
-    for command in ("instances", "solve", "train-ko", "train-dpc", "score", "bench", "report"):
-        assert f"\n    {command} " in overview
+    listed = [line.split()[0] for line in overview.splitlines() if line.startswith("    ") and line[4] != " "]
+    road = ["instances", "train-ko", "solve", "train-dpc", "bench", "report"]
+    assert listed == [*road, "score", "compare", "certify", "rollouts"]
+    for command in listed:
         assert run_cli(command, "--help").returncode == 0

@@ -40,7 +40,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import Manifest, Split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run import runner
-from ded_bench.run.results import Results, Row, format_rows, read_rows
+from ded_bench.run.results import ROWS, Results, Row
 from ded_bench.truth import score as scorer
 from tests.damage import (
     Mutant,
@@ -88,7 +88,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     schedule.write(folder / "schedule.csv.gz", case.generators)
     claimed = {("NO", "ded"): "Optimal", ("TO", "ded"): "Optimal", ("TO", "ded-dpc"): "Policy"}
     rows = [scored(Row(instance.id, "test", *key, "default", status)) for key, status in claimed.items()]
-    (folder / "results.csv").write_text(format_rows(rows))
+    ROWS.write(folder / "results.csv", rows)
     timed = ("ded", "default", instance.id, "Optimal")
     TIMING.write(folder / "timing.csv", [TimingRow("x", 1, r, *timed, solve_s=0.1) for r in case.regimes])
     rng = np.random.default_rng(0)
@@ -258,7 +258,7 @@ def test_summaries_survive_what_results_may_hold(folder: Path) -> None:
     for mutant in itertools.islice(mutants("results", [lambda r: damaged_table(whole, r)]), 80):
         path.write_bytes(mutant.data)
         try:
-            rows = {row.key: row for row in read_rows(path)}
+            rows = {row.key: row for row in ROWS.read(path)}
         except InputError:
             continue
         results = Results(folder)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Generator
 from typing import Any, NoReturn
 
 from ded_bench.koopman.surrogates import MODELS
 from ded_bench.methods.registry import METHODS
+from ded_bench.run.environment import version
 
 #: The shipped case that is meant where none is named.
 DEFAULT_CASE = "9bus"
@@ -14,6 +16,11 @@ KNOWN = ", ".join(METHODS)
 MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 
 
+#: The order of the list of commands: those of the road, then what judges results; others come last.
+ORDER = (
+    *("instances", "train-ko", "solve", "train-dpc", "bench", "report"),
+    *("score", "compare", "certify", "rollouts"),
+)
 #: Under the list of commands, which must fit a terminal of 24 lines and 80 columns.
 ROAD = (
     "The road: instances, train-ko, solve, train-dpc, solve, bench, report; `make report` walks it. "
@@ -35,6 +42,24 @@ class OneLinePerCommand(argparse.HelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=16, width=79)
         self._action_max_length = 14  # argparse forgets that commands are indented once more
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Generator[argparse.Action, None, None]:
+        def place(command: argparse.Action) -> int:
+            return ORDER.index(command.dest) if command.dest in ORDER else len(ORDER)
+
+        if isinstance(action, argparse._SubParsersAction):
+            self._indent()
+            yield from sorted(action._get_subactions(), key=place)
+            self._dedent()
+
+
+class ShowVersion(argparse.Action):
+    """Print the package's version, looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Print one line and exit with code 0."""
+        print(f"{parser.prog} {version()}")
+        parser.exit()
 
 
 def command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from ded_bench.cli import evaluation_commands, problem_commands, solve_commands, training_commands
-from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser
+from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser, ShowVersion
 from ded_bench.files.errors import InputError
 from ded_bench.run.pool import WorkersLostError
 
@@ -20,6 +20,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=ROAD,
         formatter_class=OneLinePerCommand,
     )
+    top.add_argument("--version", action=ShowVersion, nargs=0, help="show the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
     for group in (problem_commands, solve_commands, training_commands, evaluation_commands):
         group.add_commands(commands)
@@ -40,6 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:
         return 1
+    except OSError as error:  # a full disk, a folder that is read-only or a file
+        place = f"{error.filename}: " if error.filename else ""
+        print(f"ded-bench: {place}{error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("ded-bench: interrupted; what was finished is saved, run again to continue", file=sys.stderr)
         return 130

@@ -23,7 +23,9 @@ from ded_bench.koopman.surrogates import default_results, search_folders
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import SPLITS, Selection, select_files, select_split
 from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
 
 if TYPE_CHECKING:
     from ded_bench.run.results import Results, Row
@@ -31,6 +33,11 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
+    _add_solve(commands)
+    _add_score(commands)
+
+
+def _add_solve(commands: Any) -> None:
     p = command(commands, "solve", "solve instances with methods, score, one row each")
     p.add_argument(
         "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
@@ -53,14 +60,18 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--out", type=Path, help="results folder")
     p.set_defaults(run=_solve)
 
+
+def _add_score(commands: Any) -> None:
     p = command(commands, "score", "simulate schedule CSVs on the true system and judge them")
     given = p.add_mutually_exclusive_group(required=True)
     given.add_argument("--schedule", type=Path, metavar="CSV", help="one, for one --instance")
     given.add_argument("--schedules", type=Path, metavar="DIR", help="[REGIME/]INSTANCE.csv[.gz] become rows")
+    given.add_argument("--results", type=Path, metavar="DIR", help="compare its rows and kept schedules")
+    p.add_argument("--update", action="store_true", help="write the new scores into the rows of --results")
     p.add_argument("--name", help="what the rows of --schedules call your method")
-    p.add_argument("--regime", type=names, required=True, metavar="R[,R]", help="NO, TO")
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="NO, TO; not for --results")
     chosen = p.add_mutually_exclusive_group()
-    chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test")
+    chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test; not for --results")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
     p.add_argument("--case", help="name of a shipped case, or a folder")
@@ -73,21 +84,25 @@ def add_commands(commands: Any) -> None:
 def _solve(a: argparse.Namespace) -> int:
     from ded_bench.methods.registry import get_method
     from ded_bench.run.results import Results
-    from ded_bench.run.runner import make_tasks, run
-    from ded_bench.solvers.status import Status
+    from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
 
     methods = [get_method(name).name for name in a.method]
     chosen = _chosen(a)
     case = chosen.case
     results = Results(a.out or default_results(case))
-    settings = _settings(a, case, results.folder)
-    tasks = make_tasks(case, chosen.instances, methods, a.regime, settings)
+    tasks = make_tasks(case, chosen.instances, methods, a.regime, _settings(a, case, results.folder))
+    for line in fallbacks(tasks, results.folder):
+        print(f"ded-bench: {line}", file=sys.stderr)
+    todo, unscored = unfinished(tasks, results)
+    if unscored:
+        print(f"ded-bench: {len(unscored)} rows are solved already and only scored now", file=sys.stderr)
 
     def print_row(row: Row) -> None:
         if a.instance:
             _print_row(results, row)
 
-    finished = [task.key for task in tasks if results.has(task.key, task.fingerprint)]
+    waiting = {task.key for task in (*todo, *unscored)}
+    finished = [task.key for task in tasks if task.key not in waiting]
     for key in finished:
         print_row(results.rows[key])
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
@@ -101,11 +116,20 @@ def _solve(a: argparse.Namespace) -> int:
 
 
 def _score(a: argparse.Namespace) -> int:
+    if a.update and not a.results:
+        raise InputError("--update", "", "is only for --results")
+    if a.results:
+        return _score_results(a)
+    if not a.regime:
+        raise InputError("--regime", "", "is needed to judge a schedule")
+    return _score_folder(a) if a.schedules else _score_one(a)
+
+
+def _score_one(a: argparse.Namespace) -> int:
+    """One schedule file, for one instance."""
     from ded_bench.truth.score import score
     from ded_bench.truth.simulate import SimulationError
 
-    if a.schedules:
-        return _score_folder(a)
     if len(a.instance or ()) != 1 or len(a.regime) != 1:
         raise InputError("--schedule", str(a.schedule), "needs one --instance and one --regime")
     chosen, (regime,) = _chosen(a), a.regime
@@ -127,6 +151,51 @@ def _score(a: argparse.Namespace) -> int:
         for name, value in facts.items():
             print(f"{name:20} {value}")
     return 0
+
+
+def _score_results(a: argparse.Namespace) -> int:
+    """The schedules kept in a results folder, against its rows."""
+    from ded_bench.run.results import Results
+    from ded_bench.run.scoring import rescore
+
+    results = Results(a.results)
+    if not results.rows:
+        raise InputError(results.path, "", "is missing or has no rows")
+    case, instances = _instances_of(a, results)
+    stream = sys.stderr if a.json else sys.stdout
+
+    def say(sentence: str) -> None:
+        print(sentence, file=stream, flush=True)
+
+    check = rescore(case, instances, results, a.workers, update=a.update, on_difference=say)
+    if a.json:
+        for row in check.rows:
+            _print_row(results, row)
+    parts = [
+        f"{len(check.rows)} rows {'scored anew' if a.update else 'checked'} in {results.path}",
+        f"{len(check.differences)} differences",
+        f"{check.without_schedule} rows without a kept schedule",
+        *([f"{check.unscored} not scored yet"] if check.unscored else []),
+        *([f"{check.unknown} of unknown instances"] if check.unknown else []),
+    ]
+    say(", ".join(parts))
+    return 0 if a.update or not check.differences else 1
+
+
+def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[str, Instance]]:
+    """The case of a results folder and its instances by id, wherever they come from."""
+    if a.instance:
+        chosen = _chosen(a)
+        return chosen.case, {instance.id: instance for instance, _ in chosen.instances}
+    named = {row.case for row in results.rows.values()}
+    if not a.case and len(named) != 1:
+        raise InputError(results.path, "case", f"rows of {len(named)} cases: choose one by --case")
+    place = a.case or named.pop()
+    splits = {row.split for row in results.rows.values()}
+    needed = ["all", *(["validation"] if "validation" in splits else [])]
+    selections = [select_split(place, split) for split in needed]
+    found = {instance.id: instance for chosen in selections for instance, _ in chosen.instances}
+    return selections[0].case, found
 
 
 def _score_folder(a: argparse.Namespace) -> int:
@@ -167,7 +236,7 @@ def _chosen(a: argparse.Namespace) -> Selection:
 def _print_row(results: Results, row: Row) -> None:
     """One JSON object: the row, and where its schedule lies."""
     path = results.schedule_path(row.key)
-    scheduled = path.is_file() and row.status != "Failed"
+    scheduled = path.is_file() and row.status != Status.FAILED
     fields = dataclasses.asdict(row) | {"schedule": str(path) if scheduled else None}
     print(json.dumps(fields), flush=True)
 

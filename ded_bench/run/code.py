@@ -37,7 +37,7 @@ def code_of(module: str) -> str:
 def code_of_method(method: Method, artifacts: tuple[Artifact, ...]) -> str:
     """The code of one of our methods, or what one of others says of its own."""
     foreign = [artifact.fingerprint for artifact in artifacts if artifact.kind == "code"]
-    return "-".join(foreign) if ":" in method.module else code_of(method.module)
+    return code_of(method.module) if _path(method.module) else "-".join(foreign)
 
 
 def content_of(source: str) -> str:

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 from tqdm import tqdm
 
+from ded_bench.files.errors import InputError
+from ded_bench.files.table import LARGEST
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.run.cluster import open_workers
+from ded_bench.run.code import code_of_method
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import LARGEST, Results, Row
-from ded_bench.run.shipping import Files, pack
-from ded_bench.run.tasks import Task, failed, reason_of, score_tasks, solve_task
-from ded_bench.truth.score import Score
+from ded_bench.run.results import Results, Row
+from ded_bench.run.scoring import score_schedules, scored_row
+from ded_bench.run.shipping import pack
+from ded_bench.run.tasks import Task, failed, solve_task
 
-#: Schedules scored side by side in one task; more gains little, fewer costs overhead.
-SCORE_BATCH = 50
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
 #: what comes before the first solve of a process, imports and the building of the model: some seconds.
 GRACE_S = 60.0
@@ -45,13 +48,40 @@ def make_tasks(
     tasks = []
     for method in map(get_method, methods):
         for regime in regimes:
-            artifacts = [a.fingerprint for a in method.artifacts(case, regime, settings)]
+            artifacts = method.artifacts(case, regime, settings)
+            code = code_of_method(method, artifacts)
             for instance, split in instances:
-                names = regime, method.name, settings.slug
-                parts = (case.fingerprint, instance.fingerprint, *names, *artifacts)
-                fingerprint = hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-                tasks.append(Task(instance, split, regime, method.name, settings, fingerprint))
+                fingerprint = fingerprint_of(case, instance, regime, method.name, settings, artifacts)
+                task = Task(instance, split, regime, method.name, settings, fingerprint, artifacts, code)
+                tasks.append(task)
     return tasks
+
+
+def fingerprint_of(
+    case: Case,
+    instance: Instance,
+    regime: str,
+    method: str,
+    settings: Settings,
+    artifacts: Sequence[Artifact],
+) -> str:
+    """Twelve hex digits that change with whatever decides on an answer, except for our own code."""
+    parts = [case.fingerprint, instance.fingerprint, regime, method, settings.slug]
+    parts += [artifact.fingerprint for artifact in artifacts]
+    parts += [f"time limit {settings.time_limit_s:g} s"] if settings.time_limit_s is not None else []
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
+
+
+def fallbacks(tasks: Sequence[Task], folder: Path) -> list[str]:
+    """What methods take from elsewhere than this results folder without having been told to: a line each."""
+    lines = []
+    for task in tasks:
+        given = {task.settings.policy, Path(task.settings.model)}
+        for artifact in task.artifacts:
+            if artifact.path and artifact.path not in given and not artifact.path.is_relative_to(folder):
+                what = f"{artifact.kind} {artifact.name}@{artifact.fingerprint}"
+                lines.append(f"{task.method} {task.regime}: {what} from {artifact.path}")
+    return list(dict.fromkeys(lines))
 
 
 def run(
@@ -80,14 +110,11 @@ def run(
         InputError: no scheduler answers.
         WorkersLostError: it answers no more, or its workers cannot run this package.
     """
-    todo = [task for task in tasks if not results.solved(task.key, task.fingerprint)]
-    unscored = [
-        task
-        for task in tasks
-        if results.solved(task.key, task.fingerprint) and not results.has(task.key, task.fingerprint)
-    ]
-    with open_workers(workers, scheduler) as pool:
-        calls = [(solve_task, (case, task)) for task in (_packed(case, todo) if scheduler else todo)]
+    todo, unscored = unfinished(tasks, results)
+    with open_workers(workers, scheduler) as pool, contextlib.ExitStack() as stack:
+        if todo or unscored:
+            stack.callback(results.compact)  # also after an interruption
+        calls = [(solve_task, (case, task)) for task in (_packed(todo) if scheduler else todo)]
         limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
         with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
             for task, answer in pool.imap(calls, todo, limits):
@@ -108,48 +135,32 @@ def run(
     return [results.rows[task.key] for task in tasks]
 
 
-def _packed(case: Case, tasks: Sequence[Task]) -> Iterator[Task]:
-    """Tasks with all that their methods may look for in a results folder."""
+def unfinished(tasks: Sequence[Task], results: Results) -> tuple[list[Task], list[Task]]:
+    """Tasks that are to be solved and scored, and those that are solved and only to be scored."""
+    missing = [task for task in tasks if not results.has(task.key, task.fingerprint)]
+    solved = [results.solved(task.key, task.fingerprint) for task in missing]
+    todo = [task for task, done in zip(missing, solved, strict=True) if not done]
+    return todo, [task for task, done in zip(missing, solved, strict=True) if done]
 
-    @functools.cache
-    def files(method: str, regime: str, settings: Settings) -> Files:
-        return pack(settings, get_method(method).artifacts(case, regime, settings))
 
+def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
+    """Tasks with the files that their answers depend on."""
+    files = functools.cache(pack)
     for task in tasks:
-        yield dataclasses.replace(task, files=files(task.method, task.regime, task.settings))
+        yield dataclasses.replace(task, files=files(task.settings, task.artifacts))
 
 
 def _score(
     case: Case, tasks: Sequence[Task], results: Results, pool: Workers, on_row: Callable[[Row], None]
 ) -> None:
-    batches = list(_batches(tasks))
-
-    def schedules(batch: Sequence[Task]) -> list[Schedule]:
-        return [results.schedule(task.key, case, task.instance) for task in batch]
-
-    calls = ((score_tasks, (case, batch, schedules(batch))) for batch in batches)  # read as they are needed
-    with tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar:
-        for batch, answer in pool.imap(calls, batches):
-            rows = []
-            for i, task in enumerate(batch):
-                verdict = answer[i] if isinstance(answer, list) else answer
-                rows.append(scored_row(results.rows[task.key], verdict))
-            results.add(rows)
-            for row in rows:
-                on_row(row)
-            bar.update(len(batch))
-
-
-def scored_row(row: Row, verdict: object) -> Row:
-    """A row with the scorer's verdict filled in, or with the reason why there is none."""
-    if not isinstance(verdict, Score):
-        return dataclasses.replace(row, error=f"scoring failed: {reason_of(verdict)}")
-    numbers = dataclasses.asdict(verdict)
-    if None in map(_storable, numbers.values()):
-        return dataclasses.replace(row, error="scoring failed: cost or violations are beyond all measure")
-    return dataclasses.replace(
-        row, feasible=verdict.feasible, feasible_strict=verdict.feasible_strict, **numbers
-    )
+    for batch, verdicts in score_schedules(case, tasks, results, pool):
+        for verdict in verdicts:
+            if isinstance(verdict, InputError):  # a kept schedule that is damaged is the user's to remove
+                raise verdict
+        rows = [scored_row(results.rows[t.key], v) for t, v in zip(batch, verdicts, strict=True)]
+        results.add(rows)
+        for row in rows:
+            on_row(row)
 
 
 def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
@@ -177,18 +188,16 @@ def unscored_row(task: Task, solution: Solution, workers: int, problems_version:
         case=task.instance.case,
         seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
         fingerprint=task.fingerprint,
+        time_limit_s=task.settings.time_limit_s,
+        model=_named(task, "model"),
+        policy=_named(task, "policy"),
+        code=task.code,
     )
+
+
+def _named(task: Task, kind: str) -> str:
+    return "+".join(f"{a.name}@{a.fingerprint}" for a in task.artifacts if a.kind == kind)
 
 
 def _storable(value: float | None) -> float | None:
     return value if value is not None and abs(value) <= LARGEST else None
-
-
-def _batches(tasks: Sequence[Task]) -> Iterator[list[Task]]:
-    """Tasks to be simulated side by side: of one grid, and of one method, whose schedules bend alike."""
-    groups: dict[tuple[int, float, str], list[Task]] = {}
-    for task in tasks:
-        groups.setdefault((task.instance.steps, task.instance.dt_s, task.method), []).append(task)
-    for group in groups.values():
-        for start in range(0, len(group), SCORE_BATCH):
-            yield group[start : start + SCORE_BATCH]

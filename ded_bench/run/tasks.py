@@ -6,8 +6,8 @@ import functools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.plugin import accept
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution, Solver
@@ -16,13 +16,11 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.environment import host
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError
+from ded_bench.run.results import Key
 from ded_bench.run.shipping import Files, unpacked
 from ded_bench.solvers.status import Status
 from ded_bench.truth.score import Score, score
 from ded_bench.truth.simulate import SimulationError
-
-if TYPE_CHECKING:
-    from ded_bench.run.results import Key
 
 
 @dataclass(frozen=True)
@@ -35,13 +33,13 @@ class Task:
     method: str
     settings: Settings
     fingerprint: str
+    artifacts: tuple[Artifact, ...] = ()
+    code: str = ""
     files: Files = ()  # for a worker without the results folder
 
     @property
     def key(self) -> Key:
         """The row's place in the results table."""
-        from ded_bench.run.results import Key  # and with it pandas, which worker processes do without
-
         return Key(self.instance.id, self.regime, self.method, self.settings.slug)
 
 

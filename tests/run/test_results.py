@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import dataclasses
 from pathlib import Path
 
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.run.results import COLUMNS, Key, Results, Row, format_rows, read_rows
+from ded_bench.run.results import ROWS, Key, Results, Row
 
 ROW = Row(
     instance="a-1",
@@ -20,60 +20,48 @@ ROW = Row(
     iterations=3,
     solve_s=0.1 + 0.2,
     feasible=True,
-    error='comma, "quote"\nand line',
+    error='comma, "quote"',
     fingerprint="f",
 )
 
 
 def test_rows_survive_the_file_to_the_last_digit(tmp_path: Path) -> None:
     Results(tmp_path).add([ROW])
-    assert read_rows(tmp_path / "results.csv") == [ROW]
+    assert ROWS.read(tmp_path / "results.csv") == [ROW]
     assert Results(tmp_path).rows == {ROW.key: ROW}
     frame = Results(tmp_path).frame()
     assert frame["solve_s"].iloc[0] == 0.1 + 0.2
-    assert list(frame.columns) == list(COLUMNS)
+    assert list(frame.columns) == list(ROWS.names)
 
 
-def test_a_row_counts_only_with_its_schedule_and_fingerprint(tmp_path: Path) -> None:
+def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(tmp_path: Path) -> None:
+    """Its schedule need not be kept, unless it is still to be scored, or scoring it has failed."""
     results = Results(tmp_path)
-    results.add([ROW])
-    assert not results.has(ROW.key, "f")
-    path = results.schedule_path(ROW.key)
-    path.parent.mkdir(parents=True)
-    path.touch()
-    assert results.has(ROW.key, "f")
-    assert not results.has(ROW.key, "another fingerprint")
+    plain = dataclasses.replace(ROW, error="")
+    scored, failed = dataclasses.replace(plain, objective=1.0), dataclasses.replace(plain, error="why")
+    for row, alone, with_schedule in ((scored, True, True), (plain, False, False), (failed, False, True)):
+        results.add([row])
+        assert results.has(row.key, "f") is alone
+        assert not results.solved(row.key, "f")
+        path = results.schedule_path(row.key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        assert results.has(row.key, "f") is with_schedule
+        assert results.solved(row.key, "f")
+        assert not results.has(row.key, "another fingerprint")
+        path.unlink()
     assert not results.has(Key("a-2", "NO", "ded", "default"), "f")
 
 
-def _add(folder: str, first: int) -> None:
-    import dataclasses
-
-    results = Results(folder)
-    for i in range(first, first + 20):
-        results.add([dataclasses.replace(ROW, instance=f"a-{i}")])
-
-
-def test_two_writers_lose_no_row(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=_add, args=(str(tmp_path), first)) for first in (0, 100)]
-    for writer in writers:
-        writer.start()
-    for writer in writers:
-        writer.join()
-        assert writer.exitcode == 0
-    assert len(Results(tmp_path).rows) == 40
-
-
-GOOD = format_rows([ROW])
+GOOD = ROWS.format([ROW])
 
 
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         ("", "instance"),
-        (GOOD.replace("solve_s", "solve"), "solve_s"),
-        (GOOD.replace(",date", ",date,extra"), "extra"),
+        (GOOD.replace("status", "state"), "status: required column is missing"),
+        (GOOD.replace(",date", ",date,extra"), "line 2"),
         (GOOD.replace("Optimal", "Splendid"), "line 2, status"),
         (GOOD.replace("0.30000000000000004", "nan"), "line 2, solve_s"),
         (GOOD.replace("0.30000000000000004", "fast"), "line 2, solve_s"),

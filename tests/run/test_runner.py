@@ -10,13 +10,17 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
+from ded_bench.koopman.linear import linear_model
+from ded_bench.koopman.surrogates import model_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.run import runner
+from ded_bench.run.code import code_of
 from ded_bench.run.pool import ATTEMPTS
-from ded_bench.run.results import Results
-from ded_bench.run.runner import make_tasks, run
+from ded_bench.run.results import ROWS, Results
+from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
+from ded_bench.run.tasks import Task
 from ded_bench.truth.score import score
 from tests.strange_methods import STRANGE, solve_strange
 
@@ -69,6 +73,65 @@ def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_pat
     assert (tmp_path / "out" / "results.csv").read_bytes() == before
     run(threebus, make("calm-1", "calm-2"), Results(tmp_path / "out"))
     assert calls(strange) == {"calm-1": 2, "calm-2": 2}  # once per regime
+
+
+def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp_path: Path) -> None:
+    """A limited answer is not taken for an unlimited one; model, policy and code are named."""
+    folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    linear_model(threebus).save(model_file(elsewhere, "koopman"))
+    settings = Settings(search=(folder, elsewhere))
+    instances = [(quiet_instance(threebus, horizon_s=0.2), "none")]
+
+    def tasks(settings: Settings) -> list[Task]:
+        return make_tasks(threebus, instances, ["ded-ko-knots"], ["NO", "TO"], settings)
+
+    results = Results(folder)
+    free = run(threebus, tasks(settings), results)
+    (limited,) = run(threebus, tasks(dataclasses.replace(settings, time_limit_s=100.0))[:1], results)
+    assert limited.key == free[0].key
+    assert limited.fingerprint != free[0].fingerprint
+    assert (free[0].time_limit_s, limited.time_limit_s) == (None, 100.0)
+    assert unfinished(tasks(settings), results) == (tasks(settings)[:1], [])  # the limited one does not count
+    assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
+    assert limited.policy == ""
+    assert limited.code == code_of("ded_bench.methods.ded_ko_knots")
+    assert limited.score_code == code_of("ded_bench.truth.score")
+    path = model_file(elsewhere, "koopman")
+    assert fallbacks(tasks(settings), folder) == [
+        f"ded-ko-knots {regime}: model {limited.model} from {path}" for regime in ("NO", "TO")
+    ]
+    assert fallbacks(tasks(settings), elsewhere) == []
+    assert fallbacks(tasks(dataclasses.replace(settings, model=str(path))), folder) == []
+
+
+def test_other_code_makes_no_row_invalid(strange, make, threebus: Case, tmp_path: Path) -> None:
+    results = Results(tmp_path / "out")
+    rows = run(threebus, make("calm-1"), results)
+    results.add([dataclasses.replace(row, code="0" * 12, score_code="1" * 12) for row in rows])
+    run(threebus, make("calm-1"), results)
+    assert {row.code for row in results.rows.values()} == {"0" * 12}
+    assert calls(strange) == {"calm-1": 2}
+
+
+def test_a_run_leaves_one_line_per_row_even_if_interrupted(
+    strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was solved before the interruption is only scored by the next run."""
+    results = Results(tmp_path / "out")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "_score", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(threebus, make("calm-1"), results)
+    monkeypatch.undo()
+    monkeypatch.setitem(METHODS, "ded", STRANGE)
+    todo, unscored = unfinished(make("calm-1"), Results(tmp_path / "out"))
+    assert (todo, unscored) == ([], make("calm-1"))
+    run(threebus, make("calm-1"), results)
+    assert len(results.path.read_text().splitlines()) == 3
+    assert all(row.scored for row in ROWS.read(results.path))
 
 
 def test_a_schedule_without_its_score_is_only_scored(strange, make, threebus: Case, tmp_path: Path) -> None:

@@ -1,0 +1,188 @@
+"""Scores of kept schedules: rows are scored, or those of a results folder scored again and compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from tqdm import tqdm
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.table import LARGEST
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.run.code import code_of
+from ded_bench.run.pool import Workers
+from ded_bench.run.results import Results, Row
+from ded_bench.run.tasks import Task, reason_of, score_tasks
+from ded_bench.truth import score as scorer
+from ded_bench.truth.score import Score
+
+#: Schedules scored side by side in one task; more gains little, fewer costs overhead.
+SCORE_BATCH = 50
+#: What a kept schedule, scored again, may differ by from its row.
+OBJECTIVE_RELATIVE, VIOLATION_HZ, VIOLATION_PU = 1e-9, 1e-9, 1e-9
+#: How the error of a row begins whose schedule cannot be simulated.
+FAILED = "scoring failed: "
+_POWER_LIMITS = ("ramp_violation", "bound_violation", "initial_violation")
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was found when the kept schedules of a results folder were scored again.
+
+    Attributes:
+        rows: those that were compared, as they are scored now.
+        differences: one sentence each.
+        without_schedule: rows whose schedule is not kept.
+        unscored: rows with a schedule, but no score yet.
+        unknown: rows of instances that are not among those given.
+    """
+
+    rows: list[Row]
+    differences: list[str]
+    without_schedule: int
+    unscored: int
+    unknown: int
+
+
+def score_schedules(
+    case: Case, tasks: Sequence[Task], results: Results, pool: Workers
+) -> Iterator[tuple[list[Task], list[object]]]:
+    """Score the kept schedules of tasks, batch by batch; a schedule that cannot be read has an InputError."""
+    batches = list(_batches(tasks))
+    with tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar:
+        wrong: dict[int, InputError] = {}
+
+        def read(batch: Sequence[Task]) -> tuple[list[Task], list[Schedule]]:
+            sound = []
+            for task in batch:
+                try:
+                    sound.append((task, results.schedule(task.key, case, task.instance)))
+                except InputError as error:
+                    wrong[id(task)] = error
+            return [task for task, _ in sound], [schedule for _, schedule in sound]
+
+        calls = ((score_tasks, (case, *read(batch))) for batch in batches)  # read as they are needed
+        for batch, answer in pool.imap(calls, batches):
+            verdicts = iter(answer) if isinstance(answer, list) else None
+            yield (
+                batch,
+                [wrong.get(id(task)) or (answer if verdicts is None else next(verdicts)) for task in batch],
+            )
+            bar.update(len(batch))
+
+
+def scored_row(row: Row, verdict: object) -> Row:
+    """A row with the scorer's verdict filled in, or with the reason why there is none."""
+    row = without_score(row)
+    if not isinstance(verdict, Score):
+        return dataclasses.replace(row, error=f"{FAILED}{reason_of(verdict)}")
+    numbers = dataclasses.asdict(verdict)
+    if not all(abs(value) <= LARGEST for value in numbers.values()):
+        return dataclasses.replace(row, error=f"{FAILED}cost or violations are above {LARGEST:g}")
+    return dataclasses.replace(
+        row,
+        feasible=verdict.feasible,
+        feasible_strict=verdict.feasible_strict,
+        score_code=code_of(scorer.__name__),
+        **numbers,
+    )
+
+
+def without_score(row: Row) -> Row:
+    """A row as it was before it was scored."""
+    names = (field.name for field in dataclasses.fields(Score))
+    empty = dict.fromkeys((*names, "feasible", "feasible_strict"))
+    error = "" if row.error.startswith(FAILED) else row.error
+    return dataclasses.replace(row, error=error, score_code="", **empty)  # type: ignore[arg-type]
+
+
+def rescore(
+    case: Case,
+    instances: Mapping[str, Instance],
+    results: Results,
+    workers: int = 1,
+    *,
+    update: bool = False,
+    on_difference: Callable[[str], None] = lambda sentence: None,
+) -> Check:
+    """Score the kept schedules of a results folder again, and compare with its rows.
+
+    Args:
+        instances: by id; rows of others are counted.
+        update: write the new scores into the rows.
+
+    Raises:
+        InputError: none of the rows' schedules is kept.
+    """
+    known = [row for row in results.rows.values() if row.instance in instances]
+    kept = [row for row in known if results.schedule_path(row.key).is_file()]
+    if not kept:
+        raise InputError(results.paths.schedules, "", "holds no schedule of these rows")
+    chosen = kept if update else [row for row in kept if row.scored]
+    tasks = [
+        Task(instances[row.instance], row.split, row.regime, row.method, Settings(row.settings), "")
+        for row in chosen
+    ]
+    rows, differences = [], []
+    with Workers(workers) as pool:
+        for batch, verdicts in score_schedules(case, tasks, results, pool):
+            pairs = [
+                (row, scored_row(row, verdict))
+                for row, verdict in zip((results.rows[task.key] for task in batch), verdicts, strict=True)
+            ]
+            for old, new in pairs:
+                for sentence in _differences(old, new) if old.scored else ():
+                    differences.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
+                    on_difference(differences[-1])
+            rows += [new for _, new in pairs]
+            if update:
+                results.add(new for _, new in pairs)
+    if update:
+        results.compact()
+    return Check(
+        rows,
+        differences,
+        without_schedule=len(known) - len(kept),
+        unscored=sum(not row.scored for row in kept) if not update else 0,
+        unknown=len(results.rows) - len(known),
+    )
+
+
+def _differences(old: Row, new: Row) -> Iterator[str]:
+    """What a row says and its schedule, scored again, does not."""
+    if (old.objective is None) != (new.objective is None) or old.objective is None or new.objective is None:
+        if old.objective is not None:
+            yield new.error
+        elif new.objective is not None:
+            yield f"the row has no score ({old.error}), but the schedule has"
+        return
+    if not math.isclose(old.objective, new.objective, rel_tol=OBJECTIVE_RELATIVE):
+        yield f"objective {old.objective!r} in the row, {new.objective!r} scored again"
+    tolerances = {"freq_violation_hz": VIOLATION_HZ, **dict.fromkeys(_POWER_LIMITS, VIOLATION_PU)}
+    missing = [name for name in tolerances if getattr(old, name) is None]
+    yield from (f"{name} is missing in the row" for name in missing)
+    if missing:
+        return
+    for name, tolerance in tolerances.items():
+        was, is_now = getattr(old, name), getattr(new, name)
+        if abs(was - is_now) > tolerance:
+            yield f"{name} {was!r} in the row, {is_now!r} scored again"
+    own = Score(**{field.name: getattr(old, field.name) for field in dataclasses.fields(Score)})
+    if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):
+        yield "feasible or feasible_strict do not follow from the row's own violations"
+
+
+def _batches(tasks: Iterable[Task]) -> Iterator[list[Task]]:
+    """Tasks to be simulated side by side: of one grid, and of one method, whose schedules bend alike."""
+    groups: dict[tuple[int, float, str], list[Task]] = {}
+    for task in tasks:
+        groups.setdefault((task.instance.steps, task.instance.dt_s, task.method), []).append(task)
+    for group in groups.values():
+        for start in range(0, len(group), SCORE_BATCH):
+            yield group[start : start + SCORE_BATCH]

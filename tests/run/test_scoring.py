@@ -1,0 +1,112 @@
+"""Kept schedules, scored again: what agrees, what does not, and what cannot be checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.run.code import code_of
+from ded_bench.run.results import Results, Row
+from ded_bench.run.scoring import rescore, scored_row
+from ded_bench.truth.score import score
+
+
+@pytest.fixture
+def instances(threebus: Case, quiet_instance) -> dict[str, Instance]:
+    return {name: quiet_instance(threebus, id=name, horizon_s=0.2) for name in "abcd"}
+
+
+@pytest.fixture
+def results(threebus: Case, instances: dict[str, Instance], tmp_path: Path) -> Results:
+    """Four scored rows in TO; all but the last one's schedules are kept."""
+    results = Results(tmp_path)
+    for i, (name, instance) in enumerate(instances.items()):
+        power = instance.p_initial(threebus)
+        schedule = Schedule(np.array([0.0, 0.2]), np.array([power, power + 0.001 * i]))
+        row = Row(name, "test", "TO", "ded", "default", "Optimal", case="threebus", fingerprint="f")
+        results.add([scored_row(row, score(threebus, instance, schedule, "TO"))])
+        if name != "d":
+            schedule.write(results.schedule_path(row.key), threebus.generators)
+    return results
+
+
+def row_of(results: Results, name: str) -> Row:
+    return next(row for row in results.rows.values() if row.instance == name)
+
+
+def test_rows_that_agree_and_rows_without_a_schedule(threebus: Case, instances, results) -> None:
+    check = rescore(threebus, instances, results)
+    assert [row.instance for row in check.rows] == ["a", "b", "c"]
+    assert (check.differences, check.without_schedule, check.unscored, check.unknown) == ([], 1, 0, 0)
+    del instances["b"]
+    assert rescore(threebus, instances, results).unknown == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"objective": 1.0 + 1e-8}, "objective"),
+        ({"freq_violation_hz": 2e-9}, "freq_violation_hz"),
+        ({"ramp_violation": 2e-9}, "ramp_violation"),
+        ({"bound_violation": None}, "bound_violation is missing"),
+        ({"feasible": False}, "feasible or feasible_strict"),
+        ({"objective": None, "error": "scoring failed: no idea"}, "has no score (scoring failed: no idea)"),
+    ],
+)
+def test_a_row_that_differs_is_named(change: dict, said: str, threebus: Case, instances, results) -> None:
+    row = row_of(results, "b")
+    if change.get("objective"):
+        change = {"objective": row.objective * change["objective"]}
+    elif "error" not in change:
+        change = {name: value and value + getattr(row, name) for name, value in change.items()}
+        change |= {"feasible": False} if "feasible" in change else {}
+    results.add([dataclasses.replace(row, **change)])
+    heard: list[str] = []
+    check = rescore(threebus, instances, results, on_difference=heard.append)
+    assert len(check.differences) == 1
+    assert check.differences == heard
+    assert check.differences[0].startswith("ded default TO b: ")
+    assert said in check.differences[0]
+
+
+def test_rounding_is_no_difference(threebus: Case, instances, results) -> None:
+    row = row_of(results, "b")
+    change = {"objective": row.objective * (1 + 5e-10), "ramp_violation": row.ramp_violation + 5e-10}
+    results.add([dataclasses.replace(row, **change)])
+    assert rescore(threebus, instances, results).differences == []
+
+
+def test_a_schedule_that_is_damaged_or_another_is_a_difference(threebus: Case, instances, results) -> None:
+    results.schedule_path(row_of(results, "a").key).write_bytes(b"no schedule")
+    path = results.schedule_path(row_of(results, "c").key)
+    path.write_bytes(gzip.compress(b"t,P_plant\n0,0.6\n0.2,0.7\n"))
+    check = rescore(threebus, instances, results)
+    assert len([line for line in check.differences if " TO a: scoring failed" in line]) == 1
+    assert {line.split(": ")[0] for line in check.differences} == {"ded default TO a", "ded default TO c"}
+
+
+def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Results) -> None:
+    rescore(threebus, instances, results, update=True)
+    right = dict(results.rows)
+    old = dataclasses.replace(row_of(results, "b"), objective=1.0, score_code="0" * 12)
+    unscored = dataclasses.replace(row_of(results, "c"), objective=None, feasible=None, score_code="")
+    results.add([old, unscored])
+    assert rescore(threebus, instances, results).unscored == 1
+    check = rescore(threebus, instances, results, update=True)
+    assert [line.split(":")[0] for line in check.differences] == ["ded default TO b"]
+    assert Results(results.folder).rows == right
+    assert row_of(results, "b").score_code == code_of("ded_bench.truth.score")
+    assert len(results.path.read_text().splitlines()) == 5
+
+
+def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> None:
+    with pytest.raises(InputError, match=r"schedules: holds no schedule of these rows"):
+        rescore(threebus, {"d": instances["d"]}, results)

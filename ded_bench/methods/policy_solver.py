@@ -14,6 +14,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
+from ded_bench.truth.servable import servable
 
 VERSION = f"numba {numba.__version__}, numpy {np.__version__}"
 
@@ -48,6 +49,6 @@ def warmed_up(solve: Solver, scope: Scope) -> Solver:
     The instance is drawn from a seed of policy training, so that no answer is computed twice.
     """
     case = scope.case
-    instance = sample_instance(case, POLICY_SEED, 0).model_copy(update={"horizon_s": scope.horizon_s})
-    solve(instance)
+    instance = sample_instance(case, POLICY_SEED, 0, servable)
+    solve(instance.model_copy(update={"horizon_s": scope.horizon_s}))
     return solve

@@ -24,11 +24,13 @@ from ded_bench.methods.policy_file import Scope, policy_file
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 from ded_bench.truth.score import score
+from ded_bench.truth.simulate import simulate
 
 HORIZON = 4.0
 N_KNOTS = 50
@@ -75,7 +77,7 @@ def random_policy(case: Case, size: float = 1.0, horizon: float = HORIZON) -> Di
 
 def tensors(channels: Channels) -> list[torch.Tensor]:
     """What the network takes, in float32."""
-    arrays = channels.start, channels.undriven, channels.sequence, channels.constants
+    arrays = channels.start, channels.free_response, channels.sequence, channels.constants
     return [torch.as_tensor(a, dtype=torch.float32) for a in arrays]
 
 
@@ -146,24 +148,81 @@ def test_compiled_twin_equals_the_torch_network(case: Case) -> None:
 
 
 def test_the_response_is_the_linear_models(case: Case) -> None:
-    """Condensed in coarse steps, from equilibrium: the rollout in fine ones."""
+    """Condensed in coarse steps, from any state: the rollout in fine ones."""
     rng, response = np.random.default_rng(0), response_of(case)
     fine = linear_model(case, response.nodes[1] / 8)
     grid = np.linspace(0.0, HORIZON, 8 * (len(response.nodes) - 1) + 1)
     n_gen, n_load = len(case.generators), len(case.loads)
-    omega = rng.normal(0.0, 0.01, (3, n_gen))
+    theta, omega = rng.normal(0.0, 0.01, (2, 3, n_gen))
+    theta[0] = 0.0
     loads = -rng.uniform(0.5, 1.5, (3, len(response.nodes), n_load))
     powers = rng.uniform(0.5, 1.5, (3, N_KNOTS, n_gen))
-    seen = response(response.undriven(omega, loads), powers).reshape(3, N_KNOTS, 2, n_gen + 1)
+    loads[:, 0], powers[:, 0] = case.load_nominal, case.p_nominal  # where the model's angles are exact
+    network = Network(case)
+    angles = np.tile(network.power_flow(case.p_nominal, case.load_nominal), (3, 1))
+    angles[:, network.generators] += theta
+    psi = fine.observables(network, angles, omega, loads[:, 0])
+    seen = response(response.free_response(np.hstack([theta, omega]), loads), powers).reshape(
+        3, N_KNOTS, 2, n_gen + 1
+    )
     for b in range(3):
         columns = [np.interp(grid, KNOTS, column) for column in powers[b].T]
         columns += [np.interp(grid, response.nodes, column) for column in loads[b].T]
         inputs = np.stack(columns, axis=1)
-        outputs = fine.rollout(fine.b @ inputs[0] + np.pad(omega[b], (0, n_gen)), inputs)[:, : n_gen + 1]
+        outputs = fine.rollout(psi[b], inputs)[:, : n_gen + 1]
         np.testing.assert_allclose(seen[b, :, 0], outputs[::16], atol=1e-5)  # float32
         np.testing.assert_allclose(seen[b, 1:, 1], outputs[8::16], atol=1e-5)
         np.testing.assert_array_equal(seen[b, 0, 0], seen[b, 0, 1])
         assert np.ptp(outputs, axis=0).min() > 1e-2
+
+
+def test_angles_off_equilibrium_enter_the_response(case: Case, quiet_instance) -> None:
+    """Released a little off the nominal equilibrium, the true grid swings as the response says."""
+    network = Network(case)
+    angles = network.power_flow(case.p_nominal, case.load_nominal)[network.generators]
+    power = dict(zip(case.generators, case.p_nominal.tolist(), strict=True))
+    initial = {"power": power, "omega": dict.fromkeys(case.generators, 0.0)}
+    theta = dict(zip(case.generators, (angles + 1e-4).tolist(), strict=True))
+    changes = {"schema": "ded-bench/instance/2", "initial": initial | {"theta": theta}, "horizon_s": HORIZON}
+    instance = quiet_instance(case, **changes)
+    inputs, response = Inputs.of(case, [instance]), response_of(case)
+    n_gen = len(case.generators)
+    np.testing.assert_allclose(inputs.state[:, :n_gen], 1e-4, rtol=1e-6)
+    p_gen = np.tile(case.p_nominal, (1, N_KNOTS, 1))
+    seen = response(Channels.of(case, inputs, response).free_response, p_gen)[0, :, :n_gen]
+    run = simulate(case, instance, Schedule(KNOTS, p_gen[0]))
+    true = np.stack([np.interp(KNOTS, instance.grid, column) for column in run.omega.T], axis=1)
+    peak = np.abs(true).max()
+    assert peak > 1e-5
+    np.testing.assert_allclose(seen, true, atol=0.02 * peak)
+    at_rest = quiet_instance(case, horizon_s=HORIZON)
+    assert not Inputs.of(case, [at_rest]).state.any()
+    model, stride = linear_model(case), 10
+    free = coarse_free_response(network, model, inputs, instance.grid, stride)
+    p_load = instance.p_load(case)[None]
+    expected = free_response(model, model.initial(network, [instance]), p_load, stride)
+    np.testing.assert_allclose(free, expected, atol=1e-7)
+
+
+def test_a_ramp_and_its_points_are_the_same_load(case: Case) -> None:
+    """Every kind of load path gives the same channels, however its segments are written down."""
+    ramps = some_instances(case, 4)
+    points = []
+    for instance in ramps:
+        load = {}
+        for bus, ramp in instance.load.items():
+            times = np.unique([0.0, ramp.start, ramp.start + ramp.duration, 1.0, 2.5, 40.0])
+            load[bus] = LoadPoints(points=[(t, float(ramp.at(np.array(t)))) for t in times.tolist()])
+        points.append(instance.model_copy(update={"load": load}))
+    seen = [channels_of(case, Inputs.of(case, batch)) for batch in (ramps, points, [points[0], ramps[1]])]
+    for name in ("sequence", "constants", "start", "free_response"):
+        values = [getattr(channels, name) for channels in seen]
+        np.testing.assert_allclose(values[1], values[0], atol=1e-6)
+        np.testing.assert_allclose(values[2], values[0][:2], atol=1e-6)
+    grid = ramps[0].grid
+    expected = np.stack([i.p_load(case, grid) for i in ramps])
+    for batch in (ramps, points):
+        np.testing.assert_allclose(Inputs.of(case, batch).p_load(grid), expected, atol=1e-12)
 
 
 def test_batches_threads_and_single_calls_agree(threebus: Case) -> None:

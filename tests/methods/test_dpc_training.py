@@ -133,12 +133,12 @@ def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path)
     np.testing.assert_array_equal(
         channels.start, follow(middle, inputs.p_initial, threebus.ramp * policy.knots[1])
     )
-    start, undriven, sequence, constants = tensors(channels)
+    start, free, sequence, constants = tensors(channels)
     other = sequence.clone()
     other[..., sequence_groups(threebus)["dispatch"]] += 0.3
     with torch.no_grad():
-        seen = policy.network(start, undriven, sequence, constants)
-        unseen = policy.network(start, undriven + 0.3, other, constants)
+        seen = policy.network(start, free, sequence, constants)
+        unseen = policy.network(start, free + 0.3, other, constants)
     torch.testing.assert_close(seen, unseen)
     np.testing.assert_allclose(policy.powers(inputs), seen.numpy(), atol=1e-5)
     with pytest.raises(TypeError, match="colour"):

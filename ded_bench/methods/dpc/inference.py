@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ded_bench.methods.dpc.inputs import Channels
-from ded_bench.methods.dpc.kernels import answer
+from ded_bench.methods.dpc.kernels import NetworkInputs, PowerLimits, StageWeights, answer
 from ded_bench.methods.dpc.response import Response
 from ded_bench.problem.case import Array, Case
 
@@ -25,17 +25,22 @@ class CompiledStages:
         n_stages = 1 + max(int(name.split(".")[1]) for name in state)
         half = 0.5 * (case.p_max - case.p_min)
         stages = [_matrices(_part(state, f"stages.{i}."), len(dilations), half) for i in range(n_stages)]
-        self._weights = tuple(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
+        self._weights = StageWeights(
+            *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
+        )
         step = case.ramp * (response.knots[1] - response.knots[0])
-        self._limits = case.p_min, case.p_max, step
+        self._limits = PowerLimits(case.p_min, case.p_max, step)
         self._of_power, self._dilations = response.of_power, np.array(dilations)
 
     def __call__(self, channels: Channels) -> Array:
         """Powers at the knots, (batch, n_knots, n_gen), pu."""
         p_gen = channels.start.swapaxes(1, 2).copy()
-        sequence, undriven = channels.sequence.swapaxes(1, 2), channels.undriven.swapaxes(1, 2)
-        given = channels.constants.astype(np.float32), sequence, undriven
-        answer(p_gen, *given, self._of_power, *self._limits, self._dilations, *self._weights)
+        seen = NetworkInputs(
+            channels.constants.astype(np.float32),
+            channels.sequence.swapaxes(1, 2),
+            channels.free_response.swapaxes(1, 2),
+        )
+        answer(p_gen, seen, self._of_power, self._limits, self._dilations, self._weights)
         return p_gen.swapaxes(1, 2)
 
 
@@ -43,8 +48,8 @@ def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-def _matrices(state: Mapping[str, np.ndarray], n_blocks: int, half: Array) -> tuple[np.ndarray, ...]:
-    """The last arguments of `kernels.answer` for one stage, from a ResidualNetwork's state.
+def _matrices(state: Mapping[str, np.ndarray], n_blocks: int, half: Array) -> StageWeights:
+    """The weights of one stage, from a ResidualNetwork's state; normalisation is part of them.
 
     Args:
         half: half of each generator's range, pu.
@@ -54,18 +59,18 @@ def _matrices(state: Mapping[str, np.ndarray], n_blocks: int, half: Array) -> tu
     biases = np.concatenate([state["first.bias"], *(state[f"spread.{i}.bias"] for i in blocks)])
     first = state["first.weight"][:, :, 0] / state["sequence_scale"][:, None]
     biases[: len(first)] -= np.einsum("oct,c->o", first, state["sequence_mean"])
-    return (
-        state["sequence_mean"],
-        enter,
-        state["embed.0.bias"] - enter @ state["constants_mean"],
-        state["embed.2.weight"],
-        state["embed.2.bias"] + biases,
-        _windows(first),
-        np.stack([_windows(state[f"spread.{i}.weight"][:, :, 0]) for i in blocks]),
-        np.stack([state[f"mix.{i}.weight"][:, :, 0, 0] for i in blocks]),
-        np.stack([state[f"mix.{i}.bias"] for i in blocks]),
-        half[:, None] * state["last.weight"][:, :, 0, 0],
-        half * state["last.bias"],
+    return StageWeights(
+        mean=state["sequence_mean"],
+        enter=enter,
+        enter_bias=state["embed.0.bias"] - enter @ state["constants_mean"],
+        embed=state["embed.2.weight"],
+        embed_bias=state["embed.2.bias"] + biases,
+        first=_windows(first),
+        spread=np.stack([_windows(state[f"spread.{i}.weight"][:, :, 0]) for i in blocks]),
+        mix=np.stack([state[f"mix.{i}.weight"][:, :, 0, 0] for i in blocks]),
+        mix_bias=np.stack([state[f"mix.{i}.bias"] for i in blocks]),
+        last=half[:, None] * state["last.weight"][:, :, 0, 0],
+        last_bias=half * state["last.bias"],
     )
 
 

@@ -1,56 +1,105 @@
 """What `ded-dpc` sees of instances: stacked arrays, and channels over the knots made from them.
 
-The angles at t = 0 are no input: they follow from P_0 and the initial loads, which are, so that no
-power flow has to be solved. Loads enter as forecasts at the knots, with their bend between two
-knots, and as the static dispatch that they would have if nothing had inertia; what they do to
-frequency and slack power is in `response`.
+Angles at t = 0 that are those of an equilibrium follow from P_0 and the initial loads, so that no power
+flow has to be solved; where an instance gives others, their deviation counts. Loads enter as forecasts
+at the knots, with their bend between two knots, and as the static dispatch that they would have if
+nothing had inertia; what loads and initial state do to frequency and slack power is in `response`.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.dpc.kernels import fill
+from ded_bench.methods.dpc.kernels import ChannelArrays, InstanceArrays, PowerLimits, fill
 from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
+from ded_bench.truth.network import Network
+
+#: A segment that no path reaches: it starts later than any horizon ends, s.
+NEVER = (1e30, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Instances of one case as stacked arrays, in the units of the files."""
+    """Instances of one case as stacked arrays, in the units of the files.
 
-    ramps: Array  # initial (pu), start (s), duration (s), rate (pu/s); (batch, n_load, 4)
+    A load's path is a row of segments (start in s, injection there in pu, slope in pu/s); the rest of
+    the row is filled with segments that start at `NEVER`.
+    """
+
+    load: Array  # segments, (batch, n_load, n_segments, 3)
     cost: Array  # (slack, generators), (batch, 1 + n_gen)
     p_initial: Array  # P_0, (batch, n_gen), pu
-    omega: Array  # ω(0), (batch, n_gen), rad/s
+    state: Array  # (δθ, ω) at t = 0, (batch, 2 n_gen), rad and rad/s; see `_initial_state`
 
     @staticmethod
     def of(case: Case, instances: Sequence[Instance]) -> Inputs:
-        """Stack instances."""
+        """Stack instances.
+
+        Raises:
+            PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
+        """
         machines = (case.slack, *case.generators)
-        ramps = [[(r.initial, r.start, r.duration, r.rate) for r in i.ramps(case)] for i in instances]
+        paths = [_segments(i.load[bus]) for i in instances for bus in case.loads]
+        longest = max(map(len, paths), default=0)
+        flat = [number for path in paths for number in path + NEVER * ((longest - len(path)) // 3)]
         return Inputs(
-            np.array(ramps),
+            np.array(flat).reshape(len(instances), len(case.loads), longest // 3, 3),
             np.array([[i.cost[bus] for bus in machines] for i in instances]),
             np.array([[i.initial.power[bus] for bus in case.generators] for i in instances]),
-            np.array([[i.initial.omega[bus] for bus in case.generators] for i in instances]),
+            np.array([_initial_state(case, i) for i in instances]),
         )
 
     def __len__(self) -> int:
-        return len(self.ramps)
+        return len(self.load)
 
     def __getitem__(self, rows: slice) -> Inputs:
-        return Inputs(self.ramps[rows], self.cost[rows], self.p_initial[rows], self.omega[rows])
+        return Inputs(self.load[rows], self.cost[rows], self.p_initial[rows], self.state[rows])
+
+    @property
+    def omega(self) -> Array:
+        """ω(0), (batch, n_gen), rad/s."""
+        return self.state[:, self.p_initial.shape[1] :]
 
     def p_load(self, times: Array) -> Array:
         """Load injections, shape (batch, n_times, n_load), pu."""
-        initial, start, duration, rate = (self.ramps[:, None, :, i] for i in range(4))
-        into = np.minimum(np.maximum(times[:, None] - start, 0.0), duration)
-        return np.asarray(initial + rate * into)
+        start, value, slope = (self.load[:, None, :, :, i] for i in range(3))
+        found = np.broadcast_to(value[..., 0], (len(self), len(times), self.load.shape[1]))
+        for k in range(self.load.shape[2]):
+            since = times[:, None] - start[..., k]
+            found = np.where(since < 0.0, found, value[..., k] + slope[..., k] * since)
+        return found
+
+
+def _segments(load: LoadRamp | LoadPoints) -> tuple[float, ...]:
+    """(start, injection there, slope) of each linear piece of a load's path, one after another."""
+    if isinstance(load, LoadRamp):
+        initial, start, duration, rate = load.initial, load.start, load.duration, load.rate
+        return 0.0, initial, 0.0, start, initial, rate, start + duration, initial + rate * duration, 0.0
+    path: list[float] = []
+    for (t, p), (t_next, p_next) in itertools.pairwise(load.points):
+        path += [t, p, (p_next - p) / (t_next - t)]
+    return tuple(path)
+
+
+def _initial_state(case: Case, instance: Instance) -> list[float]:
+    """δθ, by which θ(0) is off the equilibrium of P_0 and the initial loads, then ω(0), (2 n_gen,).
+
+    δθ is zero unless the instance gives angles; only then a power flow has to be solved.
+    """
+    omega = [instance.initial.omega[bus] for bus in case.generators]
+    theta = instance.theta_initial(case)
+    if theta is None:
+        return [0.0] * len(omega) + omega
+    network = Network(case)
+    p_load = instance.p_load(case, np.zeros(1))[0]
+    equilibrium = network.power_flow(instance.p_initial(case), p_load)
+    return [*(theta - equilibrium[network.generators]).tolist(), *omega]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +112,7 @@ class Channels:
     sequence: Array  # (batch, n_knots, n_sequence), see `sequence_groups`
     constants: Array  # (batch, n_constants)
     start: Array  # schedule to correct, (batch, n_knots, n_gen), pu
-    undriven: Array32  # see `Response.undriven`
+    free_response: Array32  # see `Response.free_response`
 
     @staticmethod
     def of(case: Case, inputs: Inputs, response: Response, dispatch: bool = True) -> Channels:
@@ -74,16 +123,18 @@ class Channels:
         """
         knots, nodes, batch = response.knots, response.nodes, len(inputs)
         n_sequence, n_constants = n_channels(case)
-        p_load = np.empty((batch, len(case.loads), len(nodes)))
-        sequence = np.empty((batch, n_sequence, len(knots)))
-        constants = np.empty((batch, n_constants))
-        start = np.empty((batch, len(case.generators), len(knots)))
-        step = case.ramp * (knots[1] - knots[0])
-        given = inputs.ramps, inputs.cost, inputs.p_initial, inputs.omega
-        limits = case.p_min, case.p_max, step
-        fill(*given, nodes, *limits, dispatch, p_load, sequence, constants, start)
-        undriven = response.undriven(inputs.omega, p_load.swapaxes(1, 2))
-        return Channels(sequence.swapaxes(1, 2), constants, start.swapaxes(1, 2), undriven)
+        channels = ChannelArrays(
+            p_load=np.empty((batch, len(case.loads), len(nodes))),
+            sequence=np.empty((batch, n_sequence, len(knots))),
+            constants=np.empty((batch, n_constants)),
+            start=np.empty((batch, len(case.generators), len(knots))),
+        )
+        given = InstanceArrays(inputs.load, inputs.cost, inputs.p_initial, inputs.state)
+        limits = PowerLimits(case.p_min, case.p_max, case.ramp * (knots[1] - knots[0]))
+        fill(given, nodes, limits, dispatch, channels)
+        p_load, sequence, constants, start = channels
+        free = response.free_response(inputs.state, p_load.swapaxes(1, 2))
+        return Channels(sequence.swapaxes(1, 2), constants, start.swapaxes(1, 2), free)
 
     def static_cost(self, inputs: Inputs) -> Array:
         """Cost of the static dispatch, mean over the knots, shape (batch,): the instance's own scale."""

@@ -6,6 +6,7 @@ Its cache on disk notices that a function's own file changed, not that a functio
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -28,6 +29,56 @@ def compiled(function: Callable[..., None]) -> Callable[..., None]:
         return numba.njit(nogil=True)(function)
 
 
+class PowerLimits(NamedTuple):
+    """What a schedule of knots must keep to."""
+
+    p_min: Array  # (n_gen,), pu, as the next
+    p_max: Array
+    step: Array  # largest change between two knots, (n_gen,), pu
+
+
+class InstanceArrays(NamedTuple):
+    """What channels are computed from; see `inputs.Inputs`."""
+
+    load: Array
+    cost: Array
+    p_initial: Array
+    state: Array
+
+
+class ChannelArrays(NamedTuple):
+    """Receives channels; the channel comes before the knot. See `inputs.Channels`."""
+
+    p_load: Array  # loads at the nodes, (batch, n_load, n_nodes), pu
+    sequence: Array  # (batch, n_sequence, n_knots)
+    constants: Array  # (batch, n_constants)
+    start: Array  # (batch, n_gen, n_knots), pu
+
+
+class NetworkInputs(NamedTuple):
+    """What all stages see; the channel comes before the knot. See `inputs.Channels`."""
+
+    constants: Array32  # (batch, n_constants)
+    sequence: Array  # (batch, n_sequence, n_knots)
+    free_response: Array32  # (batch, n_outputs, n_knots)
+
+
+class StageWeights(NamedTuple):
+    """Weights of all stages, each with the stage as its first axis; made by `inference`."""
+
+    mean: Array32  # of the inputs, which stands beyond the first and the last knot
+    enter: Array32
+    enter_bias: Array32
+    embed: Array32
+    embed_bias: Array32
+    first: Array32
+    spread: Array32
+    mix: Array32
+    mix_bias: Array32
+    last: Array32
+    last_bias: Array32
+
+
 @compiled
 def track(targets: Array, step: Array, p_gen: Array) -> None:
     """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0.
@@ -44,54 +95,52 @@ def track(targets: Array, step: Array, p_gen: Array) -> None:
 
 @compiled
 def fill(
-    ramps: Array,
-    cost: Array,
-    p_initial: Array,
-    omega: Array,
-    nodes: Array,
-    p_min: Array,
-    p_max: Array,
-    step: Array,
-    dispatch: bool,
-    p_load: Array,
-    sequence: Array,
-    constants: Array,
-    start: Array,
+    given: InstanceArrays, nodes: Array, limits: PowerLimits, dispatch: bool, channels: ChannelArrays
 ) -> None:
-    """Compute the last four, instance by instance; see `inputs.Inputs` and `inputs.Channels`."""
-    n_gen, n_load = len(p_min), p_load.shape[1]
-    for b in range(len(ramps)):
+    """Compute the channels of a batch, instance by instance; see `inputs.Channels.of`."""
+    p_load, sequence, constants, start = channels
+    n_gen, n_load = len(limits.p_min), p_load.shape[1]
+    for b in range(len(p_load)):
         for i in range(n_load):
-            _loads_and_bends(ramps[b, i], nodes, p_load[b, i], sequence[b, i], sequence[b, n_load + i])
+            at_knots, bends = sequence[b, i], sequence[b, n_load + i]
+            _loads_and_bends(given.load[b, i], nodes, p_load[b, i], at_knots, bends)
         static = sequence[b, 2 * n_load :]
-        _dispatch(sequence[b, :n_load], cost[b], p_min, p_max, static)
-        _constants(cost[b], p_initial[b], omega[b], constants[b])
+        _dispatch(sequence[b, :n_load], given.cost[b], limits.p_min, limits.p_max, static)
+        _constants(given.cost[b], given.p_initial[b], given.state[b, n_gen:], constants[b])
         for g in range(n_gen):
             for j in range(1, start.shape[2]):
-                start[b, g, j] = static[g, j] if dispatch else 0.5 * (p_min[g] + p_max[g])
-            start[b, g, 0] = p_initial[b, g]
-        track(start[b], step, start[b])
+                start[b, g, j] = static[g, j] if dispatch else 0.5 * (limits.p_min[g] + limits.p_max[g])
+            start[b, g, 0] = given.p_initial[b, g]
+        track(start[b], limits.step, start[b])
 
 
 @compiled
-def _loads_and_bends(ramp: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
+def _loads_and_bends(segments: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
     """A load at the nodes and at the knots, and how far its mean between two knots is off the chord; pu.
 
-    Every second node is a knot. The bend tells where between two knots a ramp starts or ends.
+    Every second node is a knot. The bend tells where between two knots the load changes its slope.
+
+    Args:
+        segments: see `inputs.Inputs`.
     """
-    initial, begin, duration, rate = ramp
-    spacing = nodes[2] - nodes[0]
-    last_area = last_half = 0.0
+    n_segments, initial, spacing = len(segments), segments[0, 1], nodes[2] - nodes[0]
+    following, before = 0, 0.0  # next segment, and ∫ (load - initial) dt up to the start of this one
+    start = rise = slope = area_before = rise_before = 0.0
     for k in range(len(nodes)):
-        since = max(nodes[k] - begin, 0.0)
-        into = min(since, duration)
-        p_load[k] = initial + rate * into
+        while following < n_segments and segments[following, 0] <= nodes[k]:
+            width = segments[following, 0] - start
+            before += width * (rise + 0.5 * slope * width)
+            start, slope = segments[following, 0], segments[following, 2]
+            rise = segments[following, 1] - initial
+            following += 1
+        since = nodes[k] - start
+        change = rise + slope * since
+        p_load[k] = initial + change
         if k % 2 == 0:
-            half = 0.5 * into
-            area = into * (since - half)  # ∫ into dt
+            area = before + 0.5 * since * (rise + change)
             at_knots[k // 2] = p_load[k]
-            bends[k // 2] = rate * ((area - last_area) / spacing - half - last_half) if k else 0.0
-            last_area, last_half = area, half
+            bends[k // 2] = (area - area_before) / spacing - 0.5 * (change + rise_before) if k else 0.0
+            area_before, rise_before = area, change
 
 
 @compiled
@@ -150,39 +199,26 @@ def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) ->
 @compiled
 def answer(
     p_gen: Array,
-    constants: Array32,
-    sequence: Array,
-    undriven: Array32,
+    seen: NetworkInputs,
     of_power: Array32,
-    low: Array,
-    high: Array,
-    step: Array,
+    limits: PowerLimits,
     dilations: Array,
-    mean: Array32,
-    enter: Array32,
-    enter_bias: Array32,
-    embed: Array32,
-    embed_bias: Array32,
-    first: Array32,
-    spread: Array32,
-    mix: Array32,
-    mix_bias: Array32,
-    last: Array32,
-    last_bias: Array32,
+    weights: StageWeights,
 ) -> None:
     """Turn the first schedules of a batch into answers, stage by stage.
 
     Args:
         p_gen: (batch, n_gen, n_knots), pu; receives the answers.
-        constants: and the next two, see `inputs.Channels`; here the channel comes before the knot.
-        of_power: see `response.Response`; `low`, `high`, `step`: see `follower.follow`.
-        mean: of the inputs, which stands beyond the first and the last knot; this and what follows
-            has the stage as its first axis.
+        of_power: see `response.Response`.
+        dilations: of the convolutions of each stage.
     """
+    mean, enter, enter_bias, embed, embed_bias, first, spread, mix, mix_bias, last, last_bias = weights
+    constants, sequence, free_response = seen
+    low, high, step = limits
     _, n_gen, n = p_gen.shape
     n_stages, width, n_in = len(first), first.shape[1], mean.shape[1]
-    n_seen, margin = n_gen + undriven.shape[1], dilations.max()
-    p32, driven = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
+    n_seen, margin = n_gen + free_response.shape[1], dilations.max()
+    p32, forced = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
     inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
     input_columns, columns = np.empty((3 * n_in, n), np.float32), np.empty((3 * width, n), np.float32)
     inner, change = np.empty((width, n), np.float32), np.empty((width, n), np.float32)
@@ -202,11 +238,12 @@ def answer(
             for g in range(n_gen):
                 _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
                 _copy(p_gen[b, g], inputs[g, 1 : n + 1])
-            np.dot(p32, of_power, driven)
+            np.dot(p32, of_power, forced)
             for i in range(n_gen, n_seen):
-                row, own, due = inputs[i, 1 : n + 1], undriven[b, i - n_gen], driven[(i - n_gen) * n :]
+                row, output = inputs[i, 1 : n + 1], i - n_gen
+                free, due = free_response[b, output], forced[output * n :]
                 for j in range(n):
-                    row[j] = own[j] + due[j]
+                    row[j] = free[j] + due[j]
             for i in range(n_seen, n_in):
                 _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
             # its corrections
@@ -219,7 +256,7 @@ def answer(
             for i in range(len(dilations)):
                 _gather(hidden, dilations[i], columns)
                 np.dot(spread[s, i], columns, inner)
-                _add_and_cut(inner, bias[(1 + i) * width : (2 + i) * width])
+                _add_and_rectify(inner, bias[(1 + i) * width : (2 + i) * width])
                 np.dot(mix[s, i], inner, change)
                 for o in range(width):
                     row = hidden[o, margin : margin + n]
@@ -259,7 +296,7 @@ def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
 
 
 @compiled
-def _add_and_cut(values: Array32, bias: Array32) -> None:
+def _add_and_rectify(values: Array32, bias: Array32) -> None:
     """ReLU(values + bias), in place."""
     for o in range(len(values)):
         row, own = values[o], bias[o]

@@ -81,6 +81,10 @@ def coarse_free_response(
         part = inputs[start : start + CHUNK]
         p_load = part.p_load(grid)
         theta = network.power_flow(part.p_initial, p_load[:, 0])
-        psi = model.observables(network, theta, part.omega, p_load[:, 0])
+        delta, omega = np.hsplit(part.state, 2)
+        if delta.any():
+            theta[:, network.generators] += delta
+            theta, _ = network.solve_loads(theta, network.load_injections(p_load[:, 0]))
+        psi = model.observables(network, theta, omega, p_load[:, 0])
         parts.append(free_response(model, psi, p_load, stride).astype(np.float32))
     return np.concatenate(parts)

@@ -59,7 +59,7 @@ class StagedNetwork(nn.Module):
 
     def normalise(self, channels: Channels) -> None:
         """Set the affine input normalisation of all stages from training data."""
-        seen = self.response(channels.undriven, channels.start)
+        seen = self.response(channels.free_response, channels.start)
         sequence = np.concatenate([channels.start, seen, channels.sequence], axis=-1)
         for stage in self.stages:
             cast(ResidualNetwork, stage).normalise(sequence, channels.constants)
@@ -70,11 +70,11 @@ class StagedNetwork(nn.Module):
             for name in groups:
                 cast(ResidualNetwork, stage).sequence_scale[self.groups[name]] = HIDDEN_SCALE
 
-    def forward(self, start: Tensor, undriven: Tensor, sequence: Tensor, constants: Tensor) -> Tensor:
+    def forward(self, start: Tensor, free: Tensor, sequence: Tensor, constants: Tensor) -> Tensor:
         """Powers at the knots, (batch, n_knots, n_gen), pu, from `Channels` in float32."""
         p_gen, half = start, 0.5 * (self.high - self.low)
         for stage in self.stages:
-            seen = undriven + (p_gen.flatten(1) @ self.of_power).view_as(undriven)
+            seen = free + (p_gen.flatten(1) @ self.of_power).view_as(free)
             corrections = stage(torch.cat([p_gen, seen, sequence], dim=2), constants)
             targets = Clip.apply((p_gen + half * corrections)[:, 1:], self.low, self.high)  # type: ignore[no-untyped-call]
             p_gen = Follow.apply(targets, start[:, 0], self.step)  # type: ignore[no-untyped-call]

@@ -75,18 +75,18 @@ class Pool:
     """Instances as tensors, ready for the loss."""
 
     start: Tensor  # (batch, n_knots, n_gen), pu
-    undriven: Tensor  # (batch, n_knots, n_outputs)
+    free_response: Tensor  # of the linearisation, at the knots, (batch, n_knots, n_outputs)
     sequence: Tensor  # (batch, n_knots, n_sequence)
     constants: Tensor  # (batch, n_constants)
     cost: Tensor  # (batch, 1 + n_gen)
     scale: Tensor  # (batch,): what costs are relative to
-    free: Tensor  # (batch, n_gen + 1, n_coarse)
+    coarse_free_response: Tensor  # of the model, (batch, n_gen + 1, n_coarse)
 
     @staticmethod
     def of(channels: Channels, inputs: Inputs, free: np.ndarray, n_points: int) -> Pool:
         """Convert channels and free responses to float32."""
         scale = np.maximum(channels.static_cost(inputs), SMALLEST_COST) * n_points
-        seen = channels.start, channels.undriven, channels.sequence, channels.constants
+        seen = channels.start, channels.free_response, channels.sequence, channels.constants
         arrays = (*seen, inputs.cost, scale, free)
         return Pool(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32) for a in arrays))
 
@@ -111,12 +111,12 @@ class Loss:
 
     def powers(self, network: StagedNetwork, pool: Pool) -> Tensor:
         """Schedules at the knots, (batch, n_knots, n_gen), pu: what `DispatchPolicy.powers` computes."""
-        powers: Tensor = network(pool.start, pool.undriven, pool.sequence, pool.constants)
+        powers: Tensor = network(pool.start, pool.free_response, pool.sequence, pool.constants)
         return powers
 
     def __call__(self, powers: Tensor, pool: Pool, margin: float = 0.0) -> tuple[Tensor, Tensor]:
         """Cost relative to the scale, (batch,), and relative excess of |ω|, (batch, n_gen, n_coarse)."""
-        omega, p_slack = self.objective.rollout(pool.free, powers)
+        omega, p_slack = self.objective.rollout(pool.coarse_free_response, powers)
         cost = self.objective.cost(powers, p_slack, pool.cost) / pool.scale
         return cost, (omega.abs() / self.omega_bound - (1.0 - margin)).relu()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,18 +39,18 @@ class Choice:
 #: iterates are the same, without a tenth of the time.
 _IPOPT_OPTIONS = {"min_refinement_steps": 0}
 #: By settings slug. IPOPT has its default tolerances in all of them.
-SETTINGS = {
-    "default": Choice(),
-    "executable": Choice("ipopt-executable"),
-    "accelerated": Choice("sequential"),
-    **{f"start-{start}": Choice(start=start) for start in STARTS},
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "default": {},
+    "executable": {"solver": "ipopt-executable"},
+    "accelerated": {"solver": "sequential"},
+    **{f"start-{start}": {"start": start} for start in STARTS},
 }
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
     case.check_regimes([regime])
-    choice = SETTINGS[settings.name]
+    choice = Choice(**SETTINGS[settings.name])
     if choice.solver == "sequential":
         return functools.partial(_solve_sequentially, case, regime, settings)
 

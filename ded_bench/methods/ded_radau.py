@@ -11,6 +11,7 @@ import functools
 import itertools
 import math
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,12 @@ from ded_bench.solvers.outcome import Compiled
 from ded_bench.truth.network import Network
 
 #: Mean length of an element in s, by settings slug.
-SETTINGS = {"default": 0.2, "1s": 1.0, "500ms": 0.5, "100ms": 0.1}
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "default": {"length_s": 0.2},
+    "1s": {"length_s": 1.0},
+    "500ms": {"length_s": 0.5},
+    "100ms": {"length_s": 0.1},
+}
 #: Collocation points of the Radau IIA method with three stages, as fractions of an element, and the
 #: weights of its quadrature (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.5).
 POINTS = (0.4 - 6**0.5 / 10, 0.4 + 6**0.5 / 10, 1.0)
@@ -43,7 +49,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
-        elements = element_count(case, instance, SETTINGS[settings.name])
+        elements = element_count(case, instance, **SETTINGS[settings.name])
         model = _built(case, elements)
         set_instance(model, case, instance, regime)
         build_s = time.perf_counter() - started

@@ -19,7 +19,7 @@ RANDOM_INTERVAL_S = 5.0
 
 def dispatched(case: Case, instance: Instance, regime: str) -> Schedule:
     """Traditional dispatch every second."""
-    return ed.dispatch(case, instance, ed.SETTINGS["1s"])
+    return ed.dispatch(case, instance, interval_s=1.0)
 
 
 def linearised(case: Case, instance: Instance, regime: str) -> Schedule:

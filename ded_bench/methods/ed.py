@@ -8,6 +8,8 @@ is missing. Frequency limits play no role in it.
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -19,17 +21,21 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
 #: Seconds from one dispatch to the next by settings slug; by default one serves a whole minute.
-SETTINGS = {"default": 60.0, "10s": 10.0, "1s": 1.0}
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "default": {"interval_s": 60.0},
+    "10s": {"interval_s": 10.0},
+    "1s": {"interval_s": 1.0},
+}
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a dispatcher of single instances; both regimes get the same schedules."""
     case.check_regimes([regime])
-    interval_s = SETTINGS[settings.name]
+    options = SETTINGS[settings.name]
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
-        schedule = dispatch(case, instance, interval_s)
+        schedule = dispatch(case, instance, **options)
         return Solution(Status.FEASIBLE, schedule, solve_s=time.perf_counter() - started)
 
     return solve

@@ -183,3 +183,56 @@ def _invert(grid: Grid, angle: Array, inverse: Array) -> None:
             jacobian[near, far] -= slope
             jacobian[far, near] -= slope
     inverse[:] = np.linalg.inv(jacobian)
+
+
+@compiled
+def solve_angles(grid: Grid, free: Indices, wanted: Array, theta: Array, f: Array) -> bool:
+    """Find the angles of some buses that give wanted injections there, one instance after another.
+
+    Newton's method, whose equations are solved anew in every step.
+
+    Args:
+        grid: the network.
+        free: the buses whose angles are searched, (n_free,).
+        wanted: their injections, (batch, n_free), pu.
+        theta: angles of all buses, (batch, n_bus), rad; guesses of the free ones become answers.
+        f: receives the injections of all buses, (batch, n_bus), pu.
+
+    Returns:
+        Whether there is a solution for all; LinAlgError where a Jacobian is singular.
+    """
+    n, place = len(free), np.full(theta.shape[1], -1)
+    for i in range(n):
+        place[free[i]] = i
+    off, jacobian = np.empty(n), np.empty((n, n))
+    for b in range(len(theta)):
+        solved = False
+        for _ in range(NEWTON_STEPS):
+            f[b] = 0.0
+            jacobian[:] = 0.0
+            for i in range(len(grid.coupling)):
+                near, far = grid.lines[i, 0], grid.lines[i, 1]
+                across = theta[b, near] - theta[b, far]
+                flow, slope = grid.coupling[i] * np.sin(across), grid.coupling[i] * np.cos(across)
+                f[b, near] += flow
+                f[b, far] -= flow
+                first, second = place[near], place[far]
+                if first >= 0:
+                    jacobian[first, first] += slope
+                if second >= 0:
+                    jacobian[second, second] += slope
+                if first >= 0 and second >= 0:
+                    jacobian[first, second] -= slope
+                    jacobian[second, first] -= slope
+            for i in range(n):
+                off[i] = f[b, free[i]] - wanted[b, i]
+            worst = np.abs(off).max()
+            solved = worst < grid.mismatch
+            if solved or not worst < np.inf:
+                break
+            step = np.linalg.solve(jacobian, off)
+            for i in range(n):
+                theta[b, free[i]] -= step[i]
+        if not solved:
+            return False
+    return True

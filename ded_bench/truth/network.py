@@ -17,11 +17,10 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.state import State
-from ded_bench.truth.integrator import Grid
+from ded_bench.truth.integrator import Grid, Indices, solve_angles
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
-NEWTON_STEPS = 30
 
 
 class PowerFlowError(ArithmeticError):
@@ -87,8 +86,6 @@ class Network:
             self.d,
             self.mismatch,
         )
-        self._outer_algebraic = self._outer(self.algebraic)
-        self._outer_unknown = self._outer(self.unknown)
         self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
         self._first_step = np.zeros_like(self._flat)
         self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
@@ -119,7 +116,7 @@ class Network:
         Raises:
             PowerFlowError: no solution from this guess.
         """
-        return self._newton(theta, injection, self.algebraic, self._outer_algebraic)
+        return self._newton(theta, injection, self.algebraic)
 
     def power_flow(self, p_gen: Array, p_load: Array) -> Array:
         """Equilibrium angles for given generator and load injections, shape (..., n_bus), rad.
@@ -133,7 +130,7 @@ class Network:
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
         theta = wanted @ self._first_step  # Newton's first step from θ = 0
-        theta, _ = self._newton(theta, wanted[..., self.unknown], self.unknown, self._outer_unknown)
+        theta, _ = self._newton(theta, wanted[..., self.unknown], self.unknown)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
             raise PowerFlowError("an angle across a line exceeds 90 degrees")
         return theta
@@ -190,25 +187,18 @@ class Network:
         slack_share = (full[[self.slack]][:, alg] @ inverse @ to_load)[0]
         return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
 
-    def _outer(self, rows: Array) -> Array:
-        part = self.incidence[:, rows]
-        return (part[:, :, None] * part[:, None, :]).reshape(len(part), -1)
-
-    def _newton(self, theta: Array, wanted: Array, rows: Array, outer: Array) -> tuple[Array, Array]:
+    def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
         theta = np.array(theta)
-        n = len(rows)
-        for _ in range(NEWTON_STEPS):
-            across = theta @ self.incidence.T
-            injections = (np.sin(across) * self.coupling) @ self.incidence
-            mismatch = injections[..., rows] - wanted
-            if np.abs(mismatch).max() < self.mismatch:
-                return theta, injections
-            jacobian = ((np.cos(across) * self.coupling) @ outer).reshape(*theta.shape[:-1], n, n)
-            try:
-                theta[..., rows] -= np.linalg.solve(jacobian, mismatch[..., None])[..., 0]
-            except np.linalg.LinAlgError:
-                break
-        raise PowerFlowError("the power flow has no solution")
+        f = np.empty(theta.shape)
+        rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
+        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(free))).reshape(-1, len(free))
+        try:
+            solved = solve_angles(self.grid, free, np.ascontiguousarray(wanted), *rows)
+        except np.linalg.LinAlgError:
+            solved = False
+        if not solved:
+            raise PowerFlowError("the power flow has no solution")
+        return theta, f
 
 
 def check_servable(case: Case, instance: Instance, source: str) -> None:

@@ -168,7 +168,7 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, quiet_insta
     solve(instances[1])
     for instance in instances:
         again = solve(instance)
-        elements = element_count(case, instance, get_method("ded-radau").settings["default"])
+        elements = element_count(case, instance, get_method("ded-radau").settings["default"]["length_s"])
         model = build_ded_radau(case, elements)
         set_instance(model, case, instance, "TO")
         fresh = CasadiIpopt(model).solve()

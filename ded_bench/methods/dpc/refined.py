@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from ded_bench.koopman.surrogates import find_model
@@ -20,7 +21,7 @@ from ded_bench.solvers.status import Status
 
 METHOD = "ded-dpc-refined"
 #: Number of steps, by slug.
-SETTINGS: dict[str, dict[str, Any]] = {
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "default": {"steps": STEPS},
     "steps25": {"steps": 25},
     "steps100": {"steps": 100},

@@ -145,21 +145,13 @@ def train(
         fresh: how many instances to draw; 0 trains on four fifths of those given.
         variant: fields of `Variant`.
     """
-    chosen, seed, seconds, device = Variant(**variant), options.seed, options.seconds, options.device
+    chosen, seed, device = Variant(**variant), options.seed, options.device
     first = instances[0]
     scope = Scope(case, regime, first.horizon_s)
     response = Response.make(case, case.knot_times(first.horizon_s))
     stride = coarse_stride(first.dt_s, first.steps)
     generator = torch.Generator().manual_seed(seed)
-    if fresh:
-        fresh = fresh if seconds is None else min(fresh, math.ceil(FRESH_PER_SECOND * seconds))
-        drawn = list(sample_instances(case, POLICY_SEED + seed, fresh, servable=servable))
-        held_out = list(instances)
-    else:
-        order = torch.randperm(len(instances), generator=generator).tolist()
-        n_held = max(1, round(HELD_OUT * len(instances)))
-        held_out = [instances[i] for i in order[:n_held]]
-        drawn = [instances[i] for i in order[n_held:]] or held_out
+    drawn, held_out = _split(case, instances, fresh, options, generator)
     inputs = [Inputs.of(case, part) for part in (drawn, held_out)]
     channels = [Channels.of(case, part, response, chosen.prior) for part in inputs]
     free = [coarse_free_response(Network(case), model, part, first.grid, stride) for part in inputs]
@@ -167,11 +159,7 @@ def train(
         Pool.of(c, i, f, len(first.grid)).to(device) for c, i, f in zip(channels, inputs, free, strict=True)
     )
     condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
-    loss = Loss(
-        Objective.make(condensed).to(device),
-        case.omega_bound(regime),
-        stride * first.dt_s,
-    )
+    loss = Loss(Objective.make(condensed).to(device), case.omega_bound(regime), stride * first.dt_s)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         network = StagedNetwork(case, response, chosen.stages, chosen.width, chosen.dilations)
@@ -182,7 +170,7 @@ def train(
     run = _Run(network, loss, generator, chosen, checkpoint_file(out), len(data))
     if options.resume and run.checkpoint.is_file():
         run.load(device)
-    run.go(data, check, epochs, seconds, f"{METHOD} {regime}")
+    run.go(data, check, epochs, options.seconds, f"{METHOD} {regime}")
     network.load_state_dict(run.best_weights)
     training = {
         "seed": seed,
@@ -206,6 +194,25 @@ def train(
     policy.save(out)
     write_history(out, run.history)
     return policy
+
+
+def _split(
+    case: Case,
+    instances: Sequence[Instance],
+    fresh: int,
+    options: TrainingOptions,
+    generator: torch.Generator,
+) -> tuple[list[Instance], list[Instance]]:
+    """Instances to train on, and those that choose the best weights."""
+    if fresh:
+        if options.seconds is not None:
+            fresh = min(fresh, math.ceil(FRESH_PER_SECOND * options.seconds))
+        drawn = sample_instances(case, POLICY_SEED + options.seed, fresh, servable=servable)
+        return list(drawn), list(instances)
+    order = torch.randperm(len(instances), generator=generator).tolist()
+    n_held_out = max(1, round(HELD_OUT * len(instances)))
+    held_out = [instances[i] for i in order[:n_held_out]]
+    return [instances[i] for i in order[n_held_out:]] or held_out, held_out
 
 
 class _Run:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 #: Short trainings, for comparison with each other only: each `study-…` changes one thing of `study`.
 STUDY: dict[str, Any] = {"epochs": 8, "fresh": 16_000}
-#: What the policy was trained on and how, by slug; values are options of `ded_dpc_train.train`.
+#: What the policy was trained on and how, by slug; values are options of `training.train`.
 #: `train400` sees nothing but the benchmark's training instances, in about as many steps.
-SETTINGS: dict[str, dict[str, Any]] = {
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "default": {},
     "train400": {"fresh": 0, "epochs": 2000},
     "study": STUDY,

@@ -147,11 +147,12 @@ def _solve_algebraic(grid: Grid, wanted: Array, inverse: Array, angle: Array, f:
             f[far] -= flow
         worst = 0.0
         for i in range(n):
-            worst = max(worst, abs(f[grid.algebraic[i]] - wanted[i]))
+            off = abs(f[grid.algebraic[i]] - wanted[i])
+            if not off < np.inf:  # before max, which passes over what is not a number
+                return False
+            worst = max(worst, off)
         if worst < grid.mismatch:
             return True
-        if not worst < np.inf:
-            return False
         if worst > CONTRACTION * last:
             _invert(grid, angle, inverse)
         last = worst

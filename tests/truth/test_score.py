@@ -110,7 +110,7 @@ def test_the_largest_frequency_counts(case, instance, still):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_ramp_violation_is_per_step_beyond_epsilon(case, instance, still, sign):
     """A jump of ε + 2e-3 pu between two points; ε = ramp · dt. Up and down alike."""
-    epsilon = case.ramp_pu_per_s * instance.dt_s
+    epsilon = case.ramp[0] * instance.dt_s
 
     def jump(p: np.ndarray) -> None:
         p[50:, 0] += sign * (epsilon + 2e-3)
@@ -167,7 +167,7 @@ def test_violations_of_a_schedule(case, instance, regime, bound_hz):
     p = np.stack([case.p_nominal, case.p_nominal, case.p_nominal + step, case.p_nominal + step])
     schedule = Schedule(t=np.array([0.0, 0.5, 0.51, 1.0]), p=p)
     verdict = score(case, instance, schedule, regime)
-    assert verdict.ramp_violation == pytest.approx(0.3 - case.ramp_pu_per_s * instance.dt_s, rel=1e-9)
+    assert verdict.ramp_violation == pytest.approx(0.3 - case.ramp[0] * instance.dt_s, rel=1e-9)
     assert verdict.initial_violation == 0
     assert verdict.bound_violation == pytest.approx(max(0.0, float((case.p_min - p[-1]).max())), abs=1e-12)
     fastest = np.abs(simulate(case, instance, schedule).omega).max() / (2 * math.pi)

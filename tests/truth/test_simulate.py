@@ -135,14 +135,14 @@ def test_energy_is_conserved_without_damping(case, alter, quiet_instance, consta
 
 
 def test_damping_takes_the_energy_that_is_lost(case, quiet_instance, constant):
-    """H(t) - H(0) = -∫ Σ D ω² dt; Simpson's rule at 0.01 s errs by less than 1e-7 of what is lost."""
+    """H(t) - H(0) = -∫ Σ D ω² dt; Simpson's rule at 0.01 s errs by less than 2e-7 of what is lost."""
     instance = quiet_instance(case, horizon_s=10.0, initial=swinging(case, 0.3))
     trajectory = simulate(case, instance, constant(instance, case.p_nominal))
     d = np.array([case.machines[g].d for g in case.generators])
     lost = cumulative_simpson(trajectory.omega**2 @ d, x=trajectory.t, initial=0.0)
     total = energy(case, trajectory)
     assert lost[-1] > 0
-    np.testing.assert_allclose(total[0] - total, lost, rtol=0, atol=1e-7 * lost[-1])
+    np.testing.assert_allclose(total[0] - total, lost, rtol=0, atol=2e-7 * lost[-1])
 
 
 # Small perturbations.

@@ -210,7 +210,7 @@ def bang_bang(case: Case, instance: Instance) -> Schedule:
     """Up or down at every grid point, at half to full ramp, drawn at random in pairs that cancel."""
     signs = np.random.default_rng(51).choice([-1.0, 1.0], (instance.steps, len(case.generators)))
     signs[::2] = -signs[1::2]
-    steps = signs * case.ramp_pu_per_s * instance.dt_s * np.linspace(0.5, 1.0, instance.steps)[:, None]
+    steps = signs * case.ramp * instance.dt_s * np.linspace(0.5, 1.0, instance.steps)[:, None]
     p = instance.p_initial(case) + np.vstack([np.zeros(len(case.generators)), np.cumsum(steps, axis=0)])
     return Schedule(t=instance.grid, p=p)
 

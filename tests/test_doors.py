@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.evaluate.summary import summary
 from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import write_benchmark
-from ded_bench.report.paper import table_v, table_vi
+from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
+from ded_bench.report.paper import paper_lines
 from ded_bench.run.results import Results
 
 PYPROJECT = """\
@@ -132,8 +132,9 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
     )
     assert command(*bench)[0] == 0
     frame, timing = Results(out).frame(), timing_summary(read_timing(out / "timing.csv"))
-    five = table_v(summary(frame), timing, {}).set_index(["regime", "title"])
-    six = table_vi(summary(frame), {}).set_index(["regime", "title"])
+    lines = paper_lines(frame, timing, None)
+    five = tabulate(TABLE_V, lines).set_index(["regime", "title"])
+    six = tabulate(TABLE_VI, lines).set_index(["regime", "title"])
     for regime in ("NO", "TO"):
         assert five.loc[(regime, "flat"), "increase_percent"] == pytest.approx(2.0)
         assert five.loc[(regime, "flat"), "n"] == 2
@@ -201,7 +202,7 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     assert (
         f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     )
-    assert "mine" in set(table_v(summary(Results(out).frame()), timing_summary([]), {})["title"])
+    assert "mine" in {line.title for line in paper_lines(Results(out).frame(), timing_summary([]), None)}
     for wrong in (
         score,  # no name
         (*score, "--name", "ded"),

@@ -121,11 +121,13 @@ class KeyedTable(Generic[K, T]):
             raise InputError(self.path, "", "is not UTF-8 text") from None
 
     def _take(self, found: Iterable[tuple[T, dict[str, str]]]) -> None:
+        rows = dict(self.rows)  # whoever iterates over the present ones may add rows meanwhile
         for row, others in list(found):  # all of them are right, or none is taken
             key = self._key(row)
-            self._superseded += key in self.rows
-            self.rows[key] = row
+            self._superseded += key in rows
+            rows[key] = row
             self._others[key] = others
+        self.rows = rows
 
     def _forget(self) -> None:
         self.rows, self._others, self._header = {}, {}, self._table.names

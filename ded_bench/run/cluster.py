@@ -76,7 +76,7 @@ class Cluster(Workers):
     def __exit__(self, *_: object) -> None:
         if self._client.status == "running":
             self._client.run(_rest, on_error="ignore")
-        with contextlib.suppress(OSError):  # nobody is there to take leave of
+        with contextlib.suppress(OSError):  # the scheduler is gone
             self._client.close(timeout=CONNECT_S)
 
     def _submit(self, request: bytes, limit_s: float | None) -> Future[Answer]:

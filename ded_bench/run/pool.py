@@ -7,7 +7,6 @@ crash or hang, and only its own call is to blame: it is killed and replaced, and
 from __future__ import annotations
 
 import contextlib
-import importlib
 import itertools
 import multiprocessing
 import os
@@ -68,11 +67,6 @@ class Workers:
     def __exit__(self, *_: object) -> None:
         self._children.close()
         self._executor.shutdown(cancel_futures=True)
-
-    def warm(self, module: str) -> None:
-        """Start all processes and have them import a module, while this one has other things to do."""
-        for _ in range(self.count):
-            self._submit(pickle.dumps((importlib.import_module, (module,))), None)
 
     def imap(
         self, calls: Iterable[Call], labels: Iterable[T], limits_s: Iterable[float | None] | None = None

@@ -95,6 +95,14 @@ def test_others_rows_are_seen_and_kept(tmp_path: Path) -> None:
     assert first.rows == {}
 
 
+def test_rows_may_be_added_while_one_goes_through_them(tmp_path: Path) -> None:
+    table = old(tmp_path)
+    table.add([Old("a", 1), Old("b", 2)])
+    for row in table.rows.values():
+        table.add([Old(row.name * 2, row.number)])
+    assert list(table.rows) == ["a", "b", "aa", "bb"]
+
+
 def test_a_file_changed_by_hand_is_read_anew(tmp_path: Path) -> None:
     """Even if it is longer than before and still the same file to the system."""
     table = old(tmp_path)

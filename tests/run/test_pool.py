@@ -44,10 +44,6 @@ class MoodyError(Exception):
         super().__init__(first)
 
 
-def loaded(module: str) -> bool:
-    return module in sys.modules
-
-
 def raise_moody() -> None:
     raise MoodyError("a", "b")
 
@@ -99,12 +95,6 @@ def test_every_call_is_answered_once_whatever_it_does(tmp_path: Path, capfd) -> 
     assert "cannot be sent" in str(answers["unsendable"])
     assert isinstance(answers["unreadable here"], TypeError)
     assert capfd.readouterr().out == ""  # rows go there
-
-
-def test_a_warm_process_has_the_module_before_it_is_called() -> None:
-    with Workers(1) as workers:
-        workers.warm("colorsys")
-        assert [answer for _, answer in workers.imap([(loaded, ("colorsys",))], [None])] == [True]
 
 
 def test_a_hang_costs_its_own_process_only(tmp_path: Path) -> None:

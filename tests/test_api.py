@@ -17,7 +17,7 @@ from ded_bench.problem.sampling import write_benchmark
 from ded_bench.solvers.status import Status
 from ded_bench.truth import score, simulate
 
-HEAVY = ("casadi", "matplotlib", "pandas", "pyomo", "scipy", "torch")
+HEAVY = ("casadi", "matplotlib", "numba", "pandas", "pyomo", "scipy", "torch")
 
 
 def loaded_after(code: str) -> list[str]:
@@ -34,6 +34,11 @@ def test_a_light_door() -> None:
     )
 
 
+def test_help_waits_for_no_compiler() -> None:
+    """Nor for a solver or torch."""
+    assert "numba" not in loaded_after("import ded_bench.cli.commands")
+
+
 def test_the_scorer_needs_no_method() -> None:
     code = "from ded_bench import Schedule, load_instances, score\nimport numpy as np\n"
     code += "from ded_bench.problem.instance import Instance\n"
@@ -41,7 +46,7 @@ def test_the_scorer_needs_no_method() -> None:
     code += "i = i.model_copy(update={'horizon_s': 0.05})\n"
     code += "p = list(i.initial.power.values())\n"
     code += "score(i, Schedule(np.array([0.0, 0.05]), np.array([p, p])), 'TO')"
-    assert loaded_after(code) == ["scipy"]
+    assert loaded_after(code) == ["numba", "scipy"]
 
 
 def test_everything_promised_is_there() -> None:

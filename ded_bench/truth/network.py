@@ -7,7 +7,9 @@ L_i = f_i(θ). Everything is batched over leading dimensions.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,9 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.state import State
-from ded_bench.truth.integrator import Grid, Indices, solve_angles
+
+if TYPE_CHECKING:
+    from ded_bench.truth.integrator import Grid, Indices
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
@@ -76,21 +80,19 @@ class Network:
         self.m = np.array([case.machines[g].m for g in case.generators])
         self.d = np.array([case.machines[g].d for g in case.generators])
         self.mismatch = max(MISMATCH, RESOLUTION * float(self.coupling.max()))
-        self.grid = Grid(
-            self.ends,
-            self.coupling,
-            self.generators,
-            self.algebraic,
-            self.slack,
-            self.m,
-            self.d,
-            self.mismatch,
-        )
         self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
         self._first_step = np.zeros_like(self._flat)
         self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
             self._flat[np.ix_(self.unknown, self.unknown)]
         )
+
+    @functools.cached_property
+    def grid(self) -> Grid:
+        """What compiled functions see of this network."""
+        from ded_bench.truth.integrator import Grid  # and with it Numba: help does without
+
+        places = self.generators, self.algebraic, self.slack
+        return Grid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
@@ -188,6 +190,8 @@ class Network:
         return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
 
     def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
+        from ded_bench.truth.integrator import solve_angles  # here only, as in `grid`
+
         theta = np.array(theta)
         f = np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)

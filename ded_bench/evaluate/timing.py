@@ -201,20 +201,17 @@ class _Turns:
             call_s=seconds,
             schedule_difference_pu=self._difference(job, instance, solution.schedule),
             load_average=os.getloadavg()[0],
-            error=_problem(solution),
+            error="" if solution.schedule is not None else solution.error or solution.status.sentence,
             solver_version=solution.solver_version,
             date=now(),
             **facts,
         )
 
     def _difference(self, job: Job, instance: Instance, schedule: Schedule | None) -> float | None:
-        kept = self._kept(Key(instance.id, job.regime, job.method, job.settings.slug), instance)
-        return None if schedule is None or kept is None else largest_difference(schedule, kept)
-
-    def _kept(self, key: Key, instance: Instance) -> Schedule | None:
-        if self.results is None or not self.results.schedule_path(key).is_file():
+        key = Key(instance.id, job.regime, job.method, job.settings.slug)
+        if schedule is None or self.results is None or not self.results.schedule_path(key).is_file():
             return None
-        return self.results.schedule(key, self.case, instance)
+        return largest_difference(schedule, self.results.schedule(key, self.case, instance))
 
 
 def _go(
@@ -230,10 +227,15 @@ def _go(
     jobs = list(turns.facts)
     turn = 0
     for round_ in range(1, (rounds or MAX_ROUNDS) + 1):
-        present = [job for job in jobs if round_ <= (rounds or _rounds_of(job, rows, round_))]
+        present = jobs
+        if rounds is None and round_ > 1:
+            first = [row for row in rows.values() if row.round == 1]
+            present = [
+                job for job in jobs if round_ <= rounds_of(r for r in first if _name(r) == _name_of(job))
+            ]
         for instance in tqdm(instances, unit="instance", disable=None, desc=f"bench, round {round_}"):
             turn += 1
-            shift = turn % len(present) if present else 0
+            shift = turn % max(len(present), 1)
             for job in present[shift:] + present[:shift]:
                 key = (round_, job.regime, job.method, job.settings.slug, instance.id)
                 if key in rows:
@@ -245,12 +247,6 @@ def _go(
                 rows[key] = turns.call(job, round_, instance)
             TIMING.write(partial, rows.values())
     return list(rows.values())
-
-
-def _rounds_of(job: Job, rows: Mapping[Any, TimingRow], round_: int) -> int:
-    if round_ == 1:
-        return 1
-    return rounds_of(row for row in rows.values() if row.round == 1 and _name(row) == _name_of(job))
 
 
 def timed(
@@ -286,8 +282,7 @@ def runs_of(
 ) -> list[Job]:
     """What a results table holds, to be timed, in the methods' order.
 
-    Rows of studies are not timed. Rows of other methods, and of models given as a file, cannot be run
-    again from their key alone and are left out.
+    Rows of studies, of other methods and of models given as a file are left out.
 
     Args:
         settings: all but the name and the model, which come from the keys.
@@ -376,12 +371,6 @@ def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
 
 def _values(rows: Sequence[TimingRow], name: str) -> list[float]:
     return [value for row in rows if (value := getattr(row, name)) is not None]
-
-
-def _problem(solution: Solution) -> str:
-    if solution.schedule is not None:
-        return ""
-    return solution.error or solution.status.sentence
 
 
 def _name(row: TimingRow) -> tuple[str, str, str]:

@@ -159,13 +159,10 @@ def bench(
 def rounds_of(rows: Iterable[TimingRow]) -> int:
     """How many rounds a method takes part in, from its calls of the first round, which are warm.
 
-    As many as fit into BUDGET_S, from 1 to MAX_ROUNDS; 1 if a call failed.
+    As many as fit into BUDGET_S, from 1 to MAX_ROUNDS; 1 if a call failed, MAX_ROUNDS without any.
     """
-    first = list(rows)
-    if any(row.call_s is None or row.error for row in first):
-        return 1
-    spent = sum(row.call_s or 0.0 for row in first)
-    return max(1, min(MAX_ROUNDS, int(BUDGET_S / max(spent, 1e-9))))
+    seconds = [BUDGET_S if row.call_s is None or row.error else row.call_s for row in rows]
+    return max(1, min(MAX_ROUNDS, int(BUDGET_S / max(sum(seconds), 1e-9))))
 
 
 class _Turns:
@@ -227,15 +224,13 @@ def _go(
     jobs = list(turns.facts)
     turn = 0
     for round_ in range(1, (rounds or MAX_ROUNDS) + 1):
-        present = jobs
-        if rounds is None and round_ > 1:
-            first = [row for row in rows.values() if row.round == 1]
-            present = [
-                job for job in jobs if round_ <= rounds_of(r for r in first if _name(r) == _name_of(job))
-            ]
+        made = [row for row in rows.values() if row.round == 1 and rounds is None and round_ > 1]
+        present = [j for j in jobs if round_ <= rounds_of(r for r in made if _name(r) == _name_of(j))]
+        if not present:
+            break
         for instance in tqdm(instances, unit="instance", disable=None, desc=f"bench, round {round_}"):
             turn += 1
-            shift = turn % max(len(present), 1)
+            shift = turn % len(present)
             for job in present[shift:] + present[:shift]:
                 key = (round_, job.regime, job.method, job.settings.slug, instance.id)
                 if key in rows:

@@ -41,9 +41,10 @@ AVERAGE = 0.998  # of the weights, exponentially
 MARGIN = 0.02
 #: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
 #: exact penalty, above nearly all of the optimum's multipliers. It grows from the first to the second.
-PRICE = (0.01, 0.04)
+PRICE = (0.01, 0.08)
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
-DOUBLING = 0.02
+#: It, MARGIN and PRICE were chosen on validation instances (docs/model.md).
+DOUBLING = 0.05
 #: The part of the instances with the largest excess is seen this many times more in the next epoch.
 HARD, REPEATS = 0.02, 5
 #: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per point.

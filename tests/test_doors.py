@@ -17,7 +17,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import write_benchmark
+from ded_bench.problem.sampling import load_split, write_benchmark
 from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.paper import paper_lines
 from ded_bench.run.results import Results
@@ -149,7 +149,8 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
     monkeypatch.chdir(tmp_path)
     source = MODULE.replace("    power", "    if regime == 'TO':\n        return None\n    power", 1)
     Path("my_dispatch.py").write_text(source)
-    chosen = ("--regime", "NO,TO", "--instance", problem / "instances" / "threebus-0000.json", "--out", "out")
+    file = problem / "instances" / f"{load_split(problem).test[0]}.json"  # the one that `bench` times
+    chosen = ("--regime", "NO,TO", "--instance", file, "--out", "out")
     code, out, _ = command("solve", "--method", "my_dispatch:solve", *chosen)
     assert code == 1
     rows = {row["regime"]: row for row in map(json.loads, out.splitlines())}

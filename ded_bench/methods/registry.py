@@ -91,6 +91,7 @@ METHODS: dict[str, Method] = {
     for method in (
         Method("ded", "ded_bench.methods.ded", "DED"),
         Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
+        Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
         Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),

@@ -1,0 +1,232 @@
+"""DED by linear programs along simulated trajectories, on the case's knots.
+
+A schedule is simulated on the true DAE; the linear program around its trajectory (see `knot_program`)
+gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
+costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
+surrogate. It takes one to three programs, since the linear models differ only by the second order
+of what one schedule changes.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ded_bench.koopman.trajectory import Indices, TrajectoryModel, linearise_along
+from ded_bench.methods import ed
+from ded_bench.methods.knot_program import KnotProgram, Prediction, divided, power_limits
+from ded_bench.methods.solution import Settings, Solution
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
+
+#: The case's own knots, or others this far apart.
+SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}}
+
+#: Programs keep this much below the bound, and may leave half of it open between the points that have
+#: rows: the rest absorbs the model's error of the last program. A schedule is accepted if its simulation
+#: exceeds the bound by at most half of what strict feasibility allows (1e-6 Hz). Costs are 1e-6 higher.
+MARGIN = 2 * np.pi * 1e-6
+OPEN = ACCEPTED = 2 * np.pi * 5e-7
+#: Agreement of a simulated schedule's cost with its program's, as a fraction.
+COST_TOLERANCE = 1e-6
+#: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
+NEAR, PARTS = 0.9, 8
+#: Trajectories, programs around one of them, and halvings of a step that the system cannot follow.
+MAX_ROUNDS, MAX_PROGRAMS, MAX_HALVINGS = 15, 15, 6
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
+    """Return a solver of single instances, which may start from an earlier solution."""
+    case.check_regimes([regime])
+    return SlpSolver(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
+
+
+@dataclass(frozen=True)
+class SlpSolver:
+    """Solves instances of one case and regime."""
+
+    case: Case
+    regime: str
+    time_limit_s: float | None = None
+    knot_interval_s: float | None = None  # None: the case's knots
+
+    def __call__(self, instance: Instance) -> Solution:
+        """Solve from the static dispatch of every second."""
+        return self.solve(instance)
+
+    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Solve.
+
+        Args:
+            instance: what to solve.
+            last: its schedule, if it has one, is where to start; its time is the instance's.
+        """
+        started = time.perf_counter()
+        limit = np.inf if self.time_limit_s is None else self.time_limit_s
+        start = ed.dispatch(self.case, instance, 1.0)
+        if last is not None and last.schedule is not None:
+            start = last.schedule
+        points = self._knots(instance)
+        sequence = _Sequence(self.case, instance, self.case.omega_bound(self.regime), points, started + limit)
+        status, schedule = sequence.run(start)
+        return Solution(
+            status=status,
+            schedule=schedule,
+            iterations=sequence.iterations,
+            build_s=0.0,
+            setup_s=0.0,
+            solve_s=time.perf_counter() - started,
+            solver_objective=sequence.claimed if status == Status.OPTIMAL else None,
+            solver_version=sequence.version,
+            error=""
+            if schedule is not None
+            else sequence.message
+            if status == Status.FAILED
+            else status.sentence,
+        )
+
+    def _knots(self, instance: Instance) -> Indices:
+        """Grid points of the knots: between grid points inputs are linear, so knots lie on them."""
+        times = self.case.knot_times(instance.horizon_s)
+        if self.knot_interval_s is not None:
+            times = np.linspace(0.0, instance.horizon_s, round(instance.horizon_s / self.knot_interval_s) + 1)
+        return np.unique(np.rint(times / instance.dt_s).astype(int))
+
+
+@dataclass
+class _Sequence:
+    """One instance's sequence of trajectories and programs."""
+
+    case: Case
+    instance: Instance
+    bound: float  # rad/s
+    points: Indices
+    deadline: float  # on the clock of `time.perf_counter`
+    limits: set[tuple[int, int]] = field(default_factory=set)  # (generator, grid point) with a row
+    iterations: int = 0
+    claimed: float = np.inf  # cost that the last program predicts
+    version: str = ""
+    message: str = ""
+    _cheapest: float = np.inf
+    _best: Schedule | None = None  # cheapest strictly feasible schedule simulated
+
+    def run(self, start: Schedule) -> tuple[Status, Schedule | None]:
+        """Go on until a simulated schedule confirms its program."""
+        if not self._reachable():
+            return Status.INFEASIBLE, None
+        p_gen = start.at(self.instance.grid[self.points])
+        p_gen[0] = self.instance.p_initial(self.case)
+        p_before, infeasible = p_gen, 0
+        for number in range(MAX_ROUNDS):
+            if time.perf_counter() > self.deadline:
+                return Status.TIME_LIMIT, self._best
+            try:
+                p_gen, trajectory = self._follow(p_before, p_gen)
+            except SimulationError as error:
+                self.message = str(error)
+                break
+            schedule = Schedule(t=trajectory.t[self.points], p=p_gen)
+            if self._confirmed(trajectory, schedule):
+                return Status.OPTIMAL, schedule
+            found, prediction = self._next(linearise_along(self.case, trajectory, self.points), number == 0)
+            if prediction is None:
+                return found, self._best
+            infeasible = infeasible + 1 if found == Status.INFEASIBLE else 0
+            if infeasible == 2:
+                return Status.INFEASIBLE, None
+            p_before, p_gen, self.claimed = p_gen, prediction.p_gen, prediction.objective
+        self.message = self.message or f"no convergence in {MAX_ROUNDS} trajectories"
+        return (Status.FAILED if self._best is None else Status.FEASIBLE), self._best
+
+    def _reachable(self) -> bool:
+        """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides."""
+        p_min, p_max = power_limits(self.case, self.instance, np.diff(self.points))
+        reach = self.case.ramp * self.instance.grid[self.points[1]]
+        p_initial = self.instance.p_initial(self.case)
+        return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
+
+    def _follow(self, p_before: Array, p_gen: Array) -> tuple[Array, Trajectory]:
+        """Simulate, closer to the powers before if the system cannot follow.
+
+        Raises:
+            SimulationError: not even then.
+        """
+        for _ in range(MAX_HALVINGS):
+            try:
+                schedule = Schedule(t=self.instance.grid[self.points], p=p_gen)
+                return p_gen, simulate(self.case, self.instance, schedule)
+            except SimulationError:
+                p_gen = (p_before + p_gen) / 2
+        raise SimulationError("the system cannot follow any schedule on the way to the program's")
+
+    def _confirmed(self, trajectory: Trajectory, schedule: Schedule) -> bool:
+        """Whether a schedule meets the bound and costs what its program said; keeps the best one."""
+        if np.abs(trajectory.omega[1:]).max() > self.bound + ACCEPTED:
+            return False
+        instance = self.instance
+        generation = float((trajectory.p_gen @ instance.cost_gen(self.case)).sum())
+        cost = generation + instance.cost_slack(self.case) * float(np.abs(trajectory.p_slack).sum())
+        if cost < self._cheapest:
+            self._cheapest, self._best = cost, schedule
+        return abs(cost - self.claimed) <= COST_TOLERANCE * abs(cost)
+
+    def _next(self, model: TrajectoryModel, first: bool) -> tuple[Status, Prediction | None]:
+        """Solve the program around a trajectory, with rows added until all points are right.
+
+        The first trajectory is not worth more than one program.
+
+        Returns:
+            `Optimal`, or `Infeasible` with the schedule of least excess; without a schedule, why not.
+        """
+        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
+        for _ in range(MAX_PROGRAMS):
+            rows = np.array(sorted(self.limits), dtype=int).reshape(-1, 2)
+            answer = program.solve(rows, self.deadline - time.perf_counter())
+            self._count(answer.iterations, answer.version, answer.message)
+            if answer.status == Status.FAILED:
+                return self._relaxed(program, rows)
+            if answer.status != Status.OPTIMAL:
+                return answer.status, None
+            prediction = program.predict(answer.x)
+            added = self._near(prediction.omega) - self.limits
+            self.limits |= added
+            if first or not added:
+                return Status.OPTIMAL, prediction
+        return Status.OPTIMAL, prediction
+
+    def _relaxed(self, program: KnotProgram, rows: Indices) -> tuple[Status, Prediction | None]:
+        """Widen the bound as little as possible where the program has no solution, or PIQP finds none."""
+        answer = program.solve_relaxed(rows, self.deadline - time.perf_counter())
+        self._count(answer.iterations, answer.version, answer.message)
+        if answer.status != Status.OPTIMAL:
+            return answer.status, None
+        prediction = program.predict(answer.x[:-1])
+        self.limits |= self._near(prediction.omega)
+        return (Status.INFEASIBLE if answer.x[-1] > OPEN else Status.OPTIMAL), prediction
+
+    def _count(self, iterations: int, version: str, message: str) -> None:
+        self.iterations += iterations
+        self.version, self.message = version, message
+
+    def _near(self, omega: Array) -> set[tuple[int, int]]:
+        """(generator, grid point) near the bound, if some |ω| is beyond it after t_0.
+
+        Args:
+            omega: shape (n_points, n_gen), rad/s.
+        """
+        size, bound = np.abs(omega.T), self.bound - MARGIN
+        size[:, 0] = 0.0  # x_0 is given, wherever it lies
+        if size.max() <= bound + OPEN:
+            return set()
+        chosen = np.zeros(size.shape, dtype=bool)
+        chosen[:, 1:-1] = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+        chosen[:, divided(self.points, np.full(len(self.points) - 1, PARTS))] = True
+        chosen[:, self.points] = False
+        g, k = np.nonzero(chosen & (size > NEAR * bound))
+        return set(zip(g.tolist(), k.tolist(), strict=True))

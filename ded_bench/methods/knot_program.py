@@ -1,0 +1,240 @@
+"""The linear program of `ded-slp`: schedules linear between knots, on a trajectory's linear model.
+
+Variables are input increments u = δP and deviations x = (δθ, δω) at the knots, and s_p >= |Σ P_s| over
+every piece p of a few grid points, so that every row is local to one interval between knots:
+
+    min  Σ_j weight_j c · (P_j + u_j) + c_s Σ_p s_p
+    x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
+    limits on P, on its ramps, and on ω at the knots and at chosen points between them
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ded_bench.koopman.trajectory import Indices, LocalRows, TrajectoryModel
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.solvers.staged_program import StagedAnswer, solve_staged
+
+#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same.
+PIECE = 10
+#: Entries of rows below this are left out: they are what a double leaves of zero.
+ROUND_OFF = 1e-13
+
+#: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
+WIDENING_PRICE = 100.0
+
+#: Row numbers, column numbers and values of dense blocks, stacked or single.
+Block = tuple[Indices, Indices, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A solution of a program, and what the linear model says about all grid points."""
+
+    p_gen: Array  # (n_knots, n_gen), pu
+    omega: Array  # (n_points, n_gen), rad/s
+    p_slack: Array  # (n_points,), pu
+    objective: float  # with |P_s| at every point
+
+
+class KnotProgram:
+    """The program around one trajectory. P_0 and x_0 are given: the first knot has no columns.
+
+    Columns of an interval, one after another: s of its pieces, then u and x at its end.
+
+    Args:
+        case: the grid.
+        instance: costs and P_0.
+        bound: limit of |ω|, rad/s.
+        model: the linear model along a trajectory that starts at P_0.
+    """
+
+    def __init__(self, case: Case, instance: Instance, bound: float, model: TrajectoryModel) -> None:
+        self.model, self._bound = model, bound
+        self._case, self._instance = case, instance
+        self._n, self._n_gen = len(model.lengths), len(case.generators)
+        self.pieces = piece_starts(model.points)
+        first = np.searchsorted(self.pieces, model.points[:-1])
+        owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
+        own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
+        self._s = np.arange(len(self.pieces)) + 3 * self._n_gen * owner
+        power = (own + 3 * self._n_gen * np.arange(self._n))[:, None]
+        self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(2 * self._n_gen)
+        self._n_columns = len(self.pieces) + 3 * self._n_gen * self._n
+        self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
+        self._price = instance.cost_slack(case)
+        self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
+
+    def solve(self, limits: Indices, time_limit_s: float) -> StagedAnswer:
+        """Solve with |ω| limited at all knots and at the points chosen.
+
+        Args:
+            limits: (generator, grid point) of the limits between knots, shape (n_limits, 2).
+            time_limit_s: see `solve_staged`.
+        """
+        return solve_staged(self._form(limits), time_limit_s)
+
+    def solve_relaxed(self, limits: Indices, time_limit_s: float) -> StagedAnswer:
+        """Solve with one more column, the last: the least by which all limits of |ω| must be widened, rad/s.
+
+        The cost counts, but so little that the widening is the least one but for round-off.
+        """
+        form = self._form(limits)
+        n, speed = self._n_columns, self._x[:, self._n_gen :].ravel()
+        one = np.ones(speed.size)
+        at_knots = sp.csc_matrix((one, (np.arange(speed.size), speed)), (speed.size, n))
+        kept = form.between.shape[0] - len(limits)
+        omega = sp.csc_matrix(sp.vstack([at_knots, form.between[kept:]]))
+        low, high = (
+            np.append(a[speed], b[kept:]) for a, b in ((form.lower, form.low), (form.upper, form.high))
+        )
+        widening = sp.csc_matrix(np.ones((omega.shape[0], 1)))
+        below = np.full(len(low), -np.inf)
+        lower, upper = np.append(form.lower, 0.0), np.append(form.upper, np.inf)
+        lower[speed], upper[speed] = -np.inf, np.inf
+        rows: Any = [[form.between[:kept], None], [omega, -widening], [-omega, -widening]]
+        relaxed = FreeForm(
+            cost=np.append(form.cost, WIDENING_PRICE * max(form.cost.sum(), 1.0)),
+            equal=sp.csc_matrix(sp.hstack([form.equal, sp.csc_matrix((form.equal.shape[0], 1))])),
+            right=form.right,
+            between=sp.csc_matrix(sp.bmat(rows)),
+            low=np.concatenate([form.low[:kept], below, below]),
+            high=np.concatenate([form.high[:kept], high, -low]),
+            lower=lower,
+            upper=upper,
+        )
+        return solve_staged(relaxed, time_limit_s)
+
+    def _form(self, limits: Indices) -> FreeForm:
+        model = self.model
+        ramp = np.diff(model.p_gen, axis=0)
+        reach = self._case.ramp * self._instance.dt_s * model.lengths[:, None]
+        slack = np.add.reduceat(model.p_slack, self.pieces)
+        omega = model.omega[limits[:, 1], limits[:, 0]]
+        cost = np.zeros(self._n_columns)
+        cost[self._u], cost[self._s] = self._generation[1:], self._price
+        lower, upper = self._column_limits()
+        rows = [self._ramp_rows(), self._slack, self._frequency_rows(limits)]
+        return FreeForm(
+            cost=cost,
+            equal=self._dynamics,
+            right=np.zeros(self._x.size),
+            between=sp.csc_matrix(sp.vstack(rows)),
+            low=np.concatenate(
+                [(-reach - ramp).ravel(), np.full(2 * len(slack), -np.inf), -self._bound - omega]
+            ),
+            high=np.concatenate([(reach - ramp).ravel(), -slack, slack, self._bound - omega]),
+            lower=lower,
+            upper=upper,
+        )
+
+    def predict(self, columns: Array) -> Prediction:
+        """All grid points at a solution, shape (n_columns,)."""
+        model = self.model
+        p_gen = np.array(model.p_gen)
+        p_gen[1:] = np.clip(p_gen[1:] + columns[self._u], self._case.p_min, self._case.p_max)
+        omega, p_slack = model.outputs(p_gen - model.p_gen)
+        objective = float((self._generation * p_gen).sum() + self._price * np.abs(p_slack).sum())
+        return Prediction(p_gen, omega, p_slack, objective)
+
+    def _column_limits(self) -> tuple[Array, Array]:
+        """Limits of all columns: of s, P and, at the knots, ω."""
+        case, model = self._case, self.model
+        p_min, p_max = power_limits(case, self._instance, model.lengths)
+        omega = model.omega[model.points[1:]]
+        lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
+        lower[self._s] = 0.0
+        lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
+        speed = self._x[:, self._n_gen :]
+        lower[speed], upper[speed] = -self._bound - omega, self._bound - omega
+        return lower, upper
+
+    def _dynamics_rows(self) -> sp.csc_matrix:
+        across = self.model.across
+        end = across.h / self.model.lengths[:, None, None]
+        row = np.arange(self._x.size).reshape(self._n, -1)
+        one = np.broadcast_to(np.eye(row.shape[1]), across.f.shape)
+        blocks = [
+            (row, self._x, one),
+            (row, self._u, -end),
+            (row[1:], self._x[:-1], -across.f[1:]),
+            (row[1:], self._u[:-1], (end - across.g)[1:]),
+        ]
+        return self._matrix(row.size, blocks)
+
+    def _ramp_rows(self) -> sp.csc_matrix:
+        row = np.arange(self._u.size).reshape(self._n, -1)
+        one = np.broadcast_to(np.eye(self._n_gen), (self._n, self._n_gen, self._n_gen))
+        return self._matrix(row.size, [(row, self._u, one), (row[1:], self._u[:-1], -one[1:])])
+
+    def _slack_rows(self) -> sp.csc_matrix:
+        """Σ δP_s - s over every piece, then -Σ δP_s - s."""
+        n = len(self.pieces)
+        rows, place = self.model.slack_rows(self.pieces), np.arange(n)
+        one = np.ones((n, 1, 1))
+        blocks = self._local(rows, place) + self._local(rows, place + n, -1.0)
+        blocks += [(p[:, None], self._s[:, None], -one) for p in (place, place + n)]
+        return self._matrix(2 * n, blocks)
+
+    def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
+        rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])
+        return self._matrix(len(limits), self._local(rows, np.arange(len(limits))))
+
+    def _local(self, rows: LocalRows, place: Indices, sign: float = 1.0) -> list[Block]:
+        """Rows of intervals as blocks of one row each; the first knot has no columns."""
+        later = rows.interval > 0
+        before = rows.interval[later] - 1
+        return [
+            (place[:, None], self._u[rows.interval], sign * rows.end[:, None]),
+            (place[later, None], self._u[before], sign * rows.start[later, None]),
+            (place[later, None], self._x[before], sign * rows.x[later, None]),
+        ]
+
+    def _matrix(self, n_rows: int, blocks: list[Block]) -> sp.csc_matrix:
+        rows = [np.broadcast_to(row[..., :, None], value.shape).ravel() for row, _, value in blocks]
+        columns = [np.broadcast_to(column[..., None, :], value.shape).ravel() for _, column, value in blocks]
+        values = np.concatenate([value.ravel() for _, _, value in blocks])
+        kept = np.abs(values) > ROUND_OFF
+        place = np.concatenate(rows)[kept], np.concatenate(columns)[kept]
+        return sp.csc_matrix((values[kept], place), (n_rows, self._n_columns))
+
+
+def knot_weights(lengths: Indices) -> Array:
+    """How much power at a knot counts in the sum over all grid points, shape (n_knots,)."""
+    half = (lengths - 1) / 2
+    weight = np.ones(len(lengths) + 1)
+    weight[:-1] += half
+    weight[1:] += half
+    return weight
+
+
+def piece_starts(points: Indices) -> Indices:
+    """First grid points of the pieces of Σ |P_s|; every interval between knots has its own."""
+    return divided(points, -(-np.diff(points) // PIECE))
+
+
+def divided(points: Indices, parts: Indices) -> Indices:
+    """First grid points of so many nearly equal parts of every interval between knots."""
+    ends = zip(itertools.pairwise(points), parts, strict=True)
+    return np.concatenate([np.linspace(*pair, count, endpoint=False).astype(int) for pair, count in ends])
+
+
+def power_limits(case: Case, instance: Instance, lengths: Indices) -> tuple[Array, Array]:
+    """Lowest and highest power at all knots but the first, shape (n_intervals, n_gen), pu.
+
+    P_0 is given, wherever it lies, but the limits hold from t_1 on, before the next knot.
+    """
+    p_initial = instance.p_initial(case)
+    p_min, p_max = np.tile(case.p_min, (len(lengths), 1)), np.tile(case.p_max, (len(lengths), 1))
+    part = 1.0 / lengths[0]
+    p_min[0] = np.maximum(case.p_min, (case.p_min - (1 - part) * p_initial) / part)
+    p_max[0] = np.minimum(case.p_max, (case.p_max - (1 - part) * p_initial) / part)
+    return p_min, p_max

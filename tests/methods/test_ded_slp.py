@@ -1,0 +1,164 @@
+"""Programs along simulated trajectories: they claim what the scorer finds, and statuses are honest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.koopman.trajectory import linearise_along
+from ded_bench.methods import ded_slp, ed
+from ded_bench.methods.ded_slp import MARGIN, prepare
+from ded_bench.methods.ded_slp_model import build_ded_slp
+from ded_bench.methods.knot_program import PIECE, KnotProgram, knot_weights, piece_starts
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.status import Status
+from ded_bench.truth.score import score
+from ded_bench.truth.simulate import SimulationError, simulate
+
+HORIZON = 4.0
+POINTS = np.array([0, 60, 121, 130, 205, 300, 400])
+
+
+def short(case: Case, index: int, **changes) -> Instance:
+    """An instance whose loads ramp from the start and whose slack costs differ with the index."""
+    instance = sample_instance(case, 77, index)
+    load = {bus: ramp.model_copy(update={"start": 0.5}) for bus, ramp in instance.load.items()}
+    return instance.model_copy(update={"horizon_s": HORIZON, "load": load, **changes})
+
+
+def program(case: Case, instance: Instance, bound: float) -> KnotProgram:
+    """The program around the static dispatch."""
+    times = instance.grid[POINTS]
+    schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
+    return KnotProgram(
+        case, instance, bound, linearise_along(case, simulate(case, instance, schedule), POINTS)
+    )
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_program_is_the_model_with_every_point(case, index):
+    """HiGHS on the Pyomo model with a state, a limit and |P_s| at every grid point finds the same optimum."""
+    instance, bound = short(case, index), case.omega_bound("TO")
+    made = program(case, instance, bound)
+    limits = [
+        (g, k) for g in range(len(case.generators)) for k in range(1, instance.steps) if k not in POINTS
+    ]
+    answer = made.solve(np.array(limits), np.inf)
+    assert answer.status == Status.OPTIMAL
+    prediction = made.predict(answer.x)
+    whole = build_ded_slp(case, instance, bound, made.model)
+    outcome = compile_model(whole, "highs").solve()
+    assert outcome.status == Status.OPTIMAL
+    # Within a piece P_s of both signs costs the program too little: its answer may be a little dearer.
+    assert outcome.objective <= prediction.objective * (1 + 1e-8)
+    assert prediction.objective == pytest.approx(outcome.objective, rel=2e-5)
+    assert np.abs(prediction.omega[1:]).max() <= bound + 1e-7
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+@pytest.mark.parametrize("index", range(2))
+def test_claims_are_what_the_scorer_finds(case, regime, index):
+    """Strictly feasible, and the cost to 1e-6."""
+    instance = short(case, index)
+    solution = prepare(case, regime, Settings())(instance)
+    assert solution.status == Status.OPTIMAL
+    found = score(case, instance, solution.schedule, regime)
+    assert found.feasible_strict
+    assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)
+
+
+def test_no_schedule_on_the_knots_nearby_is_cheaper(case):
+    """Feasible schedules between the answer and others on the same knots cost more."""
+    instance, rng = short(case, 1), np.random.default_rng(3)
+    solution = prepare(case, "TO", Settings())(instance)
+    best, other = solution.schedule, ed.dispatch(case, instance, 1.0).at(solution.schedule.t)
+    cheapest = score(case, instance, best, "TO").objective
+    feasible = 0
+    for part in (1e-3, 1e-2, *rng.uniform(0.0, 1.0, size=6)):
+        mixed = Schedule(t=best.t, p=best.p + part * (other - best.p))
+        found = score(case, instance, mixed, "TO")
+        feasible += found.feasible_strict
+        # The bound is kept with a margin, which costs a little on so short a horizon.
+        assert not found.feasible_strict or found.objective >= cheapest * (1 - 2e-5)
+    assert feasible
+
+
+def test_starts_from_an_earlier_solution(case):
+    """It takes one program to confirm its own answer, and the optimum is the same from elsewhere."""
+    instance, solver = short(case, 0), prepare(case, "TO", Settings())
+    cold = solver(instance)
+    warm = solver.solve(instance, last=cold)
+    assert warm.status == Status.OPTIMAL
+    assert warm.iterations <= cold.iterations
+    found = [score(case, instance, s.schedule, "TO").objective for s in (cold, warm)]
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+
+
+def test_finer_knots_cost_no_more(ninebus):
+    """The schedules on 0.1 s knots include nearly all those on 50 knots."""
+    instance = sample_instance(ninebus, 77, 5).model_copy(update={"horizon_s": 12.0})
+    costs = []
+    for slug in ("default", "100ms"):
+        solution = prepare(ninebus, "TO", Settings(name=slug))(instance)
+        costs.append(score(ninebus, instance, solution.schedule, "TO").objective)
+    assert len(solution.schedule.t) == 121
+    assert costs[1] <= costs[0] * (1 + 1e-5)
+
+
+def test_what_cannot_be_met_is_infeasible(case, alter):
+    """A frequency far beyond the bound at t = 0; a generator too far outside its bounds for its ramp."""
+    solver, instance = prepare(case, "TO", Settings()), short(case, 0)
+    initial = instance.model_dump(by_alias=True)["initial"]
+    fast = alter(instance, initial=initial | {"omega": dict.fromkeys(case.generators, 0.05)})
+    low = {g: case.machines[g].p_min - 0.1 for g in case.generators}
+    outside = alter(instance, initial=initial | {"power": low})
+    for impossible in (fast, outside):
+        solution = solver(impossible)
+        assert solution.status == Status.INFEASIBLE
+        assert solution.schedule is None
+        assert solution.error == Status.INFEASIBLE.sentence
+
+
+def test_time_limit_is_kept(case):
+    """No time: no claim."""
+    solution = prepare(case, "TO", Settings(time_limit_s=0.0))(short(case, 0))
+    assert solution.status == Status.TIME_LIMIT
+    assert solution.schedule is None
+
+
+def test_failures_are_said(case, monkeypatch):
+    """A system that loses synchronism under every schedule."""
+
+    def lost(*args):
+        raise SimulationError("lost")
+
+    monkeypatch.setattr(ded_slp, "simulate", lost)
+    solution = prepare(case, "TO", Settings())(short(case, 0))
+    assert solution.status == Status.FAILED
+    assert "cannot follow" in solution.error
+
+
+def test_what_is_feasible_but_not_confirmed_is_no_optimum(case, monkeypatch):
+    """With no agreement of costs ever, the best strictly feasible schedule is all that is claimed."""
+    monkeypatch.setattr(ded_slp, "COST_TOLERANCE", -1.0)
+    instance = short(case, 0)
+    solution = prepare(case, "NO", Settings())(instance)
+    assert solution.status == Status.FEASIBLE
+    assert solution.solver_objective is None
+    assert score(case, instance, solution.schedule, "NO").feasible_strict
+
+
+def test_knots_and_pieces_share_the_horizon():
+    """Weights of a constant sum to the number of points; pieces start at every knot and nowhere twice."""
+    lengths = np.diff(POINTS)
+    assert knot_weights(lengths).sum() == POINTS[-1] + 1
+    assert knot_weights(lengths) @ POINTS == pytest.approx(POINTS[-1] * (POINTS[-1] + 1) / 2)
+    starts = piece_starts(POINTS)
+    assert set(POINTS[:-1]) <= set(starts)
+    assert 0 < np.diff(starts).min() <= np.diff(starts).max() <= PIECE
+    assert MARGIN > 0

@@ -180,5 +180,5 @@ def test_a_folder_without_rows_is_bad_input(folders, tmp_path) -> None:
         compare(a, tmp_path / "nowhere")
     (tmp_path / "nowhere").mkdir()
     (tmp_path / "nowhere" / "results.csv").write_text("instance,regime\n")
-    with pytest.raises(InputError, match="split: column required"):
+    with pytest.raises(InputError, match="split: required column is missing"):
         compare(tmp_path / "nowhere", a)

@@ -16,6 +16,7 @@ import pandas as pd
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
+from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU
 
 #: Every gap is measured against this method and these settings.
 REFERENCE = ("ded", "default")
@@ -33,7 +34,7 @@ START = "start-"
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
 #: The scorer's limits on each of them for `feasible` (see `truth.score`).
-FEASIBLE = dict(zip(VIOLATIONS, (1e-4, 1e-6, 1e-6, 1e-6), strict=True))
+FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
 
 
 def title(method: str, settings: str = "default") -> str:
@@ -264,6 +265,19 @@ def performance_profile(frame: pd.DataFrame, column: str) -> pd.DataFrame:
                 }
             )
     return table(rows, [*GROUP, "title", "ratio", "fraction"])
+
+
+def timed_rows(frame: pd.DataFrame, calls: pd.DataFrame) -> pd.DataFrame:
+    """The rows that were timed alone on a machine, with the median of those times as their `solve_s`.
+
+    Args:
+        calls: columns instance, regime, method, settings and solve_s (s, missing where a call failed).
+    """
+    names = ["instance", *GROUP]
+    seconds = calls.groupby(names)["solve_s"].median()
+    found = seconds.reindex(pd.MultiIndex.from_frame(frame[names])).to_numpy(dtype=float)
+    timed: pd.DataFrame = frame.assign(solve_s=found)[np.isfinite(found)]
+    return timed
 
 
 def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:

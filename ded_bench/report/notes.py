@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pandas as pd
 
 from ded_bench.evaluate.summary import REFERENCE
-from ded_bench.files.errors import InputError
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import load_manifest, load_split
+from ded_bench.report.sources import Sources
+from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5
@@ -25,8 +22,9 @@ EXPLANATION = (
     "paper's times are from another machine, and its instances are other draws from the same ranges.",
     "**DED's optima are local**: the problem is not convex, so a method may come out below zero; DED also "
     "breaks the tight frequency bound slightly, since backward Euler is not exact.",
-    "**Success** is what a method claims, **feasible** what the scorer found: frequency within 1e-4 Hz, "
-    "power limits within 1e-6 pu (strictly: 1e-6 Hz and 1e-8 pu).",
+    "**Success** is what a method claims, **feasible** what the scorer found: frequency within "
+    f"{FEASIBLE_HZ:g} Hz, power limits within {FEASIBLE_PU:g} pu (strictly: {STRICT_HZ:g} Hz and "
+    f"{STRICT_PU:g} pu).",
     "**The ratio of summed costs** is ΣJ / ΣJ_DED over the same `n` instances: costly instances weigh more "
     "in it than in the mean of the gaps.",
     "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
@@ -34,24 +32,15 @@ EXPLANATION = (
 )
 
 
-def data_notes(
-    frame: pd.DataFrame,
-    everything: pd.DataFrame,
-    overview: pd.DataFrame,
-    timings: pd.DataFrame,
-    timing: pd.DataFrame,
-    case: Case,
-    problems: Path,
-) -> list[str]:
-    """What a reader must know before comparing numbers."""
+def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
+    """What a reader must know before comparing numbers.
+
+    Args:
+        overview: the summary of the rows that the tables are about.
+    """
+    case, everything, frame, timing = sources.case, sources.rows, sources.judged, sources.timing
     notes = []
     versions = sorted(set(everything["problems_version"]))
-    try:
-        manifest = load_manifest(problems)
-        n_test = len(load_split(problems).test)
-    except InputError as error:
-        notes.append(f"The problem files cannot be read: {error}")
-        manifest, n_test = None, 0
     if not len(everything):
         notes.append(
             f"No rows yet: `ded-bench solve --case {case.id} --method {REFERENCE[0]} "
@@ -61,9 +50,9 @@ def data_notes(
         notes.append(
             f"Rows of different problem versions are not comparable: {', '.join(map(named, versions))}."
         )
-    elif manifest and versions and versions[0] != manifest.version:
+    elif sources.problems_version and versions and versions[0] != sources.problems_version:
         notes.append(
-            f"Rows are of problem version {named(versions[0])}, but the files are {manifest.version}."
+            f"Rows are of problem version {named(versions[0])}, but the files are {sources.problems_version}."
         )
     if everything["version"].nunique() > 1:
         notes.append(
@@ -76,17 +65,17 @@ def data_notes(
     ]
     if len(unscored):
         notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
-    short = overview[overview["rows"] < n_test]
-    if n_test and len(short) and (frame["split"] == "test").all():
+    short = overview[overview["rows"] < sources.test_count]
+    if sources.test_count and len(short) and (frame["split"] == "test").all():
         for count, rows in short.groupby("rows"):
             names = ", ".join(f"{row.title} {row.regime}" for row in rows.itertuples())
-            notes.append(f"Only {count} of {n_test} test instances were run: {names}.")
+            notes.append(f"Only {count} of {sources.test_count} test instances were run: {names}.")
     if not len(timing):
         notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
     elif (timing["load_average"] > BUSY).any():
         notes.append("Some methods were timed while the machine was busy (see the column load).")
-    if len(timings) > len(timing):
-        notes.append(f"Times of other cases are left out: {len(timings) - len(timing)} rows.")
+    if sources.other_times:
+        notes.append(f"Times of other cases are left out: {sources.other_times} methods.")
     stale = sorted(set(timing["problems_version"]) - set(versions)) if versions else []
     if stale:
         notes.append(f"Times were taken on problem version {', '.join(map(named, stale))}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -16,13 +16,13 @@ from ded_bench.evaluate.ablation import (
     starts_table,
     training_table,
 )
-from ded_bench.evaluate.certificate import read_certificates
+from ded_bench.evaluate.certificate import Certificate
 from ded_bench.evaluate.summary import (
+    REFERENCE,
     TIME_SHIFT_S,
     claims,
     coverage,
     groups,
-    judged_rows,
     scoring_rows,
     summary,
     table_times,
@@ -30,8 +30,6 @@ from ded_bench.evaluate.summary import (
     validation_rows,
     worst,
 )
-from ded_bench.evaluate.timing import read_timing, timing_summary
-from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import (
@@ -66,11 +64,11 @@ from ded_bench.report.page import (
     render_html,
     render_markdown,
 )
-from ded_bench.report.paper import Line, paper_lines, read_paper
+from ded_bench.report.paper import Line, paper_lines
 from ded_bench.report.render import to_latex, to_markdown
+from ded_bench.report.sources import Sources, read_sources
 from ded_bench.run.environment import environment, now
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import Results
 
 
 def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None = None) -> list[Path]:
@@ -87,40 +85,30 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
         The files written.
 
     Raises:
-        InputError: results.csv or timing.csv is wrong.
+        InputError: a table of the folder is there, but wrong.
     """
-    results = Results(folder)
-    everything = results.frame()
-    everything = everything[everything["case"].isin([case.id, ""])].reset_index(drop=True)
-    frame = judged_rows(everything)
-    timings = timing_summary(read_timing(folder / "timing.csv"))
-    timing = timings[timings["case"] == case.id]
-    paper = read_paper(problems, case)
-    ours = paper if paper and paper.case_fingerprint == case.fingerprint else None
-    lines = paper_lines(main_rows(frame), timing, ours)
-    frames = _frames(folder, frame, everything, lines)
-    gallery = draw(case, results, frame, timing, problems, pool)
-    rows_from = rows_caption(frame, everything)
-    files = _write_tables(folder, frames, rows_from, timing)
-    notes = data_notes(frame, everything, frames["summary"], timings, timing, case, problems)
-    if paper and not ours:
-        notes.append("The paper's numbers are about another version of the case and left out.")
+    sources = read_sources(case, folder, problems)
+    lines = paper_lines(main_rows(sources.judged), sources.timing, sources.paper)
+    frames = _frames(sources, lines)
+    gallery = draw(sources, pool)
+    captions = _captions(sources)
+    files = _write_tables(sources.results.folder / "tables", frames, captions)
+    notes = [*data_notes(sources, frames["summary"]), *sources.notes, *gallery.notes]
     blocks = [
-        *_opening(case, everything, frames["summary"], [*notes, *gallery.notes]),
-        *_results(frames, rows_from, timing, gallery),
-        *_details(frames, rows_from, timing, gallery),
-        *_training(frames, folder, gallery),
-        *_closing(everything, gallery),
+        *_opening(sources, frames["summary"], notes),
+        *_results(frames, captions, gallery),
+        *_details(sources, frames, gallery),
+        *_training(sources, frames, gallery),
+        *_closing(sources.rows, gallery),
     ]
     write_atomically(folder / "report.md", render_markdown(blocks))
     write_atomically(folder / "report.html", render_html(blocks, folder))
     return [*files, *gallery.files, folder / "report.md", folder / "report.html"]
 
 
-def _frames(
-    folder: Path, frame: pd.DataFrame, everything: pd.DataFrame, lines: Sequence[Line]
-) -> dict[str, pd.DataFrame]:
+def _frames(sources: Sources, lines: Sequence[Line]) -> dict[str, pd.DataFrame]:
     """All tables by the name of their file."""
+    frame, everything, folder = sources.judged, sources.rows, sources.results.folder
     overview, overall = summary(frame), summary(scoring_rows(everything))
     frames = {
         "table_v": tabulate(TABLE_V, lines),
@@ -148,17 +136,14 @@ def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
     return f"all {instances} instances, none of them of the test split"
 
 
-def _write_tables(
-    folder: Path, frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame
-) -> list[Path]:
+def _write_tables(tables: Path, frames: dict[str, pd.DataFrame], captions: dict[str, str]) -> list[Path]:
     """CSV with every digit of all frames; Markdown of the same; LaTeX of the paper's two tables."""
-    tables = folder / "tables"
     files = []
     for name, frame in frames.items():
         columns = PRINTED.get(name) or [Column(c, c) for c in frame.columns]
         outputs = {f"{name}.csv": frame.to_csv(index=False), f"{name}.md": to_markdown(frame, columns)}
-        if name in ("table_v", "table_vi"):
-            caption = _captions(rows_from, timing)[name].split(": ", 1)[1].replace("`", "")
+        if name in captions:
+            caption = captions[name].split(": ", 1)[1].replace("`", "")
             outputs[f"{name}.tex"] = to_latex(frame, columns, caption, f"tab:{name}")
         for file, text in outputs.items():
             write_atomically(tables / file, text)
@@ -180,7 +165,9 @@ PRINTED: dict[str, Sequence[Column]] = {
 }
 
 
-def _captions(rows_from: str, timing: pd.DataFrame) -> dict[str, str]:
+def _captions(sources: Sources) -> dict[str, str]:
+    """What stands above the paper's two tables."""
+    rows_from, timing = rows_caption(sources.judged, sources.rows), sources.timing
     if len(timing):
         counts = sorted(set(timing["instances"]))
         timed = f"times: median on {'/'.join(map(str, counts))} instances, alone on {timing['host'].iloc[-1]}"
@@ -192,9 +179,8 @@ def _captions(rows_from: str, timing: pd.DataFrame) -> dict[str, str]:
     }
 
 
-def _opening(
-    case: Case, everything: pd.DataFrame, overview: pd.DataFrame, notes: Sequence[str]
-) -> list[Block]:
+def _opening(sources: Sources, overview: pd.DataFrame, notes: Sequence[str]) -> list[Block]:
+    case, everything = sources.case, sources.rows
     counts = everything["split"].value_counts().to_dict()
     parts = ", ".join(f"{count} on {_split_name(str(name))} instances" for name, count in counts.items())
     names = ", ".join(dict.fromkeys(overview["title"])) or "none yet"
@@ -223,10 +209,7 @@ def _split_name(split: str) -> str:
     return {"train": "training", "none": "other"}.get(split, split)
 
 
-def _results(
-    frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame, gallery: Gallery
-) -> list[Block]:
-    captions = _captions(rows_from, timing)
+def _results(frames: dict[str, pd.DataFrame], captions: dict[str, str], gallery: Gallery) -> list[Block]:
     return [
         Heading("The paper's result tables"),
         Table(frames["table_v"], TABLE_V, captions["table_v"]),
@@ -238,12 +221,11 @@ def _results(
     ]
 
 
-def _details(
-    frames: dict[str, pd.DataFrame], rows_from: str, timing: pd.DataFrame, gallery: Gallery
-) -> list[Block]:
+def _details(sources: Sources, frames: dict[str, pd.DataFrame], gallery: Gallery) -> list[Block]:
+    rows_from = rows_caption(sources.judged, sources.rows)
     blocks: list[Block] = [
         Heading("Each method in detail"),
-        Table(frames["summary"], GAPS, f"Gap to DED, % ({rows_from})"),
+        Table(frames["summary"], GAPS, f"Gap to {title(*REFERENCE)}, % ({rows_from})"),
         Table(frames["summary"], RATES, "Claimed and verified: shares of all rows"),
         Table(frames["claims"], CLAIMS, "Solver status against the scorer's verdict, rows"),
         Table(frames["summary"], VIOLATIONS, "Largest violation of each schedule"),
@@ -253,11 +235,28 @@ def _details(
         blocks.append(Table(frames["coverage"], COVERAGE, caption))
     if len(frames["starts"]):
         caption = (
-            "Full DED from other starting points: the optimum that IPOPT claims against that from the cold "
-            f"start (the same: within {SAME:g} of its objective)"
+            f"{title(*REFERENCE)} from other starting points: the optimum that its solver claims against "
+            f"that from the cold start (the same: within {SAME:g} of its objective)"
         )
         blocks.append(Table(frames["starts"], STARTS, caption))
-    blocks += [Heading("Times")]
+    blocks += _times(sources.timing, frames)
+    blocks += [
+        Heading("Gap against time"),
+        *gallery.of("tradeoff", "No gap yet: it needs rows of the reference and of another method."),
+        *gallery.of("profile"),
+        Heading("Worst instances"),
+        Table(
+            first_settings(frames["worst"]),
+            WORST,
+            "The three largest gaps and violations of each method, default settings (all: tables/worst.csv)",
+        ),
+        *gallery.of("worst"),
+    ]
+    return blocks
+
+
+def _times(timing: pd.DataFrame, frames: dict[str, pd.DataFrame]) -> list[Block]:
+    blocks: list[Block] = [Heading("Times")]
     if len(timing):
         ordered = pd.concat([rows for *_, rows in groups(timing)])
         named = ordered.assign(
@@ -277,22 +276,12 @@ def _details(
             f"The shifted geometric mean is exp(mean(log(t + {TIME_SHIFT_S:g} s))) − {TIME_SHIFT_S:g} s: it "
             f"counts ratios of times, not seconds, and times far below {TIME_SHIFT_S:g} s as equal."
         ),
-        Heading("Gap against time"),
-        *gallery.of("tradeoff", "No gap yet: it needs rows of DED and of another method."),
-        *gallery.of("profile"),
-        Heading("Worst instances"),
-        Table(
-            first_settings(frames["worst"]),
-            WORST,
-            "The three largest gaps and violations of each method, default settings (all: tables/worst.csv)",
-        ),
-        *gallery.of("worst"),
     ]
     return blocks
 
 
-def _training(frames: dict[str, pd.DataFrame], folder: Path, gallery: Gallery) -> list[Block]:
-    blocks: list[Block] = [Heading("Koopman models"), *_rollout_errors(folder)]
+def _training(sources: Sources, frames: dict[str, pd.DataFrame], gallery: Gallery) -> list[Block]:
+    blocks: list[Block] = [Heading("Koopman models"), *_rollout_errors(sources.rollouts)]
     if len(frames["models"]):
         caption = "What the Koopman model contributes: the same method and settings on several models"
         blocks.append(Table(frames["models"], MODELS, caption))
@@ -303,38 +292,31 @@ def _training(frames: dict[str, pd.DataFrame], folder: Path, gallery: Gallery) -
     else:
         blocks.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
     if len(frames["ablation"]):
-        caption = "Ablation of `ded-dpc`: short trainings, each with one thing changed"
+        names = ", ".join(dict.fromkeys(title(method) for method in frames["ablation"]["method"]))
+        caption = f"Ablation of {names}: short trainings, each with one thing changed; validation instances"
         blocks.append(Table(frames["ablation"], ABLATION, caption))
     blocks += gallery.of("training")
     blocks.append(Heading("Certificate"))
-    blocks += _certificates(folder)
+    blocks += _certificates(sources.certificates)
     return blocks
 
 
-def _certificates(folder: Path) -> list[Block]:
-    try:
-        certificates = read_certificates(folder)
-    except InputError as error:
-        return [Warnings((f"The certificate cannot be read: {error}",))]
+def _certificates(certificates: Sequence[Certificate]) -> list[Block]:
     if not certificates:
         return [Text("No certificate was made for these results; `ded-bench certify` makes one.")]
     rows = [c.model_dump() | {"title": title(c.method, c.settings)} for c in certificates]
     return [Items(tuple(c.sentence for c in certificates)), Table(pd.DataFrame(rows), CERTIFICATE)]
 
 
-def _rollout_errors(folder: Path) -> list[Block]:
-    """Tables that `train-ko` leaves beside the models; one that cannot be read is no table."""
+def _rollout_errors(rollouts: Mapping[str, pd.DataFrame]) -> list[Block]:
+    """The tables of the Koopman models' errors."""
     blocks: list[Block] = []
-    for path in sorted((folder / "koopman").glob("*.errors.csv")):
-        try:
-            errors = pd.read_csv(path)
-        except (OSError, ValueError):
-            continue
+    for name, errors in rollouts.items():
         columns = tuple(Column(str(name), str(name)) for name in errors.columns)
         where = (
-            "under the schedules of full DED, test instances"
-            if path.name == ROLLOUTS
-            else f"on simulated trajectories held out from the identification of `{path.name.split('.')[0]}`"
+            f"under the schedules of {title(*REFERENCE)}, test instances"
+            if ROLLOUTS.startswith(f"{name}.")
+            else f"on simulated trajectories held out from the identification of `{name}`"
         )
         caption = f"Errors of rollouts over the whole horizon {where}"
         blocks.append(Table(errors, columns, caption))

@@ -21,6 +21,7 @@ from ded_bench.evaluate.summary import (
     shifted_geometric_mean,
     summary,
     table_times,
+    timed_rows,
     title,
     tradeoff,
     validation_rows,
@@ -238,6 +239,17 @@ def test_performance_profile_by_hand() -> None:
         "ded": [[1.0, 0.5], [2.0, 1.0]],
         "ded-ko": [[1.0, 0.5], [2.0, 1.0]],
     }  # ed: never feasible
+
+
+def test_rows_take_the_median_of_their_times_alone() -> None:
+    frame = frame_of(row("a", "ded", 1.0, solve_s=99.0), row("b", "ded", 1.0), row("a", "ed", 2.0))
+    cells = [("a", "ded", 1.0), ("a", "ded", 3.0), ("a", "ded", 2.0), ("b", "ded", np.nan), ("x", "ed", 1.0)]
+    calls = pd.DataFrame(cells, columns=["instance", "method", "solve_s"]).assign(
+        regime="TO", settings="default"
+    )
+    timed = timed_rows(frame, calls)
+    assert timed[["instance", "method", "solve_s"]].to_numpy().tolist() == [["a", "ded", 2.0]]
+    assert timed_rows(frame, calls[:0]).empty
 
 
 def test_performance_profile_counts_failures_as_never_solved(table: pd.DataFrame) -> None:

@@ -130,10 +130,12 @@ def test_rollout_starts_at_the_true_frequencies_and_stays_near(case, instance, s
 
 
 def test_worst_instances_side_by_side(case, instance, shown, tmp_path) -> None:
-    columns = [Worst("first", shown[1], shown[0].trajectory.p_gen), Worst("second", shown[0], None)]
+    columns = [Worst("first", shown[1], shown[0]), Worst("second", shown[0], None)]
     figure = worst_figure(case, "TO", "heading", columns)
     first = figure.axes[0]
     assert shows(first, thin(instance.grid, shown[0].trajectory.p_gen[:, 0])[1])  # DED's for comparison
+    lower = figure.axes[2]
+    assert shows(lower, thin(instance.grid, shown[0].trajectory.omega[:, 0] * RAD_TO_HZ)[1])
     assert [ax.get_title() for ax in figure.axes[:2]] == ["first", "second"]
     assert all(has_level(ax, case.regimes["TO"].omega_hz) for ax in figure.axes[2:])
     check_layout(figure, tmp_path)

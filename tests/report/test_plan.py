@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from ded_bench.report.figures.plan import first_settings
+from ded_bench.report.figures.plan import challengers, first_settings
 from ded_bench.report.gallery import without_curve
 
 
@@ -29,3 +29,17 @@ def test_the_profile_names_the_methods_that_have_no_curve() -> None:
     )
     assert without_curve(rows, rows) == "."
     assert without_curve(rows, rows[:1]) == "; ED in TO, ED [1s] in TO had none and no curve."
+
+
+def test_trained_methods_are_shown_first_then_those_nearest_to_the_reference() -> None:
+    cells = [
+        ("ded", 0.0),
+        ("ded-ko", -0.1),
+        ("mine", 0.2),
+        ("ded-dpc-paper", 2.0),
+        ("ded-dpc", 1.0),
+        ("ed", None),
+    ]
+    rows = pd.DataFrame(cells, columns=["method", "gap_percent"]).assign(settings="default")
+    assert challengers(rows) == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]
+    assert challengers(rows[:1]) == []

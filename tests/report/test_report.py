@@ -23,7 +23,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.columns import GAPS, TABLE_V, TABLE_VI
-from ded_bench.report.figures.plan import figure_schedules, plan
+from ded_bench.report.figures.plan import plan
 from ded_bench.report.report import write_report
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results, Row
@@ -104,9 +104,9 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
     (finished / "policies").mkdir()
     history.assign(objective=[2.0, 1.0]).to_csv(finished / "policies" / "ded-dpc-TO.history.csv", index=False)
     write_arrays(
-        finished / "policies" / "p.safetensors",
+        finished / "policies" / "ded-dpc-TO.safetensors",
         {"w": np.zeros(2)},
-        {"training": {"seconds": 123.5, "epochs": 7, "seed": 42, "model": "koopman"}},
+        {"method": "ded-dpc", "training": {"seconds": 123.5, "epochs": 7, "seed": 42, "model": "koopman"}},
     )
     with Workers(2) as pool:
         return write_report(ninebus, finished, problems, pool)
@@ -241,8 +241,8 @@ def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
         "Problem version: 1-",
     ):
         assert fact in text
-    assert "| p | 123.5 | 7 |" in text.replace("124", "123.5")
-    assert "Times of other cases are left out: 1 rows" in text
+    assert "| ded-dpc-TO | 123.5 | 7 |" in text.replace("124", "123.5")
+    assert "Times of other cases are left out: 1 methods" in text
     assert "No certificate" in text
 
 
@@ -256,33 +256,19 @@ def test_the_second_report_has_the_same_tables(
         assert (again / "tables" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_representative_instance_has_the_median_gap(finished: Path) -> None:
+def test_the_instance_shown_is_usual_and_its_loads_move(finished: Path) -> None:
+    """Of five instances the two with gaps nearest to the median take part."""
     frame = Results(finished).frame().query("split == 'test'")
     wide = frame[frame["regime"] == "TO"].pivot_table(index="instance", columns="method", values="objective")
-    gap = (wide["ded-dpc-paper"] / wide["ded"]).sort_values()
-    chosen = plan(frame, lambda key: True).representative["TO"]
-    assert [key.method for key in chosen] == ["ded", "ded-dpc-paper"]
-    assert {key.instance for key in chosen} == {gap.index[(TEST - 1) // 2]}
-    nearest = plan(frame, lambda key: key.instance != gap.index[(TEST - 1) // 2]).representative["TO"]
-    assert nearest[0].instance in (gap.index[1], gap.index[3])
-
-
-@pytest.mark.usefixtures("sketched")
-def test_kept_schedules_are_enough_for_the_same_figures(
-    ninebus, problems, report, finished, tmp_path
-) -> None:
-    """A published run may keep only the schedules that its figures need."""
-    kept = figure_schedules(Results(finished))
-    whole, slim = copy(finished, tmp_path / "whole"), copy(finished, tmp_path / "slim")
-    paths = {Results(slim).schedule_path(key) for key in kept}
-    for path in (slim / "schedules").rglob("*.csv.gz"):
-        if path not in paths:
-            path.unlink()
-    assert len(paths) < len(list((whole / "schedules").rglob("*.csv.gz")))
-    for folder in (whole, slim):
-        write_report(ninebus, folder, problems)
-    for path in sorted((whole / "figures").iterdir()):
-        assert (slim / "figures" / path.name).read_bytes() == path.read_bytes()
+    gap = 100 * wide["ded-dpc-paper"] / wide["ded"]
+    nearest = (gap - gap.median()).abs().sort_values().index.to_list()
+    for wanted in nearest[:2]:
+        moves = dict.fromkeys(gap.index, 0.0) | {wanted: 1.0, nearest[2]: 9.0}
+        chosen = plan(frame, lambda key: True, moves.__getitem__).representative["TO"]
+        assert [key.method for key in chosen] == ["ded", "ded-dpc-paper"]
+        assert {key.instance for key in chosen} == {wanted}
+    without = plan(frame, lambda key: key.instance != nearest[0], lambda name: 0.0).representative["TO"]
+    assert without[0].instance in nearest[1:3]
 
 
 @pytest.mark.usefixtures("sketched")
@@ -291,21 +277,17 @@ def test_broken_pieces_are_named_and_left_out(
 ) -> None:
     folder = copy(finished, tmp_path)
     results = Results(folder)
-    broken = results.schedule_path(
-        plan(results.frame().query("split == 'test'"), lambda key: True).representative["TO"][1]
-    )
+    rows = results.frame().query("split == 'test'")
+    broken = results.schedule_path(plan(rows, lambda key: True, len).representative["TO"][1])
     broken.write_bytes(b"no gzip")
     (folder / "koopman").mkdir(exist_ok=True)
     (folder / "policies").mkdir(exist_ok=True)
-    for name in ("koopman/bad.safetensors", "policies/bad.safetensors", "policies/bad.history.csv"):
+    for name in ("koopman/bad.safetensors", "policies/bad.safetensors"):
         (folder / name).write_bytes(b"\xffrubbish")
-    (folder / "koopman" / "bad.errors.csv").write_bytes(b"")
-    (folder / "certificate.json").write_text("{")
     write_report(ninebus, folder, problems)
     text = (folder / "report.md").read_text()
-    for name in ("koopman/bad.safetensors", "policies/bad.safetensors", "bad.history.csv", broken.name):
+    for name in ("koopman/bad.safetensors", "policies/bad.safetensors", broken.name):
         assert name in text
-    assert "certificate cannot be read" in text
 
 
 @pytest.mark.usefixtures("sketched")
@@ -363,8 +345,15 @@ def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
     assert "no trajectory is drawn" in (folder / "report.md").read_text()
 
 
+def test_only_runs_that_can_be_drawn_are_among_the_worst(finished: Path) -> None:
+    frame = Results(finished).frame()
+    kept = frame["instance"].iloc[0]
+    chosen = plan(frame, lambda key: key.instance == kept, len)
+    assert {key.instance for pairs in chosen.worst.values() for key, _ in pairs} == {kept}
+
+
 def test_keys_of_the_plan_include_ded_for_comparison(finished: Path) -> None:
-    chosen = plan(Results(finished).frame(), lambda key: True)
+    chosen = plan(Results(finished).frame(), lambda key: True, len)
     for (regime, method, settings), pairs in chosen.worst.items():
         for key, _ in pairs:
             assert key[1:] == (regime, method, settings)

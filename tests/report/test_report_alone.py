@@ -78,9 +78,17 @@ def test_certificate_is_shown(ninebus: Case, problems: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize("name", ["results.csv", "timing.csv"])
-def test_a_wrong_table_is_bad_input(ninebus: Case, problems: Path, tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text("a,b\n1,2\n")
+@pytest.mark.parametrize(
+    "name",
+    ["results.csv", "timing.csv", "policies/p.history.csv", "koopman/k.errors.csv", "certificate.json"],
+)
+@pytest.mark.parametrize("text", ["", "a,b\n1,2,3,4\n1\n"])
+def test_a_wrong_table_is_bad_input(
+    ninebus: Case, problems: Path, tmp_path: Path, name: str, text: str
+) -> None:
+    """An error, not a gap in the report."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text)
     with pytest.raises(InputError) as caught:
         write_report(ninebus, tmp_path, problems)
-    assert name in caught.value.source
+    assert name in str(caught.value)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.summary import REFERENCE, gaps, groups, judged_rows, worst
-from ded_bench.run.results import Key, Results
+from ded_bench.evaluate.summary import REFERENCE, gaps, groups, worst
+from ded_bench.methods.registry import METHODS
+from ded_bench.run.results import Key
 
-#: Whose schedule the paper's figures show beside DED's: the first of these that was run.
-CHALLENGERS = ("ded-dpc", "ded-dpc-paper", "ded-ko-knots", "ded-ko")
+#: How many of the worst instances of each method are drawn.
 WORST = 3
 
 
@@ -27,35 +28,31 @@ class Plan:
 
     @property
     def keys(self) -> list[Key]:
-        """Every schedule that the figures need, DED's for comparison included."""
-        compared = [Key(k.instance, k.regime, *REFERENCE) for pairs in self.worst.values() for k, _ in pairs]
-        return list(dict.fromkeys(self.shown + compared))
-
-    @property
-    def shown(self) -> list[Key]:
-        """The runs whose trajectories are drawn."""
+        """Every run that the figures show, the reference's for comparison included."""
         keys = [key for chosen in self.representative.values() for key in chosen]
         keys += [key for pairs in self.worst.values() for key, _ in pairs]
+        keys += [Key(key.instance, key.regime, *REFERENCE) for key in keys]
         return list(dict.fromkeys(keys))
 
 
-def figure_schedules(results: Results) -> list[Key]:
-    """The schedules that a report's figures are drawn from: what a published run must keep."""
-    keys = plan(judged_rows(results.frame()), lambda key: results.schedule_path(key).is_file()).keys
-    return [key for key in keys if results.schedule_path(key).is_file()]
-
-
-def plan(frame: pd.DataFrame, available: Callable[[Key], bool]) -> Plan:
+def plan(frame: pd.DataFrame, available: Callable[[Key], bool], load_change: Callable[[str], float]) -> Plan:
     """Choose the runs to show from the rows of a results table.
 
-    The representative instance of a regime is the one whose gap is the median of the challenger's;
-    if its schedules are not there, the next nearest to it.
+    The worst runs are those of the runs that can be drawn.
+
+    Args:
+        available: whether the schedule of a run can be drawn.
+        load_change: how much an instance's loads move in all, pu.
     """
     scored = gaps(frame).dropna(subset=["objective"])
+    keys = scored[list(Key._fields)].itertuples(index=False)
+    drawable = scored[np.array([available(Key(*key)) for key in keys], dtype=bool)]
     chosen = Plan()
     for regime in sorted(set(scored["regime"])):
-        chosen.representative[regime] = _representative(scored[scored["regime"] == regime], regime, available)
-    for regime, method, settings, group in groups(worst(first_settings(scored), WORST)):
+        chosen.representative[regime] = _representative(
+            scored[scored["regime"] == regime], regime, available, load_change
+        )
+    for regime, method, settings, group in groups(worst(first_settings(drawable), WORST)):
         ranked = []
         by_gap = group[group["worst_by"] == "gap"]
         by_violation = group[group["worst_by"] == "violation"]
@@ -66,8 +63,9 @@ def plan(frame: pd.DataFrame, available: Callable[[Key], bool]) -> Plan:
             if row["instance"] not in [name for name, _ in ranked]:
                 reason = f"{row['instance']}\nworst violation, {row['excess']:.2g} × tolerance"
                 ranked.append((str(row["instance"]), reason))
-        keys = [(Key(name, regime, method, settings), reason) for name, reason in ranked]
-        chosen.worst[regime, method, settings] = [pair for pair in keys if available(pair[0])]
+        chosen.worst[regime, method, settings] = [
+            (Key(name, regime, method, settings), reason) for name, reason in ranked
+        ]
     return chosen
 
 
@@ -78,17 +76,46 @@ def first_settings(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[ranked["_name"] == first]
 
 
-def _representative(rows: pd.DataFrame, regime: str, available: Callable[[Key], bool]) -> list[Key]:
-    for method in (*CHALLENGERS, REFERENCE[0]):
-        settings = "default"
-        mine = rows[(rows["method"] == method) & (rows["settings"] == settings)]
-        mine = mine.dropna(subset=["gap_percent"]).sort_values(["gap_percent", "instance"])
+def challengers(rows: pd.DataFrame) -> list[str]:
+    """The methods whose schedule the paper's figures may show beside the reference's, first choice first.
+
+    Trained methods come before others, and the smaller the mean distance to the reference, the earlier.
+
+    Args:
+        rows: of one regime, with their gaps.
+    """
+    others = rows[(rows["settings"] == "default") & (rows["method"] != REFERENCE[0])]
+    distance = others["gap_percent"].abs().groupby(others["method"]).mean().dropna()
+    return sorted(distance.index, key=lambda name: (not is_trained(name), distance[name], name))
+
+
+def is_trained(name: str) -> bool:
+    """Whether a method of this name is registered and trained."""
+    return name in METHODS and bool(METHODS[name].trainer)
+
+
+def _representative(
+    rows: pd.DataFrame, regime: str, available: Callable[[Key], bool], load_change: Callable[[str], float]
+) -> list[Key]:
+    """The reference's and a challenger's run on one instance: usual by its gap, and one where loads move.
+
+    Of the instances that can be drawn, the third whose gaps are nearest to the challenger's median takes
+    part; the one whose loads change most is chosen.
+    """
+    for method in (*challengers(rows), REFERENCE[0]):
+        mine = rows[(rows["method"] == method) & (rows["settings"] == "default")].dropna(
+            subset=["gap_percent"]
+        )
         if not len(mine):
             continue
-        middle = mine["gap_percent"].iloc[(len(mine) - 1) // 2]
-        distance = (mine["gap_percent"] - middle).abs()
-        for instance in mine.assign(distance=distance).sort_values(["distance", "instance"])["instance"]:
-            keys = [Key(instance, regime, *REFERENCE), Key(instance, regime, method, settings)]
-            if all(available(key) for key in keys):
-                return list(dict.fromkeys(keys))
+        distance = (mine["gap_percent"] - mine["gap_percent"].median()).abs()
+        ranked = mine.assign(distance=distance).sort_values(["distance", "instance"])["instance"]
+        pairs = [
+            list(dict.fromkeys([Key(name, regime, *REFERENCE), Key(name, regime, method, "default")]))
+            for name in ranked
+        ]
+        drawable = [keys for keys in pairs if all(available(key) for key in keys)]
+        if drawable:
+            usual = drawable[: -(-len(drawable) // 3)]
+            return max(usual, key=lambda keys: (load_change(keys[0].instance), keys[0].instance))
     return []

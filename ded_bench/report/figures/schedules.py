@@ -8,7 +8,8 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.problem.case import Array, Case
+from ded_bench.evaluate.summary import title
+from ded_bench.problem.case import Case
 from ded_bench.report.figures.style import (
     BLACK,
     BUS_COLOURS,
@@ -20,6 +21,7 @@ from ded_bench.report.figures.style import (
     legend_above,
     legend_below,
     new_figure,
+    plain,
     thin,
     time_axis,
 )
@@ -62,15 +64,15 @@ def schedule_figure(case: Case, heading: str, shown: Sequence[Shown]) -> Figure:
 
 
 class Worst(NamedTuple):
-    """One column of `worst_figure`: why it is there, the trajectory, and DED's powers if there are any."""
+    """One column of `worst_figure`: why it is there, and the runs of the method and of the reference."""
 
     reason: str
     shown: Shown
-    reference: Array | None  # (n, n_gen), pu
+    reference: Shown | None
 
 
 def worst_figure(case: Case, regime: str, heading: str, columns: Sequence[Worst]) -> Figure:
-    """The worst instances of one method side by side: powers against DED's, and frequencies."""
+    """The worst instances of one method side by side: powers and frequencies, the reference's dashed."""
     limit = case.regimes[regime].omega_hz
     width = 2.9 * max(len(columns), 4)
     with new_figure(width, 4.4) as figure:
@@ -88,9 +90,14 @@ def worst_figure(case: Case, regime: str, heading: str, columns: Sequence[Worst]
                 (line,) = top.plot(*thin(t, column.shown.trajectory.p_gen[:, j]), color=paint)
                 handles[f"bus {bus}"] = line
                 bottom.plot(*thin(t, omega[:, j]), color=paint)
-            for powers in column.reference.T if column.reference is not None else ():
-                (line,) = top.plot(*thin(t, powers), color=BLACK, dashes=(4, 2), linewidth=0.9)
-                handles["DED"] = line
+            if column.reference:
+                run, dashed = (
+                    column.reference.trajectory,
+                    {"color": BLACK, "dashes": (4, 2), "linewidth": 0.9},
+                )
+                name = plain(title(column.reference.method, column.reference.settings))
+                handles[name], *_ = top.plot(*thin(run.t, run.p_gen), **dashed)
+                bottom.plot(*thin(run.t, run.omega * RAD_TO_HZ), **dashed)
             handles["bound"] = bounds(bottom, limit, -limit)
             for ax in (top, bottom):
                 ax.locator_params(nbins=4)  # ticks take longer than lines

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from ded_bench.evaluate.summary import GROUP, natural, title
+from ded_bench.evaluate.summary import GROUP, REFERENCE, natural, title
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -48,7 +48,7 @@ LINEAR_SPREAD = 5.0
 
 
 def tradeoff_figure(points: pd.DataFrame) -> Figure:
-    """Mean gap to DED against time per schedule, one panel per regime.
+    """Mean gap to the reference against time per schedule, one panel per regime.
 
     A method's settings share its colour and marker; a thin line joins them and a word names each but the
     default.
@@ -76,7 +76,7 @@ def tradeoff_figure(points: pd.DataFrame) -> Figure:
             ax.margins(0.14)
             ax.set_title(regime)
             ax.set_xlabel("time per schedule (s), median")
-        axes[0].set_ylabel("mean gap to DED (%)")
+        axes[0].set_ylabel(f"mean gap to {title(*REFERENCE)} (%)")
         if (points["correct_rate"] < 1).any():
             hollow: dict[str, Any] = {
                 "marker": "o",

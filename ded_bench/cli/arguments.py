@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Generator
+import fnmatch
+from collections.abc import Generator, Iterable
 from typing import Any, NoReturn
 
 from ded_bench.koopman.surrogates import MODELS
@@ -76,6 +77,18 @@ def names(text: str) -> tuple[str, ...]:
     if not found:
         raise argparse.ArgumentTypeError("names nothing")
     return tuple(dict.fromkeys(found))
+
+
+def matching(pattern: str, known: Iterable[str]) -> list[str]:
+    """The settings that `--settings` names: slugs separated by commas, `*` as in file names.
+
+    A slug without `*` is returned whether it is known or not; its method tells what is wrong.
+    """
+    slugs = list(known)
+    found: list[str] = []
+    for part in names(pattern):
+        found += [part] if "*" not in part else [s for s in slugs if fnmatch.fnmatchcase(s, part)]
+    return list(dict.fromkeys(found))
 
 
 def natural(text: str) -> int:

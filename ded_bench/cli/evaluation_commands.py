@@ -42,7 +42,7 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "certify", "certify a policy on fresh instances")
     p.add_argument("--method", default="ded-dpc")
-    p.add_argument("--regime", type=names, default=("NO", "TO"), metavar="R[,R]")
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--settings", default="default")
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
@@ -114,10 +114,11 @@ def _certify(a: argparse.Namespace) -> int:
     from ded_bench.evaluate.certificate import certify, rows_file, save_certificate
 
     case = Case.load(a.case)
-    case.check_regimes(a.regime)
+    regimes = a.regime or tuple(case.regimes)
+    case.check_regimes(regimes)
     folder = a.results or default_results(case)
     settings = Settings(a.settings, a.model, a.policy, search=search_folders(case, folder))
-    for regime in a.regime:
+    for regime in regimes:
         certificate = certify(
             case,
             a.method,

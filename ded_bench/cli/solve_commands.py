@@ -14,6 +14,7 @@ from ded_bench.cli.arguments import (
     KNOWN,
     MODEL_HELP,
     command,
+    matching,
     names,
     positive,
     positive_number,
@@ -42,13 +43,13 @@ def _add_solve(commands: Any) -> None:
     p.add_argument(
         "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
     )
-    p.add_argument("--regime", type=names, required=True, metavar="R[,R]", help="NO, TO")
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
     p.add_argument("--case", help="name of a shipped case, or a folder")
-    p.add_argument("--settings", default="default", help="slug of the method's settings")
+    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
     p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     where = p.add_mutually_exclusive_group()
@@ -86,11 +87,24 @@ def _solve(a: argparse.Namespace) -> int:
     from ded_bench.run.results import Results
     from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
 
-    methods = [get_method(name).name for name in a.method]
+    methods = [get_method(name) for name in a.method]
     chosen = _chosen(a)
     case = chosen.case
     results = Results(a.out or default_results(case))
-    tasks = make_tasks(case, chosen.instances, methods, a.regime, _settings(a, case, results.folder))
+    tasks = [
+        task
+        for method in methods
+        for slug in matching(a.settings, method.settings)
+        for task in make_tasks(
+            case,
+            chosen.instances,
+            [method.name],
+            a.regime or tuple(case.regimes),
+            _settings(a, slug, case, results.folder),
+        )
+    ]
+    if not tasks:
+        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
     for line in fallbacks(tasks, results.folder):
         print(f"ded-bench: {line}", file=sys.stderr)
     todo, unscored = unfinished(tasks, results)
@@ -241,9 +255,9 @@ def _print_row(results: Results, row: Row) -> None:
     print(json.dumps(fields), flush=True)
 
 
-def _settings(a: argparse.Namespace, case: Case, out: Path) -> Settings:
+def _settings(a: argparse.Namespace, slug: str, case: Case, out: Path) -> Settings:
     return Settings(
-        name=a.settings,
+        name=slug,
         model=a.model,
         policy=a.policy,
         time_limit_s=a.time_limit,

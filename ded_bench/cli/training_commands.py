@@ -14,6 +14,8 @@ from ded_bench.cli.arguments import (
     DEFAULT_CASE,
     MODEL_HELP,
     command,
+    matching,
+    names,
     natural,
     positive,
     positive_number,
@@ -37,10 +39,10 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.set_defaults(run=_train_ko)
 
-    p = command(commands, "train-dpc", "train a policy on the training instances")
-    p.add_argument("--method", choices=trainable(), default="ded-dpc")
-    p.add_argument("--settings", default="default", help="slug of the training settings")
-    p.add_argument("--regime", required=True, metavar="R", help="one of the case's")
+    p = command(commands, "train-dpc", "train policies, by default all")
+    p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
+    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the training; may hold *")
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
     p.add_argument("--seed", type=natural, default=0)
@@ -52,6 +54,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
+    p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
     p.set_defaults(run=_train_dpc)
 
@@ -83,30 +86,60 @@ def _train_ko(a: argparse.Namespace) -> int:
 
 
 def _train_dpc(a: argparse.Namespace) -> int:
+    from ded_bench.methods.registry import get_method
+    from ded_bench.run.pool import Workers
+    from ded_bench.run.tasks import reason_of
+
+    case = Case.load(a.case)
+    regimes = a.regime or tuple(case.regimes)
+    case.check_regimes(regimes)
+    methods = [get_method(name) for name in a.method or trainable()]
+    jobs = [
+        (method.name, slug, regime)
+        for method in methods
+        for slug in matching(a.settings, method.settings)
+        for regime in regimes
+    ]
+    if not jobs:
+        raise InputError("--settings", a.settings, "matches no settings of a method that is trained")
+    if a.out and len(jobs) > 1:
+        raise InputError(a.out, "", "is one file; name one method, settings and regime with --out")
+    if min(a.workers, len(jobs)) == 1:
+        for job in jobs:
+            print(train_one(a, *job), flush=True)
+        return 0
+    failures = 0
+    with Workers(min(a.workers, len(jobs))) as pool:
+        for job, said in pool.imap(((train_one, (a, *job)) for job in jobs), jobs):
+            told = said if isinstance(said, str) else f"{' '.join(job)}: {reason_of(said)}"
+            failures += not isinstance(said, str)
+            print(told, flush=True)
+    return 1 if failures else 0
+
+
+def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
+    """Train one policy as the command's options say; returns what to tell."""
     from ded_bench.koopman.surrogates import find_model
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
     from ded_bench.methods.solution import Settings
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
 
-    method = get_method(a.method)
-    setting: dict[str, Any] = dict(method.options(Settings(a.settings)))
+    method, case = get_method(name), Case.load(a.case)
+    setting: dict[str, Any] = dict(method.options(Settings(slug)))
     setting |= {"epochs": a.epochs} if a.epochs else {}
-    case = Case.load(a.case)
-    case.check_regimes([a.regime])
+    train = method.train
     results = a.results or default_results(case)
-    out = a.out or policy_file(results, a.method, a.regime, a.model, a.settings)
+    out: Path = a.out or policy_file(results, name, regime, a.model, slug)
     if out.exists() and not (a.force or a.resume):
-        print(f"{out} is there already (--force trains anew)")
-        return 0
+        return f"{out} is there already (--force trains anew)"
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     _check_writable(out)
     options = TrainingOptions(a.seed, a.seconds, a.device, a.resume)
-    facts = method.train(case, a.regime, instances, model, out, options, **setting).training
-    losses = [f", {name.replace('_', ' ')} {facts[name]:.6g}" for name in LOSSES if name in facts]
-    print(f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}")
-    return 0
+    facts = train(case, regime, instances, model, out, options, **setting).training
+    losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
+    return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
 
 
 def _check_writable(out: Path) -> None:

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.summary import GROUP, REFERENCE, START, STUDY, is_study, title
+from ded_bench.evaluate.summary import (
+    GROUP,
+    REFERENCE,
+    START,
+    STUDY,
+    is_study,
+    summary,
+    title,
+    validation_rows,
+)
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
@@ -26,6 +35,8 @@ from ded_bench.run.results import Key, Results
 
 #: Beside the models: their errors under the schedules of full DED.
 ROLLOUTS = "ded.errors.csv"
+#: What short trainings are measured against: full DED is not solved on validation instances.
+ABLATION_REFERENCE = ("ded-ko-knots", "default")
 #: Optima whose objectives differ by less are the same; relative. IPOPT's tolerance leaves 1e-8.
 SAME = 1e-6
 
@@ -61,8 +72,12 @@ def model_table(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def ablation_table(overview: pd.DataFrame, folder: Path) -> pd.DataFrame:
-    """The short trainings of a summary side by side: what differs, gaps, violations, cost of the training."""
+def ablation_table(frame: pd.DataFrame, folder: Path) -> pd.DataFrame:
+    """The short trainings side by side: what differs, gaps, violations, cost of the training.
+
+    Judged on the rows of validation instances alone; gaps are to ABLATION_REFERENCE there.
+    """
+    overview = summary(validation_rows(frame), ABLATION_REFERENCE)
     rows = []
     for row in overview[overview["settings"].map(is_study).astype(bool)].to_dict("records"):
         name, model = split_slug(str(row["settings"]))

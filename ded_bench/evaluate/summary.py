@@ -82,18 +82,21 @@ def coverage(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
     return more.reset_index(drop=True)
 
 
-def gaps(frame: pd.DataFrame) -> pd.DataFrame:
-    """Signed gap of every row to DED, both re-simulated.
+def gaps(frame: pd.DataFrame, reference: tuple[str, str] = REFERENCE) -> pd.DataFrame:
+    """Signed gap of every row to a reference, both re-simulated.
+
+    Args:
+        reference: its method and settings; DED for everything but ablations.
 
     Returns:
-        The frame with two more columns: `reference`, DED's objective on the same instance and
-        regime, and `gap_percent` = 100 (J / J_DED - 1); missing where either has no score, or where
-        J_DED is not positive.
+        The frame with two more columns: `reference`, the reference's objective on the same instance and
+        regime, and `gap_percent` = 100 (J / J_ref - 1); missing where either has no score, or where
+        J_ref is not positive.
     """
-    is_reference = (frame["method"] == REFERENCE[0]) & (frame["settings"] == REFERENCE[1])
-    reference = frame.loc[is_reference].set_index(["instance", "regime"])["objective"]
+    is_reference = (frame["method"] == reference[0]) & (frame["settings"] == reference[1])
+    objectives = frame.loc[is_reference].set_index(["instance", "regime"])["objective"]
     wanted = pd.MultiIndex.from_frame(frame[["instance", "regime"]])
-    ours = reference.reindex(wanted).to_numpy(dtype=float) if len(frame) else np.zeros(0)
+    ours = objectives.reindex(wanted).to_numpy(dtype=float) if len(frame) else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         gap = 100.0 * (frame["objective"].to_numpy(dtype=float) / ours - 1.0)
     known = (ours > 0) & np.isfinite(gap)
@@ -122,16 +125,16 @@ def natural(text: str) -> tuple[tuple[str, int], ...]:
     )
 
 
-def summary(frame: pd.DataFrame) -> pd.DataFrame:
+def summary(frame: pd.DataFrame, reference: tuple[str, str] = REFERENCE) -> pd.DataFrame:
     """Gaps, violations and rates per (regime, method, settings).
 
-    `n` rows have a gap, `failures` have no schedule or no score, `unpaired` have a score but no DED
-    to compare with. `success_rate` is what solvers claim, `correct_rate` and `strict_rate` what the
-    scorer found (`feasible`, `feasible_strict`); all three are shares of all rows.
+    `n` rows have a gap, `failures` have no schedule or no score, `unpaired` have a score but no reference
+    to compare with (DED, unless given). `success_rate` is what solvers claim, `correct_rate` and
+    `strict_rate` what the scorer found (`feasible`, `feasible_strict`); all three are shares of all rows.
     """
     rows = [
         dict(zip(HEAD, (regime, method, settings, title(method, settings)), strict=True)) | statistics(group)
-        for regime, method, settings, group in groups(gaps(frame))
+        for regime, method, settings, group in groups(gaps(frame, reference))
     ]
     return table(rows, [*HEAD, *statistics(gaps(frame[:0]))])
 

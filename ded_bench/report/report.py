@@ -27,7 +27,6 @@ from ded_bench.evaluate.summary import (
     summary,
     table_times,
     title,
-    validation_rows,
     worst,
 )
 from ded_bench.files.strict import write_atomically
@@ -119,7 +118,7 @@ def _frames(sources: Sources, lines: Sequence[Line]) -> dict[str, pd.DataFrame]:
         "worst": worst(frame),
         "training": training_table(folder, [c.name for c in TRAINING[1:-1]]),
         "models": model_table(overview),
-        "ablation": ablation_table(summary(validation_rows(everything)), folder),
+        "ablation": ablation_table(everything, folder),
         "starts": starts_table(scoring_rows(everything)),
     }
     return frames | {"coverage": coverage(overall, overview)}

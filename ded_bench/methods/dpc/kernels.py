@@ -5,28 +5,19 @@ Its cache on disk notices that a function's own file changed, not that a functio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.dpc.response import Array32
 from ded_bench.problem.case import Array
+from ded_bench.problem.compiled import compiled
 
 Indices = NDArray[np.int_]
 
 #: Costs whose sum is smaller are as good as free.
 SMALLEST_SUM = 1e-9
-
-
-def compiled(function: Callable[..., None]) -> Callable[..., None]:
-    """Compile when first called; kept on disk, if the package's or the user's folder can be written."""
-    try:
-        return numba.njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # there is no such folder
-        return numba.njit(nogil=True)(function)
 
 
 class PowerLimits(NamedTuple):
@@ -40,7 +31,6 @@ class PowerLimits(NamedTuple):
 class InstanceArrays(NamedTuple):
     """What channels are computed from; see `inputs.Inputs`."""
 
-    load: Array
     cost: Array
     p_initial: Array
     state: Array
@@ -94,23 +84,40 @@ def track(targets: Array, step: Array, p_gen: Array) -> None:
 
 
 @compiled
-def fill(
-    given: InstanceArrays, nodes: Array, limits: PowerLimits, dispatch: bool, channels: ChannelArrays
-) -> None:
-    """Compute the channels of a batch, instance by instance; see `inputs.Channels.of`."""
-    p_load, sequence, constants, start = channels
-    n_gen, n_load = len(limits.p_min), p_load.shape[1]
+def fill_loads(load: Array, nodes: Array, p_load: Array, sequence: Array) -> None:
+    """Loads of a batch at the nodes, then at the knots and their bends; see `ChannelArrays`."""
+    n_load = p_load.shape[1]
     for b in range(len(p_load)):
         for i in range(n_load):
             at_knots, bends = sequence[b, i], sequence[b, n_load + i]
-            _loads_and_bends(given.load[b, i], nodes, p_load[b, i], at_knots, bends)
-        static = sequence[b, 2 * n_load :]
-        _dispatch(sequence[b, :n_load], given.cost[b], limits.p_min, limits.p_max, static)
-        _constants(given.cost[b], given.p_initial[b], given.state[b, n_gen:], constants[b])
+            _loads_and_bends(load[b, i], nodes, p_load[b, i], at_knots, bends)
+
+
+@compiled
+def fill_machines(
+    given: InstanceArrays, static: Array, limits: PowerLimits, dispatch: bool, channels: ChannelArrays
+) -> None:
+    """What else a batch's channels hold, instance by instance; see `inputs.Channels.of`.
+
+    Args:
+        static: static dispatch at the knots, (batch, n_knots, n_gen), pu.
+    """
+    p_load, sequence, constants, start = channels
+    n_gen, n_load = len(limits.p_min), p_load.shape[1]
+    for b in range(len(p_load)):
+        for j in range(start.shape[2]):
+            p_slack = 0.0
+            for i in range(n_load):
+                p_slack -= sequence[b, i, j]
+            for g in range(n_gen):
+                p_gen = static[b, j, g]
+                p_slack -= p_gen
+                sequence[b, 2 * n_load + g, j] = p_gen
+                start[b, g, j] = p_gen if dispatch else 0.5 * (limits.p_min[g] + limits.p_max[g])
+            sequence[b, 2 * n_load + n_gen, j] = p_slack
         for g in range(n_gen):
-            for j in range(1, start.shape[2]):
-                start[b, g, j] = static[g, j] if dispatch else 0.5 * (limits.p_min[g] + limits.p_max[g])
             start[b, g, 0] = given.p_initial[b, g]
+        _constants(given.cost[b], given.p_initial[b], given.state[b, n_gen:], constants[b])
         track(start[b], limits.step, start[b])
 
 
@@ -141,35 +148,6 @@ def _loads_and_bends(segments: Array, nodes: Array, p_load: Array, at_knots: Arr
             at_knots[k // 2] = p_load[k]
             bends[k // 2] = (area - area_before) / spacing - 0.5 * (change + rise_before) if k else 0.0
             area_before, rise_before = area, change
-
-
-@compiled
-def _dispatch(p_load: Array, cost: Array, p_min: Array, p_max: Array, static: Array) -> None:
-    """`problem.dispatch.merit_order` at each knot, then the slack's power; pu.
-
-    Args:
-        p_load: loads at the knots, (n_load, n_knots).
-        cost: (slack, generators), (1 + n_gen,).
-        static: receives the powers, (n_gen + 1, n_knots).
-    """
-    (n_load, n), n_gen = p_load.shape, len(p_min)
-    for j in range(n):
-        static[n_gen, j] = 0.0
-        for i in range(n_load):
-            static[n_gen, j] -= p_load[i, j]
-    for g in range(n_gen):
-        own, below = cost[1 + g], 0.0  # below: what all must deliver, and those that come earlier can
-        for i in range(n_gen):
-            below += p_min[i]
-            other = cost[1 + i]
-            if other < cost[0] and (other < own or (other == own and i < g)):
-                below += p_max[i] - p_min[i]
-        room = p_max[g] - p_min[g] if own < cost[0] else 0.0
-        for j in range(n):
-            static[g, j] = p_min[g] + min(max(static[n_gen, j] - below, 0.0), room)
-    for g in range(n_gen):
-        for j in range(n):
-            static[n_gen, j] -= static[g, j]
 
 
 @compiled

@@ -15,11 +15,13 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
-#: Generic properties are tested on every case here: the shipped one, and a chain
-#: slack - load - generator whose power flow, load angle and modes have closed forms.
+#: Generic properties are tested on every case here: the paper's; a chain slack - load - generator whose power
+#: flow, load angle and modes have closed forms; and a meshed grid with all that a case may have: junctions, a
+#: double line, a feed-in among the loads, a slack in the middle, 50 Hz, ramp limits and rates of case/2.
 CASE_FILES = {
     "9bus": SHIPPED_CASES / "9bus" / "case.json",
     "threebus": Path(__file__).parent / "cases" / "threebus" / "case.json",
+    "fivemachine": Path(__file__).parent / "cases" / "fivemachine" / "case.json",
 }
 
 R = TypeVar("R", bound=Record)

@@ -29,6 +29,7 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 from ded_bench.truth.score import score
 from ded_bench.truth.simulate import simulate
 
@@ -112,8 +113,12 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
     power = case.p_nominal + np.outer([0.0, 0.02, -0.01, 0.02], np.ones(len(case.generators)))
     schedule = Schedule(t=bend, p=power)
     truth = simulate(case, instance, schedule)
+    network = Network(case)
+    modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
+    period = 2 * np.pi / np.abs(modes).max()
+    coarsest = max(3, 3 * round(2 * HORIZON / period))  # six elements a period of the fastest mode
     errors, gaps = [], []
-    for elements in (3, 6, 12):
+    for elements in (coarsest, 2 * coarsest, 4 * coarsest):
         model = with_inputs(case, instance, elements, schedule)
         ends = element_ends(instance, elements)
         omega = np.array([[model.omega[g, end].value for g in case.generators] for end in model.end])

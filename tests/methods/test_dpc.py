@@ -33,8 +33,6 @@ from ded_bench.truth.score import score
 from ded_bench.truth.simulate import simulate
 
 HORIZON = 4.0
-N_KNOTS = 50
-KNOTS = np.linspace(0.0, HORIZON, N_KNOTS)
 
 
 def some_instances(case: Case, count: int, first: int = 0, horizon: float = HORIZON) -> list[Instance]:
@@ -82,30 +80,32 @@ def tensors(channels: Channels) -> list[torch.Tensor]:
 
 
 def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
+    knots = case.knot_times(HORIZON)
     inputs = Inputs.of(case, some_instances(case, 30))
     inputs.cost[:10] = np.round(inputs.cost[:10])  # ties, and costs of zero
     channels = channels_of(case, inputs)
-    expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(KNOTS))
+    expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(knots))
     static = channels.sequence[..., sequence_groups(case)["dispatch"]][..., :-1]
     np.testing.assert_allclose(static, expected, atol=1e-12)
-    step = case.ramp * KNOTS[1]
+    step = case.ramp * knots[1]
     np.testing.assert_array_equal(channels.start, follow(static[:, 1:], inputs.p_initial, step))
-    p_slack = -inputs.p_load(KNOTS).sum(axis=2) - expected.sum(axis=2)
+    p_slack = -inputs.p_load(knots).sum(axis=2) - expected.sum(axis=2)
     total = (expected * inputs.cost[:, None, 1:]).sum(axis=2) + inputs.cost[:, :1] * np.abs(p_slack)
     np.testing.assert_allclose(channels.static_cost(inputs), total.mean(axis=1), atol=1e-12)
     assert (channels.sequence.shape[2], channels.constants.shape[1]) == n_channels(case)
 
 
 def test_bends_say_what_loads_do_between_knots(case: Case) -> None:
+    knots = case.knot_times(HORIZON)
     instances = some_instances(case, 5)
     channels = channels_of(case, Inputs.of(case, instances))
-    n_load, spacing = len(case.loads), KNOTS[1]
+    n_load, spacing = len(case.loads), knots[1]
     for b, instance in enumerate(instances):
-        fine = np.linspace(0.0, HORIZON, (N_KNOTS - 1) * 400 + 1)
+        fine = np.linspace(0.0, HORIZON, (case.n_knots - 1) * 400 + 1)
         values = instance.p_load(case, fine)
         halves = 0.5 * (values[1:] + values[:-1]) * (fine[1] - fine[0])
-        mean = halves.reshape(N_KNOTS - 1, 400, n_load).sum(axis=1) / spacing
-        at = instance.p_load(case, KNOTS)
+        mean = halves.reshape(case.n_knots - 1, 400, n_load).sum(axis=1) / spacing
+        at = instance.p_load(case, knots)
         np.testing.assert_allclose(channels.sequence[b, :, :n_load], at, atol=1e-14)
         expected = mean - 0.5 * (at[1:] + at[:-1])
         np.testing.assert_allclose(channels.sequence[b, 1:, n_load : 2 * n_load], expected, atol=1e-8)
@@ -149,6 +149,7 @@ def test_compiled_twin_equals_the_torch_network(case: Case) -> None:
 
 def test_the_response_is_the_linear_models(case: Case) -> None:
     """Condensed in coarse steps, from any state: the rollout in fine ones."""
+    knots = case.knot_times(HORIZON)
     rng, response = np.random.default_rng(0), response_of(case)
     fine = linear_model(case, response.nodes[1] / 8)
     grid = np.linspace(0.0, HORIZON, 8 * (len(response.nodes) - 1) + 1)
@@ -156,17 +157,17 @@ def test_the_response_is_the_linear_models(case: Case) -> None:
     theta, omega = rng.normal(0.0, 0.01, (2, 3, n_gen))
     theta[0] = 0.0
     loads = -rng.uniform(0.5, 1.5, (3, len(response.nodes), n_load))
-    powers = rng.uniform(0.5, 1.5, (3, N_KNOTS, n_gen))
+    powers = rng.uniform(0.5, 1.5, (3, case.n_knots, n_gen))
     loads[:, 0], powers[:, 0] = case.load_nominal, case.p_nominal  # where the model's angles are exact
     network = Network(case)
     angles = np.tile(network.power_flow(case.p_nominal, case.load_nominal), (3, 1))
     angles[:, network.generators] += theta
     psi = fine.observables(network, angles, omega, loads[:, 0])
     seen = response(response.free_response(np.hstack([theta, omega]), loads), powers).reshape(
-        3, N_KNOTS, 2, n_gen + 1
+        3, case.n_knots, 2, n_gen + 1
     )
     for b in range(3):
-        columns = [np.interp(grid, KNOTS, column) for column in powers[b].T]
+        columns = [np.interp(grid, knots, column) for column in powers[b].T]
         columns += [np.interp(grid, response.nodes, column) for column in loads[b].T]
         inputs = np.stack(columns, axis=1)
         outputs = fine.rollout(psi[b], inputs)[:, : n_gen + 1]
@@ -178,6 +179,7 @@ def test_the_response_is_the_linear_models(case: Case) -> None:
 
 def test_angles_off_equilibrium_enter_the_response(case: Case, quiet_instance) -> None:
     """Released a little off the nominal equilibrium, the true grid swings as the response says."""
+    knots = case.knot_times(HORIZON)
     network = Network(case)
     angles = network.power_flow(case.p_nominal, case.load_nominal)[network.generators]
     power = dict(zip(case.generators, case.p_nominal.tolist(), strict=True))
@@ -188,10 +190,10 @@ def test_angles_off_equilibrium_enter_the_response(case: Case, quiet_instance) -
     inputs, response = Inputs.of(case, [instance]), response_of(case)
     n_gen = len(case.generators)
     np.testing.assert_allclose(inputs.state[:, :n_gen], 1e-4, rtol=1e-6)
-    p_gen = np.tile(case.p_nominal, (1, N_KNOTS, 1))
+    p_gen = np.tile(case.p_nominal, (1, case.n_knots, 1))
     seen = response(Channels.of(case, inputs, response).free_response, p_gen)[0, :, :n_gen]
-    run = simulate(case, instance, Schedule(KNOTS, p_gen[0]))
-    true = np.stack([np.interp(KNOTS, instance.grid, column) for column in run.omega.T], axis=1)
+    run = simulate(case, instance, Schedule(knots, p_gen[0]))
+    true = np.stack([np.interp(knots, instance.grid, column) for column in run.omega.T], axis=1)
     peak = np.abs(true).max()
     assert peak > 1e-5
     np.testing.assert_allclose(seen, true, atol=0.02 * peak)
@@ -230,13 +232,14 @@ def test_batches_threads_and_single_calls_agree(threebus: Case) -> None:
     inputs = Inputs.of(threebus, instances)
     whole = policy.powers(inputs)
     assert policy([]) == []
-    assert whole.shape == (len(instances), N_KNOTS, len(threebus.generators))
+    assert whole.shape == (len(instances), threebus.n_knots, len(threebus.generators))
     np.testing.assert_array_equal(policy.powers(inputs, threads=2), whole)
     for b in (0, CHUNK, len(instances) - 1):
         np.testing.assert_allclose(policy(instances[b])[0].p, whole[b], atol=1e-5)
 
 
 def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
+    knots = case.knot_times(HORIZON)
     model, instances = linear_model(case), some_instances(case, 3)
     network, grid = Network(case), instances[0].grid
     inputs, stride = Inputs.of(case, instances), coarse_stride(instances[0].dt_s, instances[0].steps)
@@ -250,14 +253,14 @@ def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
     cost = torch.as_tensor(inputs.cost)
     values = []
     for step, free in ((1, fine), (stride, fine[:, :, ::stride])):
-        objective = Objective.make(CondensedRollout.make(case, model, grid, KNOTS, step), torch.float64)
+        objective = Objective.make(CondensedRollout.make(case, model, grid, knots, step), torch.float64)
         omega, p_slack = objective.rollout(torch.as_tensor(free.copy()), p_gen)
         values.append((objective.cost(p_gen, p_slack, cost), omega.abs().amax(dim=(1, 2))))
     torch.testing.assert_close(values[0][0], values[1][0], rtol=1e-3, atol=0.0)
     torch.testing.assert_close(values[0][1], values[1][1], rtol=1e-2, atol=0.0)
     # the fine cost is the sum that the scorer takes
-    powers = np.stack([np.interp(grid, KNOTS, p_gen[0, :, g]) for g in range(p_gen.shape[2])], axis=1)
-    one = Objective.make(CondensedRollout.make(case, model, grid, KNOTS), torch.float64)
+    powers = np.stack([np.interp(grid, knots, p_gen[0, :, g]) for g in range(p_gen.shape[2])], axis=1)
+    one = Objective.make(CondensedRollout.make(case, model, grid, knots), torch.float64)
     _, slack = one.rollout(torch.as_tensor(fine[:1].copy()), p_gen[:1])
     total = (powers @ inputs.cost[0, 1:]).sum() + inputs.cost[0, 0] * np.abs(slack.numpy()).sum()
     assert float(values[0][0][0]) == pytest.approx(total, rel=1e-12)
@@ -270,7 +273,9 @@ def test_gradient_of_the_loss_matches_finite_differences(threebus: Case) -> None
     free = coarse_free_response(Network(threebus), model, inputs, instances[0].grid, stride)
     pool = Pool.of(channels, inputs, free, len(instances[0].grid))
     pool = Pool(*(getattr(pool, name).double() for name in pool.__dataclass_fields__))
-    condensed = CondensedRollout.make(threebus, model, instances[0].grid, KNOTS, stride)
+    condensed = CondensedRollout.make(
+        threebus, model, instances[0].grid, threebus.knot_times(HORIZON), stride
+    )
     objective = Objective.make(condensed, torch.float64)
     loss = Loss(objective, 1e-3, 0.1)
     network = random_network(threebus, 0.003).double()

@@ -126,7 +126,7 @@ def test_rollout_starts_at_the_true_frequencies_and_stays_near(case, instance, s
     outputs = rollout(case, linear_model(case), [instance, instance], runs)
     for b, run in enumerate(runs):
         assert np.allclose(outputs[0, b, :-1], run.omega[0])
-        assert np.abs(outputs[:, b, :-1] - run.omega).max() < 0.05 * np.abs(run.omega).max()
+        assert np.abs(outputs[:, b, :-1] - run.omega).max() < 0.1 * np.abs(run.omega).max()
 
 
 def test_worst_instances_side_by_side(case, instance, shown, tmp_path) -> None:

@@ -152,6 +152,16 @@ VIOLATIONS = (
     Column("initial_violation_mean", "initial mean", "pu"),
     Column("initial_violation_max", "initial max"),
 )
+PROVENANCE = (
+    *_HEAD,
+    Column("rows", "rows"),
+    Column("code", "code"),
+    Column("score_code", "code of the scores"),
+    Column("timed_code", "code of the times"),
+    Column("model", "Koopman model"),
+    Column("policy", "policy"),
+    Column("solver_version", "solver"),
+)
 CLAIMS = (
     *_HEAD,
     Column("status", "status"),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pandas as pd
 
-from ded_bench.evaluate.summary import REFERENCE
+from ded_bench.evaluate.summary import REFERENCE, groups, title
 from ded_bench.report.sources import Sources
 from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 
@@ -65,11 +67,7 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
     ]
     if len(unscored):
         notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
-    short = overview[overview["rows"] < sources.test_count]
-    if sources.test_count and len(short) and (frame["split"] == "test").all():
-        for count, rows in short.groupby("rows"):
-            names = ", ".join(f"{row.title} {row.regime}" for row in rows.itertuples())
-            notes.append(f"Only {count} of {sources.test_count} test instances were run: {names}.")
+    notes += _missing(sources, overview)
     if not len(timing):
         notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
     elif (timing["load_average"] > BUSY).any():
@@ -85,3 +83,22 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
 def named(version: str) -> str:
     """A problem version as a reader sees it."""
     return version or "(none given)"
+
+
+def _missing(sources: Sources, overview: pd.DataFrame) -> Iterator[str]:
+    """Which rows are missing: test instances, and regimes."""
+    frame = sources.judged
+    tests = list(sources.instances)[: sources.test_count]
+    if tests and (frame["split"] == "test").all():
+        for regime, method, settings, rows in groups(frame):
+            missing = [name for name in tests if name not in set(rows["instance"])]
+            if missing:
+                named_ones = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
+                yield (
+                    f"Only {len(tests) - len(missing)} of {len(tests)} test instances were run: "
+                    f"{title(method, settings)} {regime} (without {named_ones})."
+                )
+    for name, rows in overview.groupby("title", sort=False):
+        absent = [regime for regime in sources.case.regimes if regime not in set(rows["regime"])]
+        if absent:
+            yield f"No rows of {name} in regime {', '.join(absent)}."

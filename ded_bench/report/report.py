@@ -39,6 +39,7 @@ from ded_bench.report.columns import (
     GAPS,
     LOADED_TIMES,
     MODELS,
+    PROVENANCE,
     RATES,
     STARTS,
     TABLE_V,
@@ -64,6 +65,7 @@ from ded_bench.report.page import (
     render_markdown,
 )
 from ded_bench.report.paper import Line, paper_lines
+from ded_bench.report.provenance import provenance, provenance_notes
 from ded_bench.report.render import to_latex, to_markdown
 from ded_bench.report.sources import Sources, read_sources
 from ded_bench.run.environment import environment, now
@@ -92,13 +94,18 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
     gallery = draw(sources, pool)
     captions = _captions(sources)
     files = _write_tables(sources.results.folder / "tables", frames, captions)
-    notes = [*data_notes(sources, frames["summary"]), *sources.notes, *gallery.notes]
+    notes = [
+        *data_notes(sources, frames["summary"]),
+        *provenance_notes(sources.judged, sources.timing),
+        *sources.notes,
+        *gallery.notes,
+    ]
     blocks = [
         *_opening(sources, frames["summary"], notes),
         *_results(frames, captions, gallery),
         *_details(sources, frames, gallery),
         *_training(sources, frames, gallery),
-        *_closing(sources.rows, gallery),
+        *_closing(sources.rows, frames["provenance"], gallery),
     ]
     write_atomically(folder / "report.md", render_markdown(blocks))
     write_atomically(folder / "report.html", render_html(blocks, folder))
@@ -113,6 +120,7 @@ def _frames(sources: Sources, lines: Sequence[Line]) -> dict[str, pd.DataFrame]:
         "table_v": tabulate(TABLE_V, lines),
         "table_vi": tabulate(TABLE_VI, lines),
         "summary": overview,
+        "provenance": provenance(frame, sources.timing),
         "claims": claims(frame),
         "times_under_load": table_times(frame),
         "worst": worst(frame),
@@ -153,6 +161,7 @@ def _write_tables(tables: Path, frames: dict[str, pd.DataFrame], captions: dict[
 PRINTED: dict[str, Sequence[Column]] = {
     "table_v": TABLE_V,
     "table_vi": TABLE_VI,
+    "provenance": PROVENANCE,
     "claims": CLAIMS,
     "times_under_load": LOADED_TIMES,
     "worst": WORST,
@@ -322,7 +331,7 @@ def _rollout_errors(rollouts: Mapping[str, pd.DataFrame]) -> list[Block]:
     return blocks
 
 
-def _closing(everything: pd.DataFrame, gallery: Gallery) -> list[Block]:
+def _closing(everything: pd.DataFrame, made_by: pd.DataFrame, gallery: Gallery) -> list[Block]:
     """The problems, and what made the rows."""
 
     def listed(name: str) -> str:
@@ -339,6 +348,8 @@ def _closing(everything: pd.DataFrame, gallery: Gallery) -> list[Block]:
     return [
         Heading("The problems"),
         *gallery.of("problem", "The instances' files are not at hand."),
+        Heading("What made the rows"),
+        Table(made_by, PROVENANCE, "Hashes of the sources, models and policies that answers depend on"),
         Heading("Environment"),
         Items((*items, f"This report was written {now()} with: {here}.")),
     ]

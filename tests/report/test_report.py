@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ded_bench.evaluate.summary import title
 from ded_bench.evaluate.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.koopman.linear import linear_model
@@ -242,6 +243,9 @@ def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
     ):
         assert fact in text
     assert "| ded-dpc-TO | 123.5 | 7 |" in text.replace("124", "123.5")
+    assert "## What made the rows" in text
+    assert f"{6 * TEST - 1} rows do not say which code made them: " in text
+    assert f"Only {TEST - 1} of" not in text
     assert "Times of other cases are left out: 1 methods" in text
     assert "No certificate" in text
 
@@ -342,7 +346,11 @@ def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
     write_report(ninebus, folder, problems)
     assert not list((folder / "figures").glob("schedule_*"))
     assert len(pd.read_csv(folder / "tables" / "summary.csv")) == 1
-    assert "no trajectory is drawn" in (folder / "report.md").read_text()
+    text = (folder / "report.md").read_text()
+    assert "no trajectory is drawn" in text
+    assert f"Only 0 of {TEST} test instances were run: {title('ded')} {row.regime} (without 9bus-" in text
+    other = next(regime for regime in ninebus.regimes if regime != row.regime)
+    assert f"No rows of {title('ded')} in regime {other}." in text
 
 
 def test_only_runs_that_can_be_drawn_are_among_the_worst(finished: Path) -> None:

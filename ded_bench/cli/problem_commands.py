@@ -1,32 +1,36 @@
-"""Commands that make problems."""
+"""Commands that make, list and check problems."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ded_bench.cli.arguments import (
-    DEFAULT_CASE,
-    command,
-    natural,
-    positive,
-)
+from ded_bench.cli.arguments import DEFAULT_CASE, command, natural, positive
 from ded_bench.problem.benchmark import problem_folder
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import write_benchmark
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.sampling import Split, load_manifest, load_split, write_benchmark
 
 if TYPE_CHECKING:
-    pass
+    from ded_bench.evaluate.case_check import CaseCheck
+
+COUNT, SEED = 500, 2022
 
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
+    p = command(commands, "cases", "list the shipped cases, or check a case of your own")
+    p.add_argument("case", nargs="?", help="a case to check: folder, case.json, or name of a shipped one")
+    p.add_argument("--count", type=positive, default=50, help="instances to draw and simulate (50)")
+    p.set_defaults(run=_cases)
+
     p = command(commands, "instances", "draw the benchmark's instances (paper, Table III)")
-    p.add_argument("--count", type=positive, default=500)
-    p.add_argument("--seed", type=natural, default=2022)
+    same = "default: as in the split that the case has, else"
     p.add_argument("--case", default=DEFAULT_CASE, help="name of a shipped case, or a folder")
-    p.add_argument("--test", type=positive, help="how many are for testing (default: a fifth)")
+    p.add_argument("--count", type=positive, help=f"how many to draw ({same} {COUNT})")
+    p.add_argument("--test", type=positive, help=f"how many are for testing ({same} a fifth)")
+    p.add_argument("--seed", type=natural, help=f"master seed ({same} {SEED})")
     p.add_argument("--out", type=Path, help="default: the case's own folder")
     p.set_defaults(run=_instances)
 
@@ -35,9 +39,75 @@ def _instances(a: argparse.Namespace) -> int:
     from ded_bench.truth.servable import servable
 
     case = Case.load(a.case)
-    folder = a.out or problem_folder(a.case, case)
-    manifest = write_benchmark(case, a.count, a.seed, folder, a.test, servable)
-    print(f"{a.count} instances of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}")
+    home = problem_folder(a.case, case)
+    split = load_split(home) if (home / "split.json").is_file() else Split(seed=SEED, train=(), test=())
+    there = len(split.train) + len(split.test)
+    count = a.count or there or COUNT
+    test = a.test or (len(split.test) if count == there else None)
+    seed = split.seed if a.seed is None else a.seed
+    folder = a.out or home
+    manifest = write_benchmark(case, count, seed, folder, test, servable)
+    print(f"{count} instances of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
     if manifest.redraws:
         print(f"{manifest.redraws} loads or instances were drawn again: their sign changed, or no power flow")
     return 0
+
+
+def _cases(a: argparse.Namespace) -> int:
+    return _list() if a.case is None else _check(Case.load(a.case), a.count)
+
+
+def _list() -> int:
+    rows = [["case", "buses", "generators", "loads", "instances", "version"]]
+    folders = {path.parent: Case.load(path) for path in SHIPPED_CASES.glob("*/case.json")}
+    for folder, case in sorted(folders.items(), key=lambda item: len(item[1].buses)):
+        split, manifest = load_split(folder), load_manifest(folder)
+        sizes = len(case.buses), len(case.generators), len(case.loads)
+        instances = f"{len(split.train)}+{len(split.test)}"
+        rows.append([case.id, *map(str, sizes), instances, manifest.version if manifest else ""])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+    print("\nGenerators without the slack; instances for training + testing.")
+    return 0
+
+
+def _check(case: Case, count: int) -> int:
+    from ded_bench.evaluate.case_check import check_case
+    from ded_bench.truth.network import PowerFlowError
+
+    try:
+        found = check_case(case, count)
+    except PowerFlowError as error:
+        print(f"ded-bench: case {case.id}: nominal powers: {error}", file=sys.stderr)
+        return 1
+    _print_check(case, found)
+    if not found.served:
+        print(f"ded-bench: case {case.id}: no instance can be served", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _print_check(case: Case, found: CaseCheck) -> None:
+    import numpy as np
+
+    sizes = f"{len(case.buses)} buses, {len(case.generators)} generators, {len(case.loads)} loads"
+    print(f"case {case.id}: {sizes}")
+    angle = f"largest angle across a line {found.angle_deg:.1f} degrees"
+    print(f"power flow   slack {found.p_slack:.4g} pu, {angle}")
+    print(f"modes        {len(found.frequency_hz)}; knots {case.n_knots}, suggested {found.knots}")
+    print("             Hz        damping %")
+    for frequency, damping in zip(found.frequency_hz, found.damping, strict=True):
+        print(f"             {frequency:<8.3f}  {100 * damping:.1f}")
+    again = f"{found.redrawn_loads} loads drawn again"
+    print(f"draws        {found.served} of {found.drawn} servable at once; {again}")
+    if not found.served:
+        return
+    print("static dispatch: largest |omega| in Hz of an instance")
+    for percent in (0, 10, 25, 50, 75, 90, 100):
+        peak = np.quantile(found.peak_hz, percent / 100, method="higher")
+        print(f"             {percent:>3} %     {peak:.4g}")
+    print("static dispatch violates")
+    for regime, limits in case.regimes.items():
+        share = found.violating(limits.omega_hz)
+        print(f"             {regime}: {100 * share:.0f} % of the instances beyond {limits.omega_hz:g} Hz")

@@ -70,7 +70,7 @@ def _add_score(commands: Any) -> None:
     given.add_argument("--results", type=Path, metavar="DIR", help="compare its rows and kept schedules")
     p.add_argument("--update", action="store_true", help="write the new scores into the rows of --results")
     p.add_argument("--name", help="what the rows of --schedules call your method")
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="NO, TO; not for --results")
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test; not for --results")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")

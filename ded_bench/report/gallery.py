@@ -171,8 +171,8 @@ def _draw_schedules(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
         if shown := _shown(gallery, keys):
             caption = (
                 f"{_names(shown)} on {keys[0].instance}, regime {regime}: generator powers with bounds, "
-                "loads, slack power. Of the third of the instances with gaps nearest to the median, it is "
-                "the one whose loads change most."
+                "loads, slack power. Of the instances whose schedules are kept, the third with gaps nearest "
+                "to the median was taken, and from it the one whose loads change most."
             )
             heading = f"{keys[0].instance}, {regime}"
             yield gallery.add(

@@ -205,7 +205,7 @@ class Particulars:
 
 
 def particular(source: str, case: Particulars) -> list[str | float]:
-    """Literals of code (docstrings apart) that are about one case.
+    """Literals of code (not docstrings) that are about one case.
 
     These are its name, a bus, a regime, a number of its files, and whatever looks like a fingerprint.
     Numbers as strings are always suspect; the slack's `s` is a common letter, and counts only as a

@@ -1,7 +1,7 @@
 """What changed between two results folders: a benchmark's regression test.
 
 Rows are compared by their key. Status, feasibility, objective and violations decide; gaps and times
-are told for information.
+are printed for information.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What tells two results folders apart."""
+    """What differs between two results folders."""
 
     a: Path
     b: Path
@@ -117,7 +117,7 @@ def _problems(row: Row) -> str:
 
 
 def _limits(tolerance: Tolerance) -> dict[str, float]:
-    """Columns that decide, in the order in which they are told, with the size of a change."""
+    """Columns that decide, in the order in which they are printed, with the size of a change."""
     return {
         "status": 0.0,
         "feasible": 0.0,

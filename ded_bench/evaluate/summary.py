@@ -48,15 +48,15 @@ def is_study(slug: str) -> bool:
     return slug == STUDY or slug.startswith(f"{STUDY}-")
 
 
-def is_apart(slug: str) -> bool:
-    """Whether rows with these settings stand in a table of their own alone."""
+def in_own_table(slug: str) -> bool:
+    """Whether rows with these settings stand in a table of their own, and in no other."""
     return is_study(slug) or slug.startswith(START)
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """The rows that the tables are about: the test instances if there are any, else all but validation."""
     frame = scoring_rows(frame)
-    frame = frame[~frame["settings"].map(is_apart).astype(bool)]
+    frame = frame[~frame["settings"].map(in_own_table).astype(bool)]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
 
@@ -76,9 +76,9 @@ def scoring_rows(frame: pd.DataFrame) -> pd.DataFrame:
 def coverage(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
     """Rows of a summary of everything whose methods have more rows than the summary of the judged rows."""
     judged = overview.set_index(GROUP)["rows"]
-    told = judged.reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0).to_numpy()
-    apart = overall["settings"].map(is_apart).to_numpy(dtype=bool)
-    more: pd.DataFrame = overall[(overall["rows"].to_numpy() > told) & ~apart]
+    counted = judged.reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0).to_numpy()
+    separate = overall["settings"].map(in_own_table).to_numpy(dtype=bool)
+    more: pd.DataFrame = overall[(overall["rows"].to_numpy() > counted) & ~separate]
     return more.reset_index(drop=True)
 
 
@@ -162,7 +162,7 @@ def statistics(group: pd.DataFrame) -> dict[str, object]:
 def table_times(frame: pd.DataFrame) -> pd.DataFrame:
     """Build, set-up and solve times of the results table, quartiles each, s.
 
-    These were taken while `workers` processes shared the machine: they tell methods apart by orders
+    These were taken while `workers` processes shared the machine: they compare methods by orders
     of magnitude, nothing finer.
     """
     rows = []

@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from ded_bench.evaluate.summary import is_apart, quartiles
+from ded_bench.evaluate.summary import in_own_table, quartiles
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import Table, cell
 from ded_bench.koopman.surrogates import MODELS
@@ -289,7 +289,7 @@ def runs_of(
         found.setdefault((key.method, key.settings), set()).add(key.regime)
     jobs = []
     for method in methods:
-        for slug in sorted(slug for name, slug in found if name == method and not is_apart(slug)):
+        for slug in sorted(slug for name, slug in found if name == method and not in_own_table(slug)):
             known = methods[method].settings
             choices = [
                 dataclasses.replace(settings, name=name, model=model) for name in known for model in MODELS

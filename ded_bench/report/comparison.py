@@ -37,8 +37,8 @@ def to_text(comparison: Comparison) -> str:
     for column in dict.fromkeys(change.column for change in c.changes):
         found = [change for change in c.changes if change.column == column]
         counts.append(f"{len(found)} × {column}")
-        told = [f"{name_of(change.key)}: {_arrow(change)}" for change in found]
-        lines += _section(f"{column}: {len(found)} of {c.common} common rows", told)
+        changes = [f"{name_of(change.key)}: {_arrow(change)}" for change in found]
+        lines += _section(f"{column}: {len(found)} of {c.common} common rows", changes)
     if len(c.summary):
         lines += ["", to_markdown(c.summary, PRINTED)]
     verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"

@@ -20,7 +20,7 @@ DEFAULT = "default"
 
 
 class PaperRow(Record):
-    """What a paper tells of one method in one regime; an increase of None is its NA."""
+    """What a paper reports of one method in one regime; an increase of None is its NA."""
 
     increase_percent: Number | None
     solve_s: NonNegative
@@ -104,7 +104,7 @@ class Line:
         return float(self.statistics["gap_percent_mean"])
 
     def papers(self, name: str) -> float:
-        """A number of the paper; missing if it tells none."""
+        """A number of the paper; missing if it has none."""
         value = getattr(self.paper, name, None)
         return math.nan if value is None else float(value)
 

@@ -31,7 +31,7 @@ def provenance(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:
     for regime, method, settings, group in groups(frame):
         names = [regime, method, settings, title(method, settings), len(group)]
         rows.append(
-            [*names, *(_told(group[name]) for name in MADE_BY), timed.get((regime, method, settings))]
+            [*names, *(_listed(group[name]) for name in MADE_BY), timed.get((regime, method, settings))]
         )
     return pd.DataFrame(rows, columns=[*HEAD, "rows", *MADE_BY, "timed_code"])
 
@@ -47,7 +47,7 @@ def provenance_notes(frame: pd.DataFrame, timing: pd.DataFrame) -> list[str]:
     notes = list(_code_notes(made))
     for name, what in WORDS.items():
         mixed = [
-            f"{title(method, settings)} {regime} ({_told(rows[name])})"
+            f"{title(method, settings)} {regime} ({_listed(rows[name])})"
             for regime, method, settings, rows in groups(made)
             if rows[name].nunique() > 1
         ]
@@ -71,7 +71,7 @@ def _code_notes(made: pd.DataFrame) -> Iterator[str]:
     if len(unknown):
         yield f"{len(unknown)} rows do not say which code made them: {_titles(unknown['method'])}."
     mixed = [
-        f"{title(str(method))} ({_told(codes)})"
+        f"{title(str(method))} ({_listed(codes)})"
         for method, codes in made.groupby("method", sort=False)["code"]
         if codes.nunique() > 1
     ]
@@ -79,7 +79,7 @@ def _code_notes(made: pd.DataFrame) -> Iterator[str]:
         yield f"Rows of one method come from different code: {'; '.join(mixed)}."
     if made["score_code"].nunique() > 1:
         yield (
-            f"Rows were scored by different code ({_told(made['score_code'])}); "
+            f"Rows were scored by different code ({_listed(made['score_code'])}); "
             "`ded-bench score --results DIR --update` scores the kept schedules anew."
         )
     ours = {name: code_of(METHODS[name].module) for name in set(made["method"]) & METHODS.keys()}
@@ -92,7 +92,7 @@ def _code_notes(made: pd.DataFrame) -> Iterator[str]:
         yield "Rows were scored by other code than what is installed here."
 
 
-def _told(values: Iterable[str]) -> str:
+def _listed(values: Iterable[str]) -> str:
     """Distinct values, the most frequent first; with their numbers, if there are several."""
     counts = Counter(_plain(value) or "unknown" for value in values)
     if len(counts) == 1:

@@ -1,4 +1,4 @@
-"""Two results folders side by side: what counts as a change, and what is only told."""
+"""Two results folders side by side: what counts as a change, and what is for information."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from ded_bench.evaluate.summary import GROUP, is_apart, title
+from ded_bench.evaluate.summary import GROUP, in_own_table, title
 from ded_bench.files.strict import parse_record
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.registry import METHODS
@@ -186,7 +186,7 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
 def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
     """Every method with every setting it has: one entry each in the legend, which covers nothing."""
     keys = [(name, settings) for name, method in METHODS.items() for settings in method.settings]
-    keys = [key for key in keys if not is_apart(key[1])]
+    keys = [key for key in keys if not in_own_table(key[1])]
     points = pd.DataFrame(
         [
             (regime, *key, title(*key), 100, 1.0, 0.01 * i, 10.0 ** (-i / 4), True)

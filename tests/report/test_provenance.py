@@ -1,4 +1,4 @@
-"""Which code, models and policies made the rows: told per method, and where they differ."""
+"""Which code, models and policies made the rows: per method, and where they differ."""
 
 from __future__ import annotations
 

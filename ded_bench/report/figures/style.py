@@ -1,6 +1,6 @@
 """The common look of all figures: colours, markers, dashes, legends, and how a figure is saved.
 
-Colours are Okabe and Ito's, which the colour-blind can tell apart; line styles differ as well, for
+Colours are Okabe and Ito's, which the colour-blind can distinguish; line styles differ as well, for
 print in grey. Nothing here touches pyplot's global state.
 """
 
@@ -29,17 +29,9 @@ from ded_bench.truth.simulate import Trajectory
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 GREY = "#7f7f7f"
-COLOURS = {
-    "ded": BLACK,
-    "ded-radau": GREEN,
-    "ded-ko": BLUE,
-    "ded-ko-knots": SKY,
-    "ded-dpc": VERMILION,
-    "ded-dpc-paper": ORANGE,
-    "ded-dpc-refined": PURPLE,
-    "ed": GREY,
-}
-OTHERS = ("#332288", "#882255", "#117733", "#999933")
+WINE, INDIGO, FOREST, OLIVE = "#882255", "#332288", "#117733", "#999933"
+#: Of methods, in the order of their registry.
+COLOURS = (BLACK, GREEN, WINE, GREY, BLUE, SKY, ORANGE, VERMILION, PURPLE, INDIGO, FOREST, OLIVE)
 BUS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILION, BLACK)
 DASHES: tuple[tuple[float, ...], ...] = (
     *((), (5, 2), (1.5, 1.5), (6, 2, 1.5, 2), (3, 1.5), (8, 3)),
@@ -97,28 +89,31 @@ def plain(text: str) -> str:
     return re.sub(r"^_", " _", text.replace("$", r"\$"))
 
 
+def _place(method: str) -> int:
+    """A method's place in the registry; those that are not registered share the next one."""
+    known = list(METHODS)
+    return known.index(method) if method in known else len(known)
+
+
 def colour(method: str) -> str:
     """A method's colour, the same in every figure and for all its settings."""
-    return COLOURS.get(method, OTHERS[sum(method.encode()) % len(OTHERS)])
+    return COLOURS[_place(method) % len(COLOURS)]
 
 
 def marker(method: str) -> str:
     """A method's marker in scatter plots, the same for all its settings."""
-    known = list(METHODS)
-    return MARKERS[(known.index(method) if method in known else len(known)) % len(MARKERS)]
+    return MARKERS[_place(method) % len(MARKERS)]
 
 
 def dashes(method: str, variant: int = 0) -> tuple[float, ...]:
-    """A line style that tells methods apart in print, and a method's settings; DED is solid.
+    """A line style that distinguishes methods in print, and a method's settings; the reference is solid.
 
     Args:
         variant: which of the method's settings in the figure; 0 are its default.
     """
     if (method, variant) == (REFERENCE[0], 0):
         return ()
-    known = list(METHODS)
-    place = known.index(method) if method in known else len(known)
-    return DASHES[1 + (place + variant) % (len(DASHES) - 1)]
+    return DASHES[1 + (_place(method) + variant) % (len(DASHES) - 1)]
 
 
 def thin(t: Array, values: Array) -> tuple[Array, Array]:

@@ -41,7 +41,7 @@ from ded_bench.truth.network import Network
 
 #: Gaps below this are drawn on a linear scale, larger ones on a logarithmic one, %.
 LINEAR_GAP = 0.01
-#: Smallest excess over the best that profiles tell apart, %.
+#: Smallest excess over the best that profiles resolve, %.
 SMALLEST_EXCESS = 1e-4
 #: Terms of a loss that differ by less than this factor are drawn on a linear scale.
 LINEAR_SPREAD = 5.0
@@ -105,7 +105,7 @@ def _draw_family(ax: Axes, family: pd.DataFrame, style: Mapping[str, Any]) -> No
                 place,
                 xytext=(2, 4),
                 textcoords="offset points",
-                rotation=35,  # words of neighbours, beside or above each other, stay apart
+                rotation=35,  # words of neighbours, beside or above each other, do not overlap
                 rotation_mode="anchor",
                 fontsize=6.5,
                 color=style["color"],
@@ -265,9 +265,9 @@ def perturbations(case: Case, instances: Sequence[Instance]) -> Array:
     for instance in instances:
         load = instance.p_load(case, np.zeros(1))[0]
         optimum = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), load)
-        away = optimum - case.p_nominal
-        known = np.abs(away) > 1e-3
-        found.append(2 * (optimum - instance.p_initial(case))[known] / away[known])
+        deviation = optimum - case.p_nominal
+        known = np.abs(deviation) > 1e-3
+        found.append(2 * (optimum - instance.p_initial(case))[known] / deviation[known])
     return np.concatenate(found)
 
 
@@ -355,7 +355,7 @@ def eigenvalue_figure(case: Case, models: Sequence[Koopman]) -> Figure:
             inside = values[np.abs(values) > 1e-9]
             rates = np.log(inside) / model.dt_s
             shown = np.abs(rates) <= reach
-            away = len(values) - int(shown.sum())
+            hidden = len(values) - int(shown.sum())
             style: dict[str, Any] = {
                 "marker": MARKERS[i % len(MARKERS)],
                 "linestyle": "none",
@@ -365,7 +365,7 @@ def eigenvalue_figure(case: Case, models: Sequence[Koopman]) -> Figure:
                 "markeredgewidth": 1.2,
             }
             left.plot(values.real, values.imag, **style)
-            more = f" ({away} faster, not shown right)" if away else ""
+            more = f" ({hidden} faster, not shown right)" if hidden else ""
             handles += right.plot(
                 rates[shown].real, rates[shown].imag, label=plain(f"K, {model.kind}{more}"), **style
             )

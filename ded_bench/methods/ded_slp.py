@@ -33,6 +33,10 @@ SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "100ms": {"knot_interval_s
 #: exceeds the bound by at most half of what strict feasibility allows (1e-6 Hz). Costs are 1e-6 higher.
 MARGIN = 2 * np.pi * 1e-6
 OPEN = ACCEPTED = 2 * np.pi * 5e-7
+#: Around a trajectory that exceeds the bound, rows are added until this part of its excess is left: the
+#: model's error is no smaller, and another trajectory is cheaper than another program. Around the first one
+#: a single program is solved.
+REFINEMENT = 0.01
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
@@ -132,9 +136,11 @@ class _Sequence:
                 self.message = str(error)
                 break
             schedule = Schedule(t=trajectory.t[self.points], p=p_gen)
-            if self._confirmed(trajectory, schedule):
+            excess = float(np.abs(trajectory.omega[1:]).max()) - self.bound
+            if excess <= ACCEPTED and self._confirmed(trajectory, schedule):
                 return Status.OPTIMAL, schedule
-            found, prediction = self._next(linearise_along(self.case, trajectory, self.points), number == 0)
+            model = linearise_along(self.case, trajectory, self.points)
+            found, prediction = self._next(model, np.inf if number == 0 else max(OPEN, REFINEMENT * excess))
             if prediction is None:
                 return found, self._best
             infeasible = infeasible + 1 if found == Status.INFEASIBLE else 0
@@ -166,9 +172,7 @@ class _Sequence:
         raise SimulationError("the system cannot follow any schedule on the way to the program's")
 
     def _confirmed(self, trajectory: Trajectory, schedule: Schedule) -> bool:
-        """Whether a schedule meets the bound and costs what its program said; keeps the best one."""
-        if np.abs(trajectory.omega[1:]).max() > self.bound + ACCEPTED:
-            return False
+        """Whether a schedule that meets the bound costs what its program said; keeps the best one."""
         instance = self.instance
         generation = float((trajectory.p_gen @ instance.cost_gen(self.case)).sum())
         cost = generation + instance.cost_slack(self.case) * float(np.abs(trajectory.p_slack).sum())
@@ -176,10 +180,12 @@ class _Sequence:
             self._cheapest, self._best = cost, schedule
         return abs(cost - self.claimed) <= COST_TOLERANCE * abs(cost)
 
-    def _next(self, model: TrajectoryModel, first: bool) -> tuple[Status, Prediction | None]:
+    def _next(self, model: TrajectoryModel, enough: float) -> tuple[Status, Prediction | None]:
         """Solve the program around a trajectory, with rows added until all points are right.
 
-        The first trajectory is not worth more than one program.
+        Args:
+            model: the linear model along it.
+            enough: how far ω may exceed its limit between points that have rows, rad/s.
 
         Returns:
             `Optimal`, or `Infeasible` with the schedule of least excess; without a schedule, why not.
@@ -194,9 +200,10 @@ class _Sequence:
             if answer.status != Status.OPTIMAL:
                 return answer.status, None
             prediction = program.predict(answer.x)
+            excess = float(np.abs(prediction.omega[1:]).max()) - (self.bound - MARGIN)
             added = self._near(prediction.omega) - self.limits
-            self.limits |= added
-            if first or not added:
+            self.limits |= added if excess > OPEN else set()
+            if excess <= enough or not added:
                 return Status.OPTIMAL, prediction
         return Status.OPTIMAL, prediction
 
@@ -215,17 +222,20 @@ class _Sequence:
         self.version, self.message = version, message
 
     def _near(self, omega: Array) -> set[tuple[int, int]]:
-        """(generator, grid point) near the bound, if some |ω| is beyond it after t_0.
+        """(generator, grid point) near the bound after t_0.
 
         Args:
             omega: shape (n_points, n_gen), rad/s.
         """
         size, bound = np.abs(omega.T), self.bound - MARGIN
         size[:, 0] = 0.0  # x_0 is given, wherever it lies
-        if size.max() <= bound + OPEN:
-            return set()
         chosen = np.zeros(size.shape, dtype=bool)
-        chosen[:, 1:-1] = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+        peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+        chosen[:, 1:-1] = peak
+        # A peak that is cut off moves to the points beside it.
+        over = peak & (size[:, 1:-1] > bound)
+        chosen[:, :-2] |= over
+        chosen[:, 2:] |= over
         chosen[:, divided(self.points, np.full(len(self.points) - 1, PARTS))] = True
         chosen[:, self.points] = False
         g, k = np.nonzero(chosen & (size > NEAR * bound))

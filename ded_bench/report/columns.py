@@ -225,6 +225,7 @@ TRAINING = (
     Column("instances", "instances"),
     Column("held_out", "held out"),
     Column("held_out_loss", "held-out loss", form=".6g"),
+    Column("training_loss", "training loss", form=".6g"),
     Column("parameters", "parameters"),
     Column("model", "Koopman model"),
     Column("seed", "seed"),

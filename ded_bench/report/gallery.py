@@ -316,7 +316,7 @@ def _draw_training(gallery: Gallery) -> Iterator[Call]:
         trained = title(method) if method else "unknown methods"
         caption = (
             f"Loss of each policy of {trained} over its training time; "
-            "right: what else its history tells, such as the loss's terms on held-out instances."
+            "right: what else its history holds, such as the terms of the loss."
         )
         name = f"training_{method or 'other'}"
         yield gallery.add("training", name, caption, summaries.history_figure, tables)

@@ -238,12 +238,17 @@ def test_training_history(tmp_path) -> None:
         {"epoch": [1, 2], "seconds": [60.0, 120.0], "training": [9.0, 8.0], "held out": [7.0, 6.0]}
         | {"objective": [5.0, 4.0], "ramp up": [0.0, 1e-3], "ramp down": [0.0, 0.0]}
     )
+    gaps = pd.DataFrame(
+        {"seconds": [1.0, 2.0, 3.0], "training": [9.0, np.nan, 7.0], "held out": [np.nan] * 3}
+    )  # taken now and then, and not at all
     figure = summaries.history_figure({"one": history, "two": history.drop(columns="training")})
     left, right = figure.axes[:2]
     assert drawn(left)[1].tolist() == [7.0, 6.0]
     assert left.get_lines()[0].get_xdata().tolist() == [1.0, 2.0]  # minutes
     assert drawn(right)[0].tolist() == [5.0, 4.0]
     assert [line.tolist() for line in drawn(figure.axes[2])] == [[7.0, 6.0]]
+    (few,) = drawn(summaries.history_figure({"few": gaps}).axes[0])
+    assert few.tolist() == [9.0, 7.0]
     assert np.isnan(drawn(right)[1][0])  # a term of zero has no place on a logarithmic scale
     check_layout(figure, tmp_path)
 

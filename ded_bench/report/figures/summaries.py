@@ -172,10 +172,10 @@ def _last(ratio: pd.Series[float], is_gap: bool) -> float:
 
 
 def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Training losses of policies over time: totals on the left, terms on the held-out data right.
+    """Training losses of policies over time on the left, all else that their histories hold on the right.
 
     Args:
-        histories: by name of the policy; columns seconds, held out, training if known, and the terms.
+        histories: by name of the policy; columns as `methods.training_record` describes them.
     """
     rows = max(len(histories), 1)
     with new_figure(7.2, 0.6 + 2.3 * rows) as figure:
@@ -184,22 +184,29 @@ def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
         for (name, history), (left, right) in zip(histories.items(), axes, strict=False):
             minutes = history["seconds"] / 60
             for column, paint, width in (("training", GREY, 0.8), ("held out", BLACK, 1.4)):
-                if column in history:
-                    left.plot(minutes, history[column], color=paint, label=column, linewidth=width)
+                taken = history.get(column, pd.Series(dtype=float)).dropna()
+                if len(taken):
+                    left.plot(minutes[taken.index], taken, color=paint, label=column, linewidth=width)
             terms = [c for c in history if c not in ("epoch", "step", "seconds", "training", "held out")]
             for i, term in enumerate(terms):
                 dash = DASHES[i % len(DASHES)] or (None, None)
                 paint = BUS_COLOURS[i % len(BUS_COLOURS)]
-                positive = history[term].where(history[term] > 0)
+                taken = history[term].dropna()
                 handles += right.plot(
-                    minutes, positive, color=paint, dashes=dash, label=plain(str(term)), linewidth=1.1
+                    minutes[taken.index],
+                    taken.where(taken > 0),
+                    color=paint,
+                    dashes=dash,
+                    label=plain(str(term)),
+                    linewidth=1.1,
                 )
             if _spread(history[terms]) > LINEAR_SPREAD:
                 right.set_yscale("log")
             right.set_title(plain(name), fontsize=8.5, loc="right")
             left.set_ylabel("loss")
-            right.set_ylabel("terms, held out")
-            legend_above(left, 2)
+            right.set_ylabel("other columns")
+            if left.get_lines():
+                legend_above(left, 2)
         for ax in axes[-1]:
             ax.set_xlabel("training time (min)")
         legend_below(figure, handles, columns=5)

@@ -17,6 +17,7 @@ import pytest
 
 import ded_bench
 from ded_bench.cli import main
+from ded_bench.cli.arguments import matching
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -284,3 +285,27 @@ def test_every_command_has_help() -> None:
     assert listed == [*road, "score", "compare", "certify", "rollouts"]
     for command in listed:
         assert run_cli(command, "--help").returncode == 0
+
+
+def test_settings_are_named_or_matched() -> None:
+    known = {"default": {}, "steps25": {}, "steps100": {}}
+    assert matching("default", known) == ["default"]
+    assert matching("steps*,default,steps25", known) == ["steps25", "steps100", "default"]
+    assert matching("nope", known) == ["nope"]  # its method says what is wrong
+    assert matching("nope*", known) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "problem_said"),
+    [
+        (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method, settings and regime"),
+        (("--settings", "nope*"), "matches no settings"),
+        (("--method", "ded", "--regime", "TO"), "is not trained"),
+    ],
+)
+def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train-dpc", *options]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert problem_said in err

@@ -10,29 +10,33 @@ reference for such guarantees uses. An instance on which either method fails is 
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
 from pydantic import Field
-from scipy.special import betaincinv
+from scipy.stats import binomtest
 from tqdm import tqdm
 
-from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record, write_atomically, write_record
+from ded_bench.files.strict import Record, read_record, write_record
+from ded_bench.files.table import Table, cell
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.code import code_of, code_of_method
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
+from ded_bench.truth import score as scorer
 from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score
 from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import SimulationError
@@ -42,16 +46,23 @@ COUNT, DELTA, GAP_PERCENT = 10_000, 0.01, 1.0
 FILE = "certificate.json"
 #: Instances answered, re-simulated and saved together.
 CHUNK = 50
-COLUMNS = (
-    "index",
-    "objective",
-    "reference",
-    "freq_violation_hz",
-    "ramp_violation",
-    "bound_violation",
-    "initial_violation",
-    "fingerprint",
-)
+
+
+@dataclass(frozen=True)
+class CertificateRow:
+    """One fresh instance: both costs, and the policy's violations; empty where there is no schedule."""
+
+    index: int  # of the master seed
+    fingerprint: str
+    objective: float | None = None
+    reference: float | None = None  # objective of the reference
+    freq_violation_hz: float | None = cell(default=None, lowest=0)
+    ramp_violation: float | None = cell(default=None, lowest=0)
+    bound_violation: float | None = cell(default=None, lowest=0)
+    initial_violation: float | None = cell(default=None, lowest=0)
+
+
+ROWS: Table[CertificateRow] = Table(CertificateRow)
 
 
 class Certificate(Record):
@@ -73,7 +84,12 @@ class Certificate(Record):
     delta: float
     clopper_pearson: float
     hoeffding: float
-    artifacts: str  # fingerprints of the case, the policy and the models
+    artifacts: str  # changes with the case, the policy, the models and the code
+    policy: str = ""  # `name@fingerprint` of what shaped the policy's answers
+    model: str = ""
+    code: str = ""  # of the policy, of the reference, and of the scorer
+    reference_code: str = ""
+    score_code: str = ""
     version: str
     host: str
     date: str
@@ -125,7 +141,8 @@ def clopper_pearson(successes: int, count: int, delta: float) -> float:
     Clopper and Pearson 1934, one-sided: exact for independent trials.
     """
     _check_trials(successes, count, delta)
-    return float(betaincinv(successes, count - successes + 1, delta)) if successes else 0.0
+    test = binomtest(successes, count, alternative="greater")
+    return float(test.proportion_ci(confidence_level=1.0 - delta, method="exact").low)
 
 
 def hoeffding(successes: int, count: int, delta: float) -> float:
@@ -162,19 +179,18 @@ def certify(
         InputError: unknown method or regime, a missing policy or model, or a wrong file of rows.
     """
     case.check_regimes([regime])
-    fingerprint = _fingerprint(case, method, reference, regime, settings, seed)
-    rows = read_rows(rows_path)
-    rows = rows[(rows["fingerprint"] == fingerprint) & (rows["index"] < count)]
-    done = set(rows["index"])
+    made_by = _made_by(case, method, reference, regime, settings)
+    fingerprint = _fingerprint(case, method, reference, settings, seed, made_by)
+    done = {r.index: r for r in read_rows(rows_path) if r.fingerprint == fingerprint and r.index < count}
     missing = [i for i in range(count) if i not in done]
     chunks = [missing[start : start + CHUNK] for start in range(0, len(missing), CHUNK)]
     calls = [(case, method, reference, regime, settings, seed, tuple(chunk)) for chunk in chunks]
     with tqdm(total=count, initial=len(done), unit="instance", disable=None, desc=f"certify {regime}") as bar:
         for made in _judged(calls, workers):
-            rows = pd.concat([rows, made.assign(fingerprint=fingerprint)], ignore_index=True)
-            rows = rows.sort_values("index", ignore_index=True)
-            write_atomically(rows_path, rows.to_csv(index=False))
+            done |= {row.index: dataclasses.replace(row, fingerprint=fingerprint) for row in made}
+            ROWS.write(rows_path, [done[index] for index in sorted(done)])
             bar.update(len(made))
+    rows = ROWS.frame(done.values())
     limits = meets_limits(rows, tolerance_hz, tolerance_pu)
     near = gaps(rows) <= gap_percent
     successes = int((limits & near).sum())
@@ -199,6 +215,7 @@ def certify(
         version=version(),
         host=host(),
         date=now(),
+        **made_by,
     )
 
 
@@ -213,21 +230,9 @@ def meets_limits(rows: pd.DataFrame, tolerance_hz: float, tolerance_pu: float) -
     return (rows["freq_violation_hz"] <= tolerance_hz) & (power <= tolerance_pu)
 
 
-def read_rows(path: Path) -> pd.DataFrame:
-    """Read the rows of earlier runs; an empty table if there are none.
-
-    Raises:
-        InputError: the file is no table of rows.
-    """
-    if not path.is_file():
-        return pd.DataFrame({name: pd.Series(dtype="float64") for name in COLUMNS})
-    try:
-        rows = pd.read_csv(path, dtype={"fingerprint": str, "index": int})
-    except (ValueError, OSError) as error:
-        raise InputError(path, "", f"is not a table of certificate rows ({str(error)[:80]})") from None
-    if tuple(rows.columns) != COLUMNS:
-        raise InputError(path, "", f"must have the columns {', '.join(COLUMNS)}")
-    return rows
+def read_rows(path: Path) -> list[CertificateRow]:
+    """Read the rows of earlier runs, none if there is no such file; InputError if it is wrong."""
+    return ROWS.read(path) if path.is_file() else []
 
 
 def judge(
@@ -238,7 +243,7 @@ def judge(
     settings: Settings,
     seed: int,
     indices: tuple[int, ...],
-) -> pd.DataFrame:
+) -> list[CertificateRow]:
     """Answer some instances with both methods and re-simulate; one row each, without fingerprint."""
     instances = [next(sample_instances(case, CERTIFICATE_SEED + seed, 1, i, servable)) for i in indices]
     plain = _plain(settings)
@@ -248,21 +253,19 @@ def judge(
     ]
     scores = _scores(case, [*instances, *instances], schedules, regime)
     verdicts = scores[: len(instances)], scores[len(instances) :]
-    rows = []
-    for index, own, other in zip(indices, *verdicts, strict=True):
-        row: dict[str, Any] = dict.fromkeys(COLUMNS[:-1], np.nan)
-        row |= asdict(own) if own else {}
-        rows.append(row | {"index": index, "reference": other.objective if other else np.nan})
-    return pd.DataFrame(rows, columns=list(COLUMNS[:-1]))
+    return [
+        CertificateRow(index, "", reference=other.objective if other else None, **asdict(own) if own else {})
+        for index, own, other in zip(indices, *verdicts, strict=True)
+    ]
 
 
-def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[pd.DataFrame]:
+def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:
     if workers == 1:
         yield from (judge(*call) for call in calls)
         return
     with Workers(workers) as pool:
         for _, answer in pool.imap([(judge, call) for call in calls], calls):
-            if not isinstance(answer, pd.DataFrame):
+            if not isinstance(answer, list):
                 raise RuntimeError(f"a chunk of the certificate failed: {answer}")
             yield answer
 
@@ -299,18 +302,32 @@ def _scores(
     return result
 
 
-def _fingerprint(case: Case, method: str, reference: str, regime: str, settings: Settings, seed: int) -> str:
-    plain = _plain(settings)
+def _made_by(case: Case, method: str, reference: str, regime: str, settings: Settings) -> dict[str, str]:
+    """What the answers and their scores depend on, as fields of a certificate."""
+    found = {}
+    used: list[Artifact] = []
+    for name, field, own in ((method, "code", settings), (reference, "reference_code", _plain(settings))):
+        answering = get_method(name)
+        artifacts = answering.artifacts(case, regime, own)
+        found[field] = code_of_method(answering, artifacts)
+        used += [artifact for artifact in artifacts if artifact not in used]
+    for kind in ("model", "policy"):
+        found[kind] = "+".join(f"{a.name}@{a.fingerprint}" for a in used if a.kind == kind)
+    return found | {"score_code": code_of(scorer.__name__)}
+
+
+def _fingerprint(
+    case: Case, method: str, reference: str, settings: Settings, seed: int, made_by: dict[str, str]
+) -> str:
     parts = [
         case.fingerprint,
         method,
-        settings.slug,
-        *(a.fingerprint for a in get_method(method).artifacts(case, regime, settings)),
         reference,
-        *(a.fingerprint for a in get_method(reference).artifacts(case, regime, plain)),
+        settings.slug,
         str(seed),
+        *map(str, sorted(made_by.items())),
     ]
-    return "-".join(part for part in parts if part)
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
 def _plain(settings: Settings) -> Settings:

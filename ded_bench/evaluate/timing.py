@@ -381,7 +381,7 @@ def _facts(case: Case, job: Job) -> dict[str, str]:
     method = get_method(job.method)
     used = method.artifacts(case, job.regime, job.settings)
     named = {
-        kind: ", ".join(f"{a.name} {a.fingerprint}" for a in used if a.kind == kind)
+        kind: "+".join(f"{a.name}@{a.fingerprint}" for a in used if a.kind == kind)
         for kind in ("model", "policy")
     }
     made_by = {"code": code_of_method(method, used), "version": version(), "host": host()}

@@ -12,6 +12,7 @@ from scipy.stats import binom
 
 from ded_bench.evaluate import certificate
 from ded_bench.evaluate.certificate import (
+    ROWS,
     certify,
     clopper_pearson,
     gaps,
@@ -95,7 +96,7 @@ def run(case: Case, file: Path, regime: str, count: int = 4, **options: object) 
 def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case, tmp_path: Path) -> None:
     loose = max(threebus.regimes, key=threebus.omega_bound)
     result = run(threebus, tmp_path / "rows.csv", loose)
-    rows = read_rows(tmp_path / "rows.csv")
+    rows = ROWS.frame(read_rows(tmp_path / "rows.csv"))
     assert rows["index"].tolist() == [0, 1, 2, 3]
     assert (rows["objective"] == rows["reference"]).all()  # the same schedules
     verdicts = []
@@ -134,6 +135,11 @@ def test_an_interrupted_certificate_goes_on(
     assert set(calls().values()) == {2}
     run(threebus, file, regime, seed=1)  # other instances: rows of these do not count
     assert sum(calls().values()) == 16
+    with monkeypatch.context() as patch:
+        patch.setattr(certificate, "code_of", lambda module: "another scorer")
+        again = run(threebus, file, regime, seed=1)
+    assert again.score_code == "another scorer"
+    assert sum(calls().values()) == 24  # rows of other code do not count either
 
 
 def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkeypatch) -> None:
@@ -147,7 +153,8 @@ def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkey
 
     monkeypatch.setattr(certificate, "sample_instances", renamed)
     result = run(threebus, tmp_path / "rows.csv", regime, tolerance_hz=1.0)
-    assert read_rows(tmp_path / "rows.csv")["objective"].isna().tolist() == [True, True, False, False]
+    lost = [row.objective is None for row in read_rows(tmp_path / "rows.csv")]
+    assert lost == [True, True, False, False]
     assert result.successes == result.meets_limits == result.near_reference == 2
 
 

@@ -156,7 +156,7 @@ def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     assert (row["first_build_s"], row["build_s"]) == (0.1, 0.1)
     assert np.isnan(row["setup_s"])  # the method does not tell: not available, not zero
     assert row["load_average"] >= 0
-    assert (row["policy"], row["model"], row["code"]) == ("fake one", "", "abc")
+    assert (row["policy"], row["model"], row["code"]) == ("fake@one", "", "abc")
     assert not len(timing_summary([]))
 
 

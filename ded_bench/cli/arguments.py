@@ -20,7 +20,7 @@ MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 #: The order of the list of commands: those of the road, then what judges results; others come last.
 ORDER = (
     *("instances", "train-ko", "solve", "train-dpc", "bench", "report"),
-    *("score", "compare", "certify", "rollouts"),
+    *("score", "compare", "certify", "rollouts", "scenarios"),
 )
 #: Under the list of commands, which must fit a terminal of 24 lines and 80 columns.
 ROAD = (

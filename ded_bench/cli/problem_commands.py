@@ -11,6 +11,7 @@ from ded_bench.cli.arguments import DEFAULT_CASE, command, natural, positive
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.sampling import Split, load_manifest, load_split, write_benchmark
+from ded_bench.problem.scenario_sampling import SCENARIOS, scenario_folder, write_scenarios
 
 if TYPE_CHECKING:
     from ded_bench.evaluate.case_check import CaseCheck
@@ -33,6 +34,13 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--seed", type=natural, help=f"master seed ({same} {SEED})")
     p.add_argument("--out", type=Path, help="default: the case's own folder")
     p.set_defaults(run=_instances)
+
+    p = command(commands, "scenarios", "draw minutes of operation for the closed loop")
+    p.add_argument("--count", type=positive, default=SCENARIOS)
+    p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--case", default=DEFAULT_CASE, help="name of a shipped case, or a folder")
+    p.add_argument("--out", type=Path, help="default: scenarios in the case's own folder")
+    p.set_defaults(run=_scenarios)
 
 
 def _instances(a: argparse.Namespace) -> int:
@@ -111,3 +119,13 @@ def _print_check(case: Case, found: CaseCheck) -> None:
     for regime, limits in case.regimes.items():
         share = found.violating(limits.omega_hz)
         print(f"             {regime}: {100 * share:.0f} % of the instances beyond {limits.omega_hz:g} Hz")
+
+
+def _scenarios(a: argparse.Namespace) -> int:
+    from ded_bench.truth.servable import servable
+
+    case = Case.load(a.case)
+    folder = a.out or scenario_folder(problem_folder(a.case, case))
+    manifest = write_scenarios(case, a.count, a.seed, folder, servable)
+    print(f"{a.count} scenarios of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}")
+    return 0

@@ -1,0 +1,190 @@
+"""Scenario: minutes of operation of a case - costs, what the loads do and what is announced; JSON on disk."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record
+from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
+from ded_bench.problem.instance import MAX_STEPS, Initial, Instance, LoadPoints, LoadRamp
+
+
+class ScenarioRamp(Record):
+    """One ramp of a load, and what was announced of it in advance: both values, or neither."""
+
+    start: NonNegative  # s
+    duration: NonNegative  # s
+    rate: Number  # pu/s
+    announced_start: NonNegative | None
+    announced_rate: Number | None
+
+    @model_validator(mode="after")
+    def _announced_whole(self) -> ScenarioRamp:
+        if (self.announced_start is None) != (self.announced_rate is None):
+            raise ValueError("announced_start and announced_rate: both or neither")
+        return self
+
+    @property
+    def end(self) -> float:
+        """When the ramp ends, s."""
+        return self.start + self.duration
+
+
+class Fluctuation(Record):
+    """What a load does beside its ramps: pu every `step_s` from t = 0, linear between.
+
+    Forecasts let its present value decay by exp(-t / decay_s).
+    """
+
+    step_s: Positive
+    values: Annotated[tuple[Number, ...], Field(strict=False, min_length=2)]
+    decay_s: Positive
+
+    @functools.cached_property
+    def times(self) -> Array:
+        """Times of the values, s."""
+        return np.arange(len(self.values), dtype=np.float64) * self.step_s
+
+    @functools.cached_property
+    def array(self) -> Array:
+        """The values, pu."""
+        return np.array(self.values)
+
+
+class ScenarioLoad(Record):
+    """A load that ramps several times and fluctuates; an injection in pu."""
+
+    initial: Number
+    ramps: Annotated[tuple[ScenarioRamp, ...], Field(strict=False)]
+    fluctuation: Fluctuation
+
+    def at(self, t: Array) -> Array:
+        """Injection in pu at times `t` in s (any shape)."""
+        ramped = sum(ramp.rate * np.clip(t - ramp.start, 0.0, ramp.duration) for ramp in self.ramps)
+        return np.asarray(self.initial + ramped + self.fluctuation_at(t))
+
+    def fluctuation_at(self, t: Array) -> Array:
+        """Fluctuation in pu at times `t` in s (any shape)."""
+        return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
+
+
+class Scenario(Record):
+    """Operation of one case for `duration_s`; the loads go on for a horizon of the case beyond it."""
+
+    schema_: Literal["ded-bench/scenario/1"] = Field(alias="schema", default="ded-bench/scenario/1")
+    id: Name
+    case: Name
+    seed: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
+    duration_s: Positive
+    dt_s: Positive
+    cost: dict[Name, NonNegative]
+    initial: Initial
+    load: dict[Name, ScenarioLoad]
+
+    @model_validator(mode="after")
+    def _whole_steps(self) -> Scenario:
+        steps = self.duration_s / self.dt_s
+        if steps > MAX_STEPS:  # first, since the quotient may be infinite
+            raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
+        if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
+            raise ValueError("duration_s: must be a whole multiple of dt_s")
+        if self.initial.theta is not None:
+            raise ValueError("initial.theta: a scenario starts from the power flow")
+        return self
+
+    @staticmethod
+    def load_file(path: str | Path, case: Case) -> Scenario:
+        """Read a scenario of a case.
+
+        Raises:
+            InputError: the file is missing or wrong, or belongs to another case.
+        """
+        scenario = read_record(Scenario, path)
+        scenario.check_case(case, path)
+        return scenario
+
+    def check_case(self, case: Case, source: str | Path = "") -> None:
+        """Raise InputError unless this names exactly the buses of `case` and its loads last long enough."""
+        source = source or f"scenario {self.id}"
+        steps = case.sampling.horizon_s / self.dt_s
+        if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
+            raise InputError(
+                source, "dt_s", f"must divide the case's horizon of {case.sampling.horizon_s:g} s"
+            )
+        self.snapshot(case, 0.0).check_case(case, source)
+        needed = self.duration_s + case.sampling.horizon_s
+        for bus, load in self.load.items():
+            if load.fluctuation.times[-1] < needed - 1e-9:
+                problem = f"must last for {needed:g} s, duration and horizon"
+                raise InputError(source, f"load.{bus}.fluctuation.values", problem)
+
+    @functools.cached_property
+    def steps(self) -> int:
+        """Number of time steps of the duration; the grid has one point more."""
+        return round(self.duration_s / self.dt_s)
+
+    @functools.cached_property
+    def grid(self) -> Array:
+        """Times t_k = k dt, shape (steps + 1,), s."""
+        return np.arange(self.steps + 1, dtype=np.float64) * self.dt_s
+
+    def p_load(self, case: Case, t: Array | None = None) -> Array:
+        """True load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
+        times = self.grid if t is None else t
+        return np.stack([self.load[bus].at(times) for bus in case.loads], axis=-1)
+
+    def snapshot(self, case: Case, t: float) -> Instance:
+        """An instance whose loads stay as they are at time `t`: the initial power is the scenario's."""
+        load: dict[str, LoadRamp | LoadPoints] = {
+            bus: LoadRamp(initial=float(load.at(np.array(t))), start=0.0, duration=0.0, rate=0.0)
+            for bus, load in self.load.items()
+        }
+        return Instance(
+            schema_="ded-bench/instance/1",
+            id=self.id,
+            case=self.case,
+            seed=self.seed,
+            horizon_s=case.sampling.horizon_s,
+            dt_s=self.dt_s,
+            cost=self.cost,
+            load=load,
+            initial=self.initial,
+        )
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when anything in the scenario does."""
+        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
+
+    def __eq__(self, other: object) -> bool:
+        """Equal content; cached arrays do not count."""
+        return isinstance(other, Scenario) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        """Equal scenarios have equal hashes."""
+        return hash(self.fingerprint)
+
+
+def load_scenarios(paths: Sequence[str | Path], case: Case) -> list[Scenario]:
+    """Read several scenarios of one case.
+
+    Raises:
+        InputError: no file given, a file is wrong, or two have the same id.
+    """
+    found: dict[str, Scenario] = {}
+    for path in paths:
+        scenario = Scenario.load_file(path, case)
+        if scenario.id in found:
+            raise InputError(path, "id", f"{scenario.id} was already given by another file")
+        found[scenario.id] = scenario
+    if not found:
+        raise InputError("scenarios", "", "no scenario was given")
+    return list(found.values())

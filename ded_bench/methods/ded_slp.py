@@ -35,7 +35,7 @@ MARGIN = 2 * np.pi * 1e-6
 OPEN = ACCEPTED = 2 * np.pi * 5e-7
 #: Around a trajectory that exceeds the bound, rows are added until this part of its excess is left: the
 #: model's error is no smaller, and another trajectory is cheaper than another program. Around the first one
-#: a single program is solved.
+#: a single program is solved, unless it comes from an earlier solution.
 REFINEMENT = 0.01
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
@@ -73,12 +73,11 @@ class SlpSolver:
         """
         started = time.perf_counter()
         limit = np.inf if self.time_limit_s is None else self.time_limit_s
-        start = ed.dispatch(self.case, instance, 1.0)
-        if last is not None and last.schedule is not None:
-            start = last.schedule
+        near = last.schedule if last is not None else None
+        start = ed.dispatch(self.case, instance, 1.0) if near is None else near
         points = self._knots(instance)
         sequence = _Sequence(self.case, instance, self.case.omega_bound(self.regime), points, started + limit)
-        status, schedule = sequence.run(start)
+        status, schedule = sequence.run(start, is_near=near is not None)
         return Solution(
             status=status,
             schedule=schedule,
@@ -120,8 +119,13 @@ class _Sequence:
     _cheapest: float = np.inf
     _best: Schedule | None = None  # cheapest strictly feasible schedule simulated
 
-    def run(self, start: Schedule) -> tuple[Status, Schedule | None]:
-        """Go on until a simulated schedule confirms its program."""
+    def run(self, start: Schedule, is_near: bool) -> tuple[Status, Schedule | None]:
+        """Go on until a simulated schedule confirms its program.
+
+        Args:
+            start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
+            is_near: it is thought to be near the optimum, so that limits near which it comes get rows at once.
+        """
         if not self._reachable():
             return Status.INFEASIBLE, None
         p_gen = start.at(self.instance.grid[self.points])
@@ -140,7 +144,10 @@ class _Sequence:
             if excess <= ACCEPTED and self._confirmed(trajectory, schedule):
                 return Status.OPTIMAL, schedule
             model = linearise_along(self.case, trajectory, self.points)
-            found, prediction = self._next(model, np.inf if number == 0 else max(OPEN, REFINEMENT * excess))
+            if is_near:
+                self.limits |= self._near(trajectory.omega)
+            enough = np.inf if number == 0 and not is_near else max(OPEN, REFINEMENT * excess)
+            found, prediction = self._next(model, enough)
             if prediction is None:
                 return found, self._best
             infeasible = infeasible + 1 if found == Status.INFEASIBLE else 0

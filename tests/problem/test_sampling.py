@@ -256,16 +256,15 @@ def test_every_shipped_case_has_its_sizes():
 
 @pytest.mark.parametrize("name", SIZES)
 def test_committed_manifest_holds_the_checksums(name):
-    """SHA-256 of each committed file, computed here; nothing else lies there but scenarios."""
+    """SHA-256 of each committed file, computed here; no instance is missing and no other lies there."""
     committed = SHIPPED_CASES / name
     manifest = load_manifest(committed)
     assert manifest is not None
-    found = {p.relative_to(committed).as_posix() for p in committed.rglob("*.json")}
-    files = {name for name in found if not name.startswith("scenarios/")} - {"MANIFEST.json"}
-    assert files == manifest.files.keys()
-    assert len(files) == sum(SIZES[name]) + 2
-    for name, digest in manifest.files.items():
-        assert hashlib.sha256((committed / name).read_bytes()).hexdigest() == digest, name
+    files = {f"instances/{p.name}" for p in (committed / "instances").iterdir()}
+    assert files | {"case.json", "split.json"} == manifest.files.keys()
+    assert len(files) == sum(SIZES[name])
+    for file, digest in manifest.files.items():
+        assert hashlib.sha256((committed / file).read_bytes()).hexdigest() == digest, file
 
 
 @pytest.mark.parametrize("name", [name for name in SIZES if name != "9bus"])

@@ -124,7 +124,7 @@ class _Sequence:
 
         Args:
             start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
-            is_near: it is thought to be near the optimum, so that limits near which it comes get rows at once.
+            is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
         """
         if not self._reachable():
             return Status.INFEASIBLE, None

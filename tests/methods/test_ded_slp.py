@@ -90,13 +90,15 @@ def test_no_schedule_on_the_knots_nearby_is_cheaper(case):
     assert feasible
 
 
-def test_starts_from_an_earlier_solution(case):
-    """It takes one program to confirm its own answer, and the optimum is the same from elsewhere."""
+def test_starts_from_an_earlier_solution(case, monkeypatch):
+    """It confirms its own answer with one program or two, never more than from afar; the optimum is the same."""
+    programs, solve = [], KnotProgram.solve
+    monkeypatch.setattr(KnotProgram, "solve", lambda *args: programs.append(args) or solve(*args))
     instance, solver = short(case, 0), prepare(case, "TO", Settings())
-    cold = solver(instance)
+    cold, count = solver(instance), len(programs)
     warm = solver.solve(instance, last=cold)
     assert warm.status == Status.OPTIMAL
-    assert warm.iterations <= cold.iterations
+    assert len(programs) - count <= min(count, 2)
     found = [score(case, instance, s.schedule, "TO").objective for s in (cold, warm)]
     assert found[1] == pytest.approx(found[0], rel=1e-5)
 

@@ -17,12 +17,12 @@ KNOWN = ", ".join(METHODS)
 MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 
 
-#: The order of the list of commands: those of the road, then what judges results; others come last.
+#: The order of the list of commands: those of the road, then what judges results, then the closed loop.
 ORDER = (
-    *("instances", "train-ko", "solve", "train-dpc", "bench", "report"),
-    *("score", "compare", "certify", "rollouts", "scenarios"),
+    *("cases", "instances", "train-ko", "solve", "train-dpc", "bench", "report"),
+    *("score", "compare", "certify", "rollouts", "scenarios", "online"),
 )
-#: Under the list of commands, which must fit a terminal of 24 lines and 80 columns.
+#: Under the list of commands, which must fit a terminal 80 columns wide.
 ROAD = (
     "The road: instances, train-ko, solve, train-dpc, solve, bench, report; `make report` walks it. "
     "`ded-bench COMMAND --help` lists the options of one."

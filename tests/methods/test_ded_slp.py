@@ -91,7 +91,7 @@ def test_no_schedule_on_the_knots_nearby_is_cheaper(case):
 
 
 def test_starts_from_an_earlier_solution(case, monkeypatch):
-    """It confirms its own answer with one program or two, never more than from afar; the optimum is the same."""
+    """It confirms its own answer with one program or two, and no more than a cold start takes."""
     programs, solve = [], KnotProgram.solve
     monkeypatch.setattr(KnotProgram, "solve", lambda *args: programs.append(args) or solve(*args))
     instance, solver = short(case, 0), prepare(case, "TO", Settings())

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from ded_bench.files.errors import InputError
     from ded_bench.methods.solution import Settings, Solution, Solver
+    from ded_bench.problem.ac_case import AcCase
     from ded_bench.problem.benchmark import SplitName
     from ded_bench.problem.case import Case
     from ded_bench.problem.instance import Instance
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ded_bench.truth.simulate import SimulationError, Trajectory
 
 __all__ = [
+    "AcCase",
     "Case",
     "InputError",
     "Instance",
@@ -43,6 +45,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "AcCase": "ded_bench.problem.ac_case",
     "Case": "ded_bench.problem.case",
     "InputError": "ded_bench.files.errors",
     "Instance": "ded_bench.problem.instance",
@@ -123,28 +126,60 @@ def solve(
     return _prepared(own, method, regime, settings or Settings(search=search_folders(own)))(instance)
 
 
-def simulate(instance: Instance, schedule: Schedule, case: Case | None = None) -> Trajectory:
-    """Simulate a schedule on the true DAE; see `truth.simulate.simulate`.
+def simulate(
+    instance: Instance, schedule: Schedule, case: Case | None = None, truth: str | AcCase = "paper"
+) -> Trajectory:
+    """Simulate a schedule on a true DAE; see `truth.simulate.simulate` and `truth.ac_simulate.simulate_ac`.
+
+    Args:
+        instance: its loads and its initial state.
+        schedule: generator powers.
+        case: needed if the instance's case is not a shipped one.
+        truth: `paper`: the lossless network; `ac`: the full AC network, by the data of the shipped case;
+            or AC data of another one.
 
     Raises:
-        InputError: the schedule does not span the horizon, or the case is unknown.
+        InputError: the schedule does not span the horizon, the case or truth is unknown, or has no AC data.
         SimulationError: the system loses synchronism under this schedule.
     """
+    own = _case_of(instance, case)
+    if (data := _ac_data(own, truth)) is not None:
+        from ded_bench.truth.ac_simulate import simulate_ac
+
+        return simulate_ac(own, data, instance, schedule)
     from ded_bench.truth import simulate
 
-    return simulate.simulate(_case_of(instance, case), instance, schedule)
+    return simulate.simulate(own, instance, schedule)
 
 
-def score(instance: Instance, schedule: Schedule, regime: str, case: Case | None = None) -> Score:
+def score(
+    instance: Instance,
+    schedule: Schedule,
+    regime: str,
+    case: Case | None = None,
+    truth: str | AcCase = "paper",
+) -> Score:
     """Simulate a schedule and judge it: cost and violations; see `truth.score.score`.
 
+    Args:
+        instance: its loads and its initial state.
+        schedule: generator powers.
+        regime: one of the case's.
+        case: needed if the instance's case is not a shipped one.
+        truth: as for `simulate`.
+
     Raises:
-        InputError: unknown regime or case, or the schedule does not span the horizon.
+        InputError: unknown regime, or as for `simulate`.
         SimulationError: the system loses synchronism under this schedule.
     """
+    own = _case_of(instance, case)
+    if (data := _ac_data(own, truth)) is not None:
+        from ded_bench.truth.ac_simulate import score_ac
+
+        return score_ac(own, data, instance, schedule, regime)
     from ded_bench.truth import score
 
-    return score.score(_case_of(instance, case), instance, schedule, regime)
+    return score.score(own, instance, schedule, regime)
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:
@@ -156,6 +191,16 @@ def _case_of(instance: Instance, case: Case | None) -> Case:
     if not (SHIPPED_CASES / instance.case / "case.json").is_file():
         raise InputError(f"instance {instance.id}", "case", f"{instance.case!r} is no shipped case: give it")
     return _shipped(instance.case)
+
+
+def _ac_data(case: Case, truth: str | AcCase) -> AcCase | None:
+    """The AC data that a truth needs; None for the paper's."""
+    from ded_bench.problem.ac_case import AcCase, check_truth
+
+    if isinstance(truth, AcCase):
+        return truth
+    check_truth(truth)
+    return AcCase.of(case) if truth == "ac" else None
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,8 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.surrogates import default_results, search_folders
 from ded_bench.methods.solution import Settings
-from ded_bench.problem.benchmark import SPLITS, Selection, select_files, select_split
+from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
+from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -69,6 +71,7 @@ def _add_score(commands: Any) -> None:
     given.add_argument("--schedules", type=Path, metavar="DIR", help="[REGIME/]INSTANCE.csv[.gz] become rows")
     given.add_argument("--results", type=Path, metavar="DIR", help="compare its rows and kept schedules")
     p.add_argument("--update", action="store_true", help="write the new scores into the rows of --results")
+    p.add_argument("--truth", choices=TRUTHS, default="paper", help="network; ac with --results: ac.csv")
     p.add_argument("--name", help="what the rows of --schedules call your method")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
     chosen = p.add_mutually_exclusive_group()
@@ -132,6 +135,9 @@ def _solve(a: argparse.Namespace) -> int:
 def _score(a: argparse.Namespace) -> int:
     if a.update and not a.results:
         raise InputError("--update", "", "is only for --results")
+    if a.truth != "paper" and (a.schedules or a.update):
+        option = "--schedules" if a.schedules else "--update"
+        raise InputError("--truth", a.truth, f"is not for {option}, whose rows are of the paper's network")
     if a.results:
         return _score_results(a)
     if not a.regime:
@@ -141,6 +147,7 @@ def _score(a: argparse.Namespace) -> int:
 
 def _score_one(a: argparse.Namespace) -> int:
     """One schedule file, for one instance."""
+    from ded_bench.truth.ac_simulate import score_ac
     from ded_bench.truth.score import score
     from ded_bench.truth.simulate import SimulationError
 
@@ -151,7 +158,10 @@ def _score_one(a: argparse.Namespace) -> int:
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
     try:
-        verdict = score(case, instance, schedule, regime)
+        if a.truth == "ac":
+            verdict = score_ac(case, _ac_data(a, case), instance, schedule, regime)
+        else:
+            verdict = score(case, instance, schedule, regime)
     except SimulationError as error:
         print(f"ded-bench: {a.schedule}: {error}", file=sys.stderr)
         return 1
@@ -181,6 +191,8 @@ def _score_results(a: argparse.Namespace) -> int:
     def say(sentence: str) -> None:
         print(sentence, file=stream, flush=True)
 
+    if a.truth == "ac":
+        return _score_results_on_ac(a, case, instances, results, say)
     check = rescore(case, instances, results, a.workers, update=a.update, on_difference=say)
     if a.json:
         for row in check.rows:
@@ -194,6 +206,36 @@ def _score_results(a: argparse.Namespace) -> int:
     ]
     say(", ".join(parts))
     return 0 if a.update or not check.differences else 1
+
+
+def _score_results_on_ac(
+    a: argparse.Namespace,
+    case: Case,
+    instances: dict[str, Instance],
+    results: Results,
+    say: Callable[[str], None],
+) -> int:
+    """The schedules kept in a results folder, on the AC network."""
+    from ded_bench.run.ac_scoring import score_on_ac
+
+    table, rows = score_on_ac(case, _ac_data(a, case), instances, results, a.workers)
+    if a.json:
+        for row in rows:
+            print(json.dumps(dataclasses.asdict(row)), flush=True)
+    bad = [row for row in rows if row.objective is None]
+    before = [row for row in rows if results.rows[row.key].feasible]
+    after = sum(bool(row.feasible) for row in before)
+    say(f"{len(rows)} rows in {table}, {len(bad)} without a score")
+    say(f"{after} of the {len(before)} rows that are feasible on the paper's network are so on AC")
+    return 1 if bad else 0
+
+
+def _ac_data(a: argparse.Namespace, case: Case) -> AcCase:
+    """AC data of the folder of `--case`, else beside the instances, else of the shipped case."""
+    around = [path.resolve().parent.parent for path in a.instance or ()]
+    if not a.case and around and (around[0] / FILE).is_file():
+        return AcCase.load(around[0])
+    return AcCase.load(problem_folder(a.case or case.id, case))
 
 
 def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[str, Instance]]:

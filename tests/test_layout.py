@@ -15,7 +15,19 @@ import ded_bench
 from ded_bench.problem.case import SHIPPED_CASES, Case
 
 PACKAGE = Path(ded_bench.__file__).parent
-FLOORS = ("files", "problem", "truth", "koopman", "solvers", "methods", "run", "evaluate", "report", "cli")
+FLOORS = (
+    "files",
+    "problem",
+    "truth",
+    "koopman",
+    "solvers",
+    "methods",
+    "run",
+    "evaluate",
+    "online",
+    "report",
+    "cli",
+)
 MAX_LINES = 400
 MAX_FUNCTION, MAX_ARGUMENTS = 80, 9
 #: May take more: its keywords are what a certificate promises, each with the promise's default.

@@ -6,7 +6,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from ded_bench.cli import evaluation_commands, problem_commands, solve_commands, training_commands
+from ded_bench.cli import (
+    evaluation_commands,
+    online_commands,
+    problem_commands,
+    solve_commands,
+    training_commands,
+)
 from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser, ShowVersion
 from ded_bench.files.errors import InputError
 from ded_bench.run.pool import WorkersLostError
@@ -22,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action=ShowVersion, nargs=0, help="show the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for group in (problem_commands, solve_commands, training_commands, evaluation_commands):
+    for group in (problem_commands, solve_commands, training_commands, evaluation_commands, online_commands):
         group.add_commands(commands)
     return top
 

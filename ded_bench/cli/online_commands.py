@@ -1,0 +1,101 @@
+"""The command that operates scenarios: online."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ded_bench.cli.arguments import (
+    DEFAULT_CASE,
+    KNOWN,
+    MODEL_HELP,
+    command,
+    matching,
+    names,
+    positive,
+    positive_number,
+)
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.surrogates import default_results, search_folders
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.benchmark import problem_folder
+from ded_bench.problem.case import Case
+from ded_bench.problem.forecast import QUALITIES
+from ded_bench.problem.scenario import load_scenarios
+from ded_bench.problem.scenario_sampling import scenario_files, scenario_folder
+
+if TYPE_CHECKING:
+    from ded_bench.online.online_results import OnlineRow
+
+
+def add_commands(commands: Any) -> None:
+    """Declare this command and its options."""
+    p = command(commands, "online", "operate scenarios with a method's plans, one row each")
+    p.add_argument(
+        "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
+    )
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
+    p.add_argument("--case", default=DEFAULT_CASE)
+    chosen = p.add_mutually_exclusive_group()
+    chosen.add_argument("--scenarios", type=positive, metavar="N", help="only the first N of the case")
+    chosen.add_argument("--scenario", type=Path, nargs="+", metavar="FILE", help="instead of the case's")
+    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
+    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
+    p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans (1 s)")
+    p.add_argument("--latency", default="timing", metavar="L", help="timing (default), zero, or seconds")
+    p.add_argument("--forecast", choices=QUALITIES, default=QUALITIES[0])
+    p.add_argument(
+        "--state",
+        choices=("predicted", "present"),
+        default="predicted",
+        help="what plans start from: the state when they take effect, or the measured one",
+    )
+    p.add_argument("--cold", action="store_true", help="never start a method from its last plan")
+    p.add_argument("--time-limit", type=positive_number, metavar="S", help="per plan, of the clock (60 s)")
+    p.add_argument("--workers", type=positive, default=1)
+    p.add_argument("--out", type=Path, help="results folder")
+    p.set_defaults(run=_online)
+
+
+def _online(a: argparse.Namespace) -> int:
+    from ded_bench.methods.registry import get_method
+    from ded_bench.online.loop import LoopOptions
+    from ded_bench.online.online_results import OnlineResults
+    from ded_bench.online.operation import make_operations, operate
+    from ded_bench.online.planner import LIMIT_S
+
+    case = Case.load(a.case)
+    folder = a.out or default_results(case)
+    search = search_folders(case, folder)
+    files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
+    methods = [
+        (name, Settings(slug, a.model, a.policy, search=search))
+        for name in a.method
+        for slug in matching(a.settings, get_method(name).settings)
+    ]
+    if not methods:
+        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
+    operations = make_operations(
+        case,
+        load_scenarios(files, case),
+        methods,
+        a.regime or tuple(case.regimes),
+        LoopOptions(a.period, forecast=a.forecast, predict=a.state == "predicted", warm=not a.cold),
+        a.latency,
+        search,
+        a.time_limit or LIMIT_S,
+    )
+    rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row)
+    return 1 if any(row.objective is None for row in rows) else 0
+
+
+def _print_row(row: OnlineRow) -> None:
+    name = f"{row.scenario} {row.regime} {row.method} {row.settings} {row.latency_s:.3g} s:"
+    if row.objective is None or row.max_excess_hz is None:
+        print(f"{name} {row.error}", flush=True)
+        return
+    over = "no hindsight" if row.increase_percent is None else f"{row.increase_percent:.4f} % over hindsight"
+    excess = f"largest excess {1e3 * row.max_excess_hz:.4f} mHz"
+    print(f"{name} {over}, {excess}, {row.late} late, {row.failed} failed of {row.plans}", flush=True)

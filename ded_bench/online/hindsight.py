@@ -1,0 +1,63 @@
+"""Hindsight: the whole scenario optimised at once with true loads, to compare what plans cost with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ded_bench.methods import ded_radau
+from ded_bench.methods.ded_slp import SlpSolver
+from ded_bench.methods.solution import Settings, Solution
+from ded_bench.online.judgement import Judgement, judge_operation
+from ded_bench.problem.case import Case
+from ded_bench.problem.forecast import forecast
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.simulate import simulate
+
+#: Knots lie so many times as close as the case's: plans that are renewed again and again may bend anywhere.
+FINER = 4
+
+
+@dataclass(frozen=True)
+class Hindsight:
+    """The optimum of one scenario and regime."""
+
+    method: str
+    judgement: Judgement
+    schedule: Schedule
+
+
+def hindsight(case: Case, scenario: Scenario, regime: str) -> Hindsight:
+    """Optimise the whole scenario by sequential linear programs, or by collocation where they fail.
+
+    Raises:
+        RuntimeError: neither finds a schedule.
+        SimulationError: the system cannot follow it.
+    """
+    instance = whole_instance(case, scenario)
+    interval_s = case.sampling.horizon_s / (case.n_knots - 1) / FINER
+    solution: Solution = SlpSolver(case, regime, knot_interval_s=interval_s)(instance)
+    method = "ded-slp"
+    if solution.schedule is None:
+        solution, method = ded_radau.prepare(case, regime, Settings())(instance), "ded-radau"
+    if solution.schedule is None:
+        raise RuntimeError(f"no schedule for the whole of {scenario.id}: {solution.error}")
+    trajectory = simulate(case, instance, solution.schedule)
+    return Hindsight(method, judge_operation(case, scenario, trajectory, regime), solution.schedule)
+
+
+def whole_instance(case: Case, scenario: Scenario) -> Instance:
+    """A scenario as one instance, with its true loads."""
+    points = forecast(scenario, case, "perfect", 0.0, scenario.duration_s).points(0.0, scenario.duration_s)
+    return Instance(
+        schema_="ded-bench/instance/2",
+        id=scenario.id,
+        case=case.id,
+        seed=scenario.seed,
+        horizon_s=scenario.duration_s,
+        dt_s=scenario.dt_s,
+        cost=scenario.cost,
+        load=dict(zip(case.loads, points, strict=True)),
+        initial=scenario.initial,
+    )

@@ -1,0 +1,115 @@
+"""Methods in the loop: every plan is asked of a process of its own, which is killed if it takes too long."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import pickle
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ded_bench.methods.plugin import accept
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.run.pool import Children, NoAnswerError, WorkerDiedError
+from ded_bench.run.runner import GRACE_S
+from ded_bench.solvers.status import Status
+
+#: How long a method may take for one plan unless told otherwise, s of the clock.
+LIMIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A method's answer to one instance: a schedule, or why there is none."""
+
+    schedule: Schedule | None
+    late: bool = False  # it did not come in time
+    warm: bool = False  # the method started from its last plan
+    seconds: float = 0.0  # of the clock, with the way to the method's process and back
+    error: str = ""
+
+
+#: Asks for a plan; the second argument is the last one, on the time of the instance.
+Ask = Callable[[Instance, Schedule | None], Plan]
+
+
+@dataclass
+class Planner:
+    """Asks one method for plans. A method that raises or dies gives none; one that hangs is late."""
+
+    case: Case
+    regime: str
+    method: str
+    settings: Settings
+    limit_s: float = LIMIT_S
+    _ready: bool = False
+
+    def __call__(self, instance: Instance, last: Schedule | None = None) -> Plan:
+        """Ask for a plan; the process prepares the method first, if it has not done so yet."""
+        started = time.perf_counter()
+        job = self.case, self.method, self.regime, self.settings
+        if not self._ready:
+            prepared = _call(_prepare, job, self.limit_s + GRACE_S)
+            if not isinstance(prepared, bool):
+                return self._none(prepared, started)
+            self._ready = True
+        answer = _call(_solve, (*job, instance, last), self.limit_s)
+        if not isinstance(answer, tuple):
+            return self._none(answer, started)
+        solution, warm = answer
+        seconds = time.perf_counter() - started
+        return Plan(solution.schedule, warm=warm, seconds=seconds, error=solution.error)
+
+    def _none(self, error: object, started: float) -> Plan:
+        self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
+        late = isinstance(error, NoAnswerError)
+        return Plan(None, late, seconds=time.perf_counter() - started, error=str(error))
+
+
+def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:
+    """What a function answers in the other process, or the exception that came instead."""
+    answer = _children().call(pickle.dumps((function, arguments)), limit_s)
+    if not isinstance(answer, bytes):
+        return answer
+    try:
+        found: object = pickle.loads(answer)  # from our own child
+    except Exception as error:  # an exception class may want more than its message
+        return RuntimeError(f"the answer cannot be read: {error}")
+    return found
+
+
+@functools.cache
+def _children() -> Children:
+    children = Children()
+    atexit.register(children.close)
+    return children
+
+
+def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:
+    _prepared(case, method, regime, settings)
+    return True
+
+
+def _solve(
+    case: Case, method: str, regime: str, settings: Settings, instance: Instance, last: Schedule | None
+) -> tuple[Solution, bool]:
+    """Solve in this process, from the last plan if there is one and the method can; tells if it did."""
+    started = time.perf_counter()
+    solver = _prepared(case, method, regime, settings)
+    start = getattr(solver, "solve", None) if last is not None else None
+    answer = solver(instance) if start is None else start(instance, last=_as_solution(last))
+    return accept(answer, case, instance, time.perf_counter() - started), start is not None
+
+
+def _as_solution(schedule: Schedule | None) -> Solution:
+    return Solution(Status.FEASIBLE, schedule)
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+    return get_method(method).prepare(case, regime, settings)

@@ -1,6 +1,6 @@
 """The AC simulator against an independent solver: SUNDIALS IDA on the full DAE in polar voltages.
 
-Nothing here calls the suite's physics. Power balances are written at every network bus from the JSON of case
+The reference calls nothing of the suite's physics. Power balances are written at every network bus from the JSON of case
 and AC data, term by term, with line flows instead of an admittance matrix.
 """
 
@@ -11,13 +11,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.optimize import root
+from scipy.optimize import least_squares, root
 from sksundae.ida import IDA
 
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import SHIPPED_CASES, Array, Case
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.ac_network import AcNetwork
 from ded_bench.truth.ac_simulate import simulate_ac
+from ded_bench.truth.network import PowerFlowError
 
 HORIZON_S = 3.0
 AGREE = 1e-7  # rad/s
@@ -148,3 +151,36 @@ def test_ida_agrees(name: str, quiet_instance) -> None:
         for delta, _, theta, v in map(reference.split, theirs)
     ]
     assert np.abs(ours.p_slack - p_slack).max() <= 1e-6
+
+
+@pytest.mark.parametrize(("number", "exists"), [(0, False), (3, False), (4, True), (5, True)])
+def test_where_there_is_no_equilibrium_least_squares_finds_none(number: int, exists: bool) -> None:
+    """P_0 and the initial loads of some instances leave the AC network without any equilibrium."""
+    reference = Reference("two-area")
+    file = SHIPPED_CASES / "two-area" / "instances" / f"two-area-{number:04d}.json"
+    raw = json.loads(file.read_text())
+    p_gen = np.array([raw["initial"]["power"][bus] for bus in reference.names])
+    drawn = reference.drawn.copy()
+    for bus, load in raw["load"].items():
+        drawn[reference.ids.index(bus)] += -load["initial"] - drawn[reference.ids.index(bus)].real
+
+    def residual(z: Array) -> Array:
+        p, missing = reference.balances(
+            *np.split(z, [reference.n, reference.n + reference.n_bus]), drawn=drawn
+        )
+        return np.concatenate([p[:-1] - p_gen, missing])
+
+    random = np.random.default_rng(number)
+    spread = np.repeat([0.6, 0.2], [reference.n + reference.n_bus, reference.n_bus])
+    starts = [reference.nominal + k * random.uniform(-spread, spread) for k in (0.0, 0.5, 1.0)]
+    tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 300}
+    off = min(np.abs(least_squares(residual, start, **tight).fun).max() for start in starts)
+    instance, case = Instance.load_file(file)
+    network = AcNetwork(case, AcCase.of(case))
+    if exists:
+        assert off < 1e-10
+        assert network.initial_state(instance).theta.shape == (3,)
+    else:
+        assert off > 0.1
+        with pytest.raises(PowerFlowError):
+            network.initial_state(instance)

@@ -1,7 +1,7 @@
 """The AC simulator against an independent solver: SUNDIALS IDA on the full DAE in polar voltages.
 
-The reference calls nothing of the suite's physics. Power balances are written at every network bus from the JSON of case
-and AC data, term by term, with line flows instead of an admittance matrix.
+The reference calls nothing of the suite's physics: power balances are written at every network bus from the
+JSON of case and AC data, term by term, with line flows instead of an admittance matrix.
 """
 
 from __future__ import annotations

@@ -6,8 +6,10 @@ A function is named `module:function`, on the command line or by an entry point 
 * `solve(instance, regime)` or `solve(instance, regime, case)`, which answers with a `Schedule`, or
   with a `Solution` if it has more to say (status, iterations, times); or
 * `prepare(case, regime, settings)` - the first parameter is called `case` - which returns a function
-  from an instance to a `Schedule` or `Solution`, as our own methods do. Its module may offer
-  `SETTINGS`, slugs of settings in a mapping.
+  from an instance to a `Schedule` or `Solution`, as our own methods do, or an object with
+  `solve(instance, last=None)`. In the closed loop `last` is the plan in force as a `Solution` on the
+  time of the instance, to start from; elsewhere it is None. The module may offer `SETTINGS`, slugs of
+  settings in a mapping.
 
 Either module may offer `artifact(case, regime, settings) -> str`, a fingerprint of data that the
 answers depend on; that of the sources is added here.
@@ -50,6 +52,32 @@ _TARGET = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 
 
 @dataclass(frozen=True)
+class ForeignSolver:
+    """Someone's function from an instance to a schedule, whose answers are checked."""
+
+    case: Case
+    function: Callable[..., Any]
+
+    def __call__(self, instance: Instance) -> Solution:
+        """Solve one instance."""
+        return self._checked(instance)
+
+    def _checked(self, instance: Instance, **options: Any) -> Solution:
+        started = time.perf_counter()
+        answer = self.function(instance, **options)
+        return accept(answer, self.case, instance, time.perf_counter() - started)
+
+
+@dataclass(frozen=True)
+class ForeignWarmSolver(ForeignSolver):
+    """Someone's `solve(instance, last=None)`."""
+
+    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Solve one instance, starting from the plan in force."""
+        return self._checked(instance, last=last)
+
+
+@dataclass(frozen=True)
 class Foreign:
     """What the registry asks of a method's module, made from a function of another one."""
 
@@ -67,23 +95,17 @@ class Foreign:
         """Return the function that solves one instance and checks what comes back.
 
         Raises:
-            TypeError: a `prepare` returns something that cannot be called.
+            TypeError: a `prepare` returns something that can neither be called nor solve.
         """
-        if self._prepares:
-            inner = self.function(case, regime, settings)
-            if not callable(inner):
-                raise TypeError(f"{self.target} returned {_kind(inner)}, not a function")
-            call: Callable[[Instance], Any] = inner
-        else:
+        if not self._prepares:
             extra = {"case": case} if "case" in _parameters(self.function) else {}
-            call = functools.partial(_swapped, self.function, regime, extra)
-
-        def solve(instance: Instance) -> Solution:
-            started = time.perf_counter()
-            answer = call(instance)
-            return accept(answer, case, instance, time.perf_counter() - started)
-
-        return solve
+            return ForeignSolver(case, functools.partial(_swapped, self.function, regime, extra))
+        inner = self.function(case, regime, settings)
+        if callable(getattr(inner, "solve", None)):
+            return ForeignWarmSolver(case, inner.solve)
+        if not callable(inner):
+            raise TypeError(f"{self.target} returned {_kind(inner)}, not a function")
+        return ForeignSolver(case, inner)
 
     def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
         """One: what the module says of itself, then a hash of the sources of its package."""

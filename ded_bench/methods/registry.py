@@ -4,7 +4,9 @@ A method's module offers `prepare(case, regime, settings) -> (instance -> Soluti
 mapping from the slugs of its settings to keyword options. If it depends on a trained model or policy,
 it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy
 to be trained, its line here names the module whose `train` does it (see `training_record`), and
-`ded-bench train-dpc` knows it.
+`ded-bench train-dpc` knows it. What `prepare` returns may also have `solve(instance, last=None)`, which
+the closed loop calls: it may start from the plan in force, and where no schedule meets every limit it
+may answer `Infeasible` with the schedule that exceeds them least.
 """
 
 from __future__ import annotations

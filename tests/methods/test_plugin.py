@@ -41,6 +41,16 @@ def prepare(case, regime, settings):
         return Solution(Status.OPTIMAL, flat(instance, case.p_nominal), iterations=7, solve_s=0.25)
     return run
 
+class Warm:
+    def __init__(self, case):
+        self.case = case
+
+    def solve(self, instance, last=None):
+        return flat(instance, self.case.p_nominal) if last is None else last
+
+def warm(case, regime, settings):
+    return Warm(case)
+
 def hollow(case, regime, settings):
     return None
 
@@ -95,6 +105,17 @@ def test_a_prepare_is_one_with_its_settings(theirs, threebus, instance) -> None:
         answer(f"{theirs}:solve", threebus, instance, Settings("bold"))
     with pytest.raises(TypeError, match="returned nothing, not a function"):
         answer(f"{theirs}:hollow", threebus, instance)
+
+
+def test_an_object_that_solves_may_start_from_the_last_plan(theirs, threebus, instance) -> None:
+    solver = get_method(f"{theirs}:warm").prepare(threebus, "NO", Settings())
+    assert solver(instance).schedule.p.tolist() == [[0.6], [0.6]]
+    last = Schedule(np.array([0.0, 1.0]), np.array([[0.6], [0.7]]))
+    assert solver.solve(instance, last=Solution(Status.FEASIBLE, last)).schedule.p.tolist() == [[0.6], [0.7]]
+    short = Schedule(np.array([0.0, 0.5]), last.p)
+    wrong = solver.solve(instance, last=Solution(Status.FEASIBLE, short))
+    assert (wrong.status, wrong.schedule) == (Status.FAILED, None)
+    assert not hasattr(get_method(f"{theirs}:prepare").prepare(threebus, "NO", Settings()), "solve")
 
 
 def test_its_name_in_the_rows_leads_back_to_it(theirs) -> None:

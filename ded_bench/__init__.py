@@ -117,7 +117,7 @@ def solve(
     Raises:
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
-    from ded_bench.koopman.surrogates import search_folders
+    from ded_bench.koopman.reference_run import search_folders
     from ded_bench.methods.solution import Settings
 
     own = _case_of(instance, case)

@@ -21,7 +21,8 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
-from ded_bench.koopman.surrogates import default_results, search_folders
+from ded_bench.koopman.reference_run import search_folders
+from ded_bench.koopman.surrogates import default_results
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import Case
@@ -150,9 +151,12 @@ def _compare(a: argparse.Namespace) -> int:
 def _report(a: argparse.Namespace) -> int:
     with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
         from ded_bench.report.report import write_report
+        from ded_bench.run.objectives import OBJECTIVES, objectives_file, objectives_of
+        from ded_bench.run.results import Results
 
         case = Case.load(a.case)
         folder = a.results or default_results(case)
         written = write_report(case, folder, problem_folder(a.case, case), pool)
+        OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0

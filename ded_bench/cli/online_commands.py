@@ -17,7 +17,8 @@ from ded_bench.cli.arguments import (
     positive_number,
 )
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.surrogates import default_results, search_folders
+from ded_bench.koopman.reference_run import search_folders
+from ded_bench.koopman.surrogates import default_results
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case

@@ -21,7 +21,8 @@ from ded_bench.cli.arguments import (
     positive_number,
 )
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.surrogates import default_results, search_folders
+from ded_bench.koopman.reference_run import search_folders
+from ded_bench.koopman.surrogates import default_results
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
 from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split

@@ -22,7 +22,8 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
-from ded_bench.koopman.surrogates import TRAINED, default_results, search_folders
+from ded_bench.koopman.reference_run import search_folders
+from ded_bench.koopman.surrogates import TRAINED, default_results
 from ded_bench.methods.registry import trainable
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case

@@ -35,7 +35,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
     p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
-    p.add_argument("--repeats", type=positive, help="solves of each; default: by the method's speed")
+    p.add_argument("--repeats", type=positive, help="rounds; default: by the method's speed")
     p.add_argument("--force", action="store_true", help="time again what the table holds")
     p.add_argument("--results", type=Path, help="results folder")
     p.add_argument("--out", type=Path, help="table of the run; default: timing.csv in the results folder")
@@ -75,9 +75,11 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.timing import bench, choose_sample, runs_of, timing_summary
+    from ded_bench.evaluate.bench import bench, choose_sample, runs_of
+    from ded_bench.evaluate.timing import timing_summary
     from ded_bench.methods.registry import get_method, registered
     from ded_bench.run.results import Results
+    from ded_bench.truth.servable import servable
 
     chosen = select_split(a.case)
     case = chosen.case
@@ -96,7 +98,7 @@ def _bench(a: argparse.Namespace) -> int:
         choose_sample([instance for instance, _ in chosen.instances], a.instances),
         jobs,
         a.out or ResultsFolder(results.folder).timing,
-        warm_up=validation_instances(case, 1)[0],
+        warm_up=validation_instances(case, 1, servable=servable)[0],
         results=results,
         rounds=a.repeats,
         force=a.force,

@@ -65,6 +65,10 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the processes; calls that still run get no answer."""
         self._children.close()
         self._executor.shutdown(cancel_futures=True)
 

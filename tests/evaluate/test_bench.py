@@ -1,8 +1,9 @@
-"""Timing alone on the machine: what is measured, what is kept, and the file it is kept in."""
+"""Times of methods alone on the machine: what is measured, what is kept, and the table it is kept in."""
 
 from __future__ import annotations
 
 import dataclasses
+import gc
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -12,21 +13,19 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.evaluate import timing
-from ded_bench.evaluate.timing import (
-    MAX_ROUNDS,
-    TIMING,
+from ded_bench.evaluate import bench as bench_module
+from ded_bench.evaluate.bench import (
+    ROUNDS,
     Job,
-    TimingRow,
     bench,
     choose_sample,
     largest_difference,
-    read_timing,
     rounds_of,
     runs_of,
     timed,
-    timing_summary,
+    timed_turn,
 )
+from ded_bench.evaluate.timing import TIMING, TimingRow, read_timing, timing_summary
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import METHODS, Method
@@ -36,6 +35,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.pool import WorkerDiedError
 from ded_bench.run.results import Key, Results
 from ded_bench.solvers.status import Status
 
@@ -50,10 +50,7 @@ class Inline:
     def __init__(self, count: int) -> None:
         assert count == 1  # anything more would not be alone
 
-    def __enter__(self) -> Inline:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         pass
 
     def imap(self, calls, labels) -> Iterator[tuple[object, object]]:
@@ -90,11 +87,11 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     module.prepare = prepare
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
-    monkeypatch.setattr(timing, "Workers", Inline)
-    monkeypatch.setattr(timing, "code_of_method", lambda method, artifacts: "abc")
-    timing._prepared.cache_clear()
+    monkeypatch.setattr(bench_module, "Workers", Inline)
+    monkeypatch.setattr(bench_module, "code_of_method", lambda method, artifacts: "abc")
+    bench_module._prepared.cache_clear()
     yield module
-    timing._prepared.cache_clear()
+    bench_module._prepared.cache_clear()
 
 
 @pytest.fixture
@@ -114,14 +111,14 @@ def run(fake, threebus: Case, instances: list[Instance], tmp_path: Path) -> Call
     return bench_fake
 
 
-def test_the_first_call_of_a_process_is_on_another_instance(fake, run, instances) -> None:
-    fake.times = [100.0, 1.0, 2.0, 3.0]
-    rows = run([TO])
-    assert [row.round for row in rows] == [0, 1, 1, 1]
-    assert [row.instance for row in rows] == fake.calls
-    assert fake.calls == ["threebus-v0000", *(i.id for i in instances)]  # each once, the warm-up never again
+def test_every_turn_begins_with_another_instance(fake, run, instances) -> None:
+    fake.times = [100.0, 1.0, 2.0, 3.0, 50.0, 4.0, 5.0, 6.0]
+    rows = run([TO], rounds=2)
+    assert fake.calls == 2 * ["threebus-v0000", *(i.id for i in instances)]
+    assert [row.round for row in rows] == [0, 1, 1, 1, 2, 2, 2]  # only the process's first call is a row
+    assert [row.solve_s for row in rows] == [100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     summary = timing_summary(rows).iloc[0]
-    assert (summary["solve_s"], summary["first_solve_s"]) == (2.0, 100.0)
+    assert (summary["solve_s"], summary["first_solve_s"]) == (3.5, 100.0)
     with pytest.raises(InputError, match="warms up"):
         run([TO], warm_up=instances[0])
 
@@ -129,26 +126,56 @@ def test_the_first_call_of_a_process_is_on_another_instance(fake, run, instances
 def test_methods_take_turns_in_an_order_that_rotates(fake, run, instances) -> None:
     rows = [row for row in run(BOTH, rounds=2) if row.round]
     assert [row.round for row in rows] == [1] * 6 + [2] * 6
-    assert [row.instance for row in rows[::2]] == [i.id for i in instances] * 2
-    assert all(a.instance == b.instance for a, b in zip(rows[::2], rows[1::2], strict=True))
-    assert [row.regime for row in rows[::2]] == ["TO", "NO", "TO", "NO", "TO", "NO"]
+    assert [row.instance for row in rows] == [i.id for i in instances] * 4  # a turn: all instances in a row
+    assert [row.regime for row in rows[::3]] == ["NO", "TO", "TO", "NO"]
+
+
+def test_garbage_is_not_collected_while_a_call_is_timed(fake, threebus, instances) -> None:
+    seen = []
+    calls = [
+        timed(lambda instance: seen.append(gc.isenabled()) or Solution(Status.OPTIMAL), instances[0]),
+        timed(lambda instance: 1 / 0, instances[0]),
+    ]
+    assert seen == [False]
+    assert gc.isenabled()  # also after a failure
+    assert "ZeroDivisionError" in calls[1].solution.error
+
+
+def test_only_the_instance_that_kills_its_process_is_lost(fake, run, instances, monkeypatch) -> None:
+    class Fragile(Inline):
+        def imap(self, calls, labels) -> Iterator[tuple[object, object]]:
+            ((function, arguments),) = calls
+            if instances[1] in arguments[-1]:
+                yield None, WorkerDiedError("died")
+            else:
+                yield from super().imap([(function, arguments)], labels)
+
+    monkeypatch.setattr(bench_module, "Workers", Fragile)
+    rows = run([TO])
+    assert [row.error for row in rows] == ["", "", "died", ""]
+    assert [row.instance for row in rows[1:]] == [i.id for i in instances]
 
 
 def test_every_job_has_a_process_of_its_own(fake, run, monkeypatch) -> None:
     made: list[Inline] = []
+    closed: list[Inline] = []
 
     class Counted(Inline):
         def __init__(self, count: int) -> None:
             super().__init__(count)
             made.append(self)
 
-    monkeypatch.setattr(timing, "Workers", Counted)
+        def close(self) -> None:
+            closed.append(self)
+
+    monkeypatch.setattr(bench_module, "Workers", Counted)
     run(BOTH, rounds=2)
     assert len(made) == 2
+    assert set(map(id, closed)) == set(map(id, made))
 
 
 def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
-    fake.times = [9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    fake.times = [9.0, 1.0, 2.0, 3.0, 9.0, 4.0, 5.0, 6.0]
     summary = timing_summary(run([TO], rounds=2))
     (row,) = summary.to_dict("records")
     assert (row["solve_s_q1"], row["solve_s"], row["solve_s_q3"]) == (2.25, 3.5, 4.75)
@@ -161,30 +188,31 @@ def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "rounds"), [([5.0, 7.0], 2), ([20.0, 30.0], 1), ([0.1, 0.1], MAX_ROUNDS), ([0.0], MAX_ROUNDS)]
+    ("seconds", "rounds"), [([2.0, 3.0], 1), ([2.0, 2.9], 2), ([0.5, 0.6], 5), ([0.1, 0.1], 10), ([0.0], 10)]
 )
-def test_rounds_fill_the_budget(seconds: list[float], rounds: int) -> None:
+def test_rounds_come_to_five_seconds_or_to_the_most(seconds: list[float], rounds: int) -> None:
     assert rounds_of(dataclasses.replace(ROW, call_s=s) for s in seconds) == rounds
+    assert rounds_of([dataclasses.replace(ROW, error="failed")]) == 1
 
 
 def test_fast_methods_take_part_in_more_rounds(fake, run) -> None:
-    assert max(row.round for row in run([TO], rounds=None)) == MAX_ROUNDS
+    assert max(row.round for row in run([TO], rounds=None)) == ROUNDS[-1]
     fake.times = ["none"]
     assert max(row.round for row in run([TO], rounds=None, force=True)) == 1  # failures are not repeated
 
 
 def test_a_method_that_does_not_time_itself_is_timed(fake, threebus, instances) -> None:
     fake.times = [None]
-    solution, seconds = timed(threebus, "fake", "TO", Settings(), instances[0])
-    assert solution.solve_s == seconds
-    assert 0 < seconds < 1
+    _, call = timed_turn(threebus, "fake", "TO", Settings(), instances[0], instances[1:2])
+    assert call.solution.solve_s == call.seconds
+    assert 0 < call.seconds < 1
 
 
 def test_torch_uses_one_thread(fake, threebus, instances) -> None:
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        timed(threebus, "fake", "TO", Settings(), instances[0])
+        timed_turn(threebus, "fake", "TO", Settings(), instances[0], instances[1:2])
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
@@ -250,13 +278,13 @@ def test_a_run_of_some_methods_does_not_replace_one_of_more(fake, run, tmp_path:
 
 def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
     """What was timed is kept beside the table, which stays as it was until the run is complete."""
-    fake.times = [1.0] * 5 + [KeyboardInterrupt()]
+    fake.times = [1.0] * 6 + [KeyboardInterrupt()]  # in the second method's turn
     with pytest.raises(KeyboardInterrupt):
         run(BOTH)
     assert not (tmp_path / "timing.csv").exists()
-    assert len(read_timing(tmp_path / "timing.partial.csv")) == 4  # one instance by both, and their warm-ups
+    assert len(read_timing(tmp_path / "timing.partial.csv")) == 4  # the turn that was complete
     fake.times = [2.0]
-    timing._prepared.cache_clear()
+    bench_module._prepared.cache_clear()
     rows = run(BOTH)
     assert [row.solve_s for row in rows] == [1.0] * 4 + [2.0] * 4
     assert len({row.key for row in rows}) == len(rows) == 8

@@ -21,6 +21,7 @@ from ded_bench.problem.sampling import load_split, write_benchmark
 from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.paper import paper_lines
 from ded_bench.run.results import Results
+from tests.evaluate.test_summary import DED, with_gaps
 
 PYPROJECT = """\
 [project]
@@ -131,8 +132,8 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
         out,
     )
     assert command(*bench)[0] == 0
-    frame, timing = Results(out).frame(), timing_summary(read_timing(out / "timing.csv"))
-    lines = paper_lines(frame, timing, None)
+    frame, timing = with_gaps(Results(out).frame()), timing_summary(read_timing(out / "timing.csv"))
+    lines = paper_lines(frame, timing, None, DED)
     five = tabulate(TABLE_V, lines).set_index(["regime", "title"])
     six = tabulate(TABLE_VI, lines).set_index(["regime", "title"])
     for regime in ("NO", "TO"):
@@ -203,7 +204,9 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     assert (
         f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     )
-    assert "mine" in {line.title for line in paper_lines(Results(out).frame(), timing_summary([]), None)}
+    assert "mine" in {
+        line.title for line in paper_lines(with_gaps(Results(out).frame()), timing_summary([]), None, DED)
+    }
     for wrong in (
         score,  # no name
         (*score, "--name", "ded"),

@@ -50,6 +50,7 @@ from tests.damage import (
     damaged_json,
     damaged_table,
 )
+from tests.evaluate.test_summary import with_gaps
 
 #: Damaged files of each kind; together they are the 2000 and more that this module promises.
 COUNTS = {
@@ -263,7 +264,7 @@ def test_summaries_survive_what_results_may_hold(folder: Path) -> None:
             continue
         results = Results(folder)
         results.rows = rows
-        frame = results.frame()
+        frame = with_gaps(results.frame())
         for table in (summary, table_times, claims, worst):
             table(frame)
         made += 1

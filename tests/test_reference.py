@@ -29,7 +29,7 @@ def test_readme_repeats_the_tables(name: str) -> None:
 def test_the_tables_follow_from_the_rows(ninebus: Case) -> None:
     """The printed tables are those of results.csv and timing.csv, to the last printed digit."""
     sources = read_sources(ninebus, FOLDER, SHIPPED_CASES / ninebus.id)
-    lines = paper_lines(main_rows(sources.judged), sources.timing, sources.paper)
+    lines = paper_lines(main_rows(sources.judged), sources.timing, sources.paper, sources.reference.run)
     for name, columns in TABLES.items():
         printed = (FOLDER / "tables" / f"{name}.md").read_text(encoding="utf-8")
         assert to_markdown(tabulate(columns, lines), columns) == printed, name

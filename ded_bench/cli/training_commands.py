@@ -25,7 +25,7 @@ from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import TRAINED, default_results
 from ded_bench.methods.registry import trainable
-from ded_bench.problem.benchmark import select_split
+from ded_bench.problem.benchmark import problem_folder, select_split
 from ded_bench.problem.case import Case
 
 
@@ -156,6 +156,7 @@ def _check_writable(out: Path) -> None:
 
 def _rollouts(a: argparse.Namespace) -> int:
     from ded_bench.evaluate.ablation import rollout_errors
+    from ded_bench.evaluate.reference import reference_objectives
     from ded_bench.koopman.surrogates import MODELS, find_model
     from ded_bench.run.results import Results
 
@@ -169,6 +170,8 @@ def _rollouts(a: argparse.Namespace) -> int:
         except InputError as error:
             print(f"ded-bench: left out: {error}", file=sys.stderr)
     instances = [instance for instance, _ in chosen.instances]
-    table = rollout_errors(case, Results(folder), instances, models)
+    results = Results(folder)
+    reference = reference_objectives(case.id, results.frame(), problem_folder(a.case, case))
+    table = rollout_errors(case, results, instances, models, reference)
     print(table.to_string(index=False, float_format="{:.3g}".format))
     return 0

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ded_bench.evaluate.reference import Reference
 from ded_bench.evaluate.summary import (
     GROUP,
-    REFERENCE,
     START,
     STUDY,
+    gaps,
     is_study,
     summary,
     title,
@@ -33,8 +34,8 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.run.results import Key, Results
 
-#: Beside the models: their errors under the schedules of full DED.
-ROLLOUTS = "ded.errors.csv"
+#: Full DED from its cold start, which other starting points are compared with.
+STARTED = ("ded", "default")
 #: What short trainings are measured against: full DED is not solved on validation instances.
 ABLATION_REFERENCE = ("ded-ko-knots", "default")
 #: Optima whose objectives differ by less are the same; relative. IPOPT's tolerance leaves 1e-8.
@@ -77,7 +78,10 @@ def ablation_table(frame: pd.DataFrame, folder: Path) -> pd.DataFrame:
 
     Judged on the rows of validation instances alone; gaps are to ABLATION_REFERENCE there.
     """
-    overview = summary(validation_rows(frame), ABLATION_REFERENCE)
+    chosen = validation_rows(frame)
+    method, settings = ABLATION_REFERENCE
+    against = chosen[(chosen["method"] == method) & (chosen["settings"] == settings)]
+    overview = summary(gaps(chosen, against.set_index(["instance", "regime"])["objective"]))
     rows = []
     for row in overview[overview["settings"].map(is_study).astype(bool)].to_dict("records"):
         name, model = split_slug(str(row["settings"]))
@@ -94,8 +98,8 @@ def starts_table(frame: pd.DataFrame) -> pd.DataFrame:
 
     Differences are of the solver's objectives, which the scorer's errors do not blur.
     """
-    rows = frame[frame["method"] == REFERENCE[0]].dropna(subset=["solver_objective"])
-    cold = rows[rows["settings"] == REFERENCE[1]]
+    rows = frame[frame["method"] == STARTED[0]].dropna(subset=["solver_objective"])
+    cold = rows[rows["settings"] == STARTED[1]]
     table = []
     others = rows[rows["settings"].str.startswith(START)]
     for (regime, settings), group in others.groupby(["regime", "settings"], sort=False):
@@ -129,28 +133,36 @@ FACTS = ("seconds", "epochs", "steps", "instances", "parameters")
 
 
 def rollout_errors(
-    case: Case, results: Results, instances: Sequence[Instance], models: Sequence[Koopman]
+    case: Case,
+    results: Results,
+    instances: Sequence[Instance],
+    models: Sequence[Koopman],
+    reference: Reference,
 ) -> pd.DataFrame:
-    """Errors of models over the whole horizon under the schedules of full DED (see `fit.rollout_table`).
+    """Errors of models over the whole horizon under the reference's schedules (see `identify.rollout_table`).
+
+    The table is written beside the models, under the reference's name.
 
     Args:
-        instances: those whose DED schedules in the results folder are used.
+        instances: those whose reference schedules in the results folder are used.
 
     Raises:
-        InputError: there is no schedule of full DED, or one cannot be read.
+        InputError: there is no schedule of the reference, or one cannot be read.
     """
     parts = []
     for regime in case.regimes:
-        keys = {i.id: Key(i.id, regime, *REFERENCE) for i in instances}
+        keys = {i.id: Key(i.id, regime, *reference.run) for i in instances}
         there = [i for i in instances if results.schedule_path(keys[i.id]).is_file()]
         if there:
             schedules = [results.schedule(keys[i.id], case, i) for i in there]
-            data = trajectories(case, there, schedules, [f"DED, {regime}"] * len(there))
+            data = trajectories(case, there, schedules, [f"{reference.title}, {regime}"] * len(there))
             parts.append(rollout_table(case, models, data))
     if not parts:
-        raise InputError(results.folder, "schedules", "holds none of full DED; run `ded-bench solve` first")
+        raise InputError(
+            results.folder, "schedules", f"holds none of {reference.title}; run `ded-bench solve` first"
+        )
     table = pd.concat(parts, ignore_index=True)
-    write_atomically(results.folder / "koopman" / ROLLOUTS, table.to_csv(index=False))
+    write_atomically(results.paths.model_errors(reference.method), table.to_csv(index=False))
     return table
 
 

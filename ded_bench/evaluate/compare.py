@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from ded_bench.evaluate.reference import reference_objectives
 from ded_bench.evaluate.summary import GROUP, gaps, groups, table, title
 from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.errors import InputError
@@ -148,7 +149,7 @@ def _distance(x: object, y: object, relative: bool) -> float:
 def _summary(a: Path, b: Path) -> pd.DataFrame:
     """Mean gap and time per method over the common rows that have one in both folders."""
     names = list(Key._fields)
-    frames = [gaps(Results(folder).frame()).set_index(names, drop=False) for folder in (a, b)]
+    frames = [_with_gaps(Results(folder).frame()).set_index(names, drop=False) for folder in (a, b)]
     common = frames[0].index.intersection(frames[1].index, sort=False)
     x, y = (frame.loc[common] for frame in frames)
     timings = []
@@ -176,6 +177,15 @@ def _summary(a: Path, b: Path) -> pd.DataFrame:
             }
         )
     return table(rows, SUMMARY_COLUMNS)
+
+
+def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
+    """Rows with their gaps, each case's to its own reference."""
+    parts = [
+        gaps(rows, reference_objectives(str(case), rows).objectives)
+        for case, rows in frame.groupby("case", sort=False)
+    ]
+    return pd.concat(parts) if parts else gaps(frame, pd.Series(dtype=float))
 
 
 def name_of(key: Key) -> str:

@@ -18,8 +18,6 @@ from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
 from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU
 
-#: Every gap is measured against this method and these settings.
-REFERENCE = ("ded", "default")
 GROUP = ["regime", "method", "settings"]
 HEAD = [*GROUP, "title"]
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
@@ -33,6 +31,10 @@ START = "start-"
 #: Shift of the shifted geometric mean, s: times far below it count as equal.
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
+#: What each of them is called.
+LIMITS = dict(zip(VIOLATIONS, ("frequency", "ramp", "bounds", "initial power"), strict=True))
+#: Gaps up to this are rounding, %: none of them is among the worst.
+SMALLEST_GAP = 1e-3
 #: The scorer's limits on each of them for `feasible` (see `truth.score`).
 FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
 
@@ -82,19 +84,17 @@ def coverage(overall: pd.DataFrame, overview: pd.DataFrame) -> pd.DataFrame:
     return more.reset_index(drop=True)
 
 
-def gaps(frame: pd.DataFrame, reference: tuple[str, str] = REFERENCE) -> pd.DataFrame:
+def gaps(frame: pd.DataFrame, objectives: pd.Series[float]) -> pd.DataFrame:
     """Signed gap of every row to a reference, both re-simulated.
 
     Args:
-        reference: its method and settings; DED for everything but ablations.
+        objectives: the reference's, by (instance, regime); see `evaluate.reference`.
 
     Returns:
         The frame with two more columns: `reference`, the reference's objective on the same instance and
         regime, and `gap_percent` = 100 (J / J_ref - 1); missing where either has no score, or where
         J_ref is not positive.
     """
-    is_reference = (frame["method"] == reference[0]) & (frame["settings"] == reference[1])
-    objectives = frame.loc[is_reference].set_index(["instance", "regime"])["objective"]
     wanted = pd.MultiIndex.from_frame(frame[["instance", "regime"]])
     ours = objectives.reindex(wanted).to_numpy(dtype=float) if len(frame) else np.zeros(0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -125,18 +125,18 @@ def natural(text: str) -> tuple[tuple[str, int], ...]:
     )
 
 
-def summary(frame: pd.DataFrame, reference: tuple[str, str] = REFERENCE) -> pd.DataFrame:
-    """Gaps, violations and rates per (regime, method, settings).
+def summary(frame: pd.DataFrame) -> pd.DataFrame:
+    """Gaps, violations and rates per (regime, method, settings), of rows with their gaps.
 
     `n` rows have a gap, `failures` have no schedule or no score, `unpaired` have a score but no reference
-    to compare with (DED, unless given). `success_rate` is what solvers claim, `correct_rate` and
+    to compare with. `success_rate` is what solvers claim, `correct_rate` and
     `strict_rate` what the scorer found (`feasible`, `feasible_strict`); all three are shares of all rows.
     """
     rows = [
         dict(zip(HEAD, (regime, method, settings, title(method, settings)), strict=True)) | statistics(group)
-        for regime, method, settings, group in groups(gaps(frame, reference))
+        for regime, method, settings, group in groups(frame)
     ]
-    return table(rows, [*HEAD, *statistics(gaps(frame[:0]))])
+    return table(rows, [*HEAD, *statistics(frame[:0])])
 
 
 def statistics(group: pd.DataFrame) -> dict[str, object]:
@@ -207,24 +207,24 @@ def claims(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def worst(frame: pd.DataFrame, count: int = 3) -> pd.DataFrame:
-    """The worst instances of each method: largest gaps, and largest violations.
+    """The worst instances of each method: largest gaps, and largest violations, of rows with their gaps.
 
-    `excess` is the largest violation in units of the scorer's tolerance: above 1 is infeasible.
-    Rows that break no limit at all are not listed among the violations.
+    `excess` is the largest violation in units of the scorer's tolerance, `broken` the limit that it breaks.
+    Rows within tolerance are not listed among the violations, nor gaps below zero or below SMALLEST_GAP.
     """
-    scored = gaps(frame).dropna(subset=["objective"])
-    scored = scored.assign(excess=excess(scored))
+    scored = frame.dropna(subset=["objective"])
+    scored = scored.assign(excess=excess(scored), broken=broken(scored))
     rows = []
     for regime, method, settings, group in groups(scored):
-        by_gap = group.dropna(subset=["gap_percent"]) if (method, settings) != REFERENCE else group[:0]
-        by_violation = group[group["excess"] > 0]
+        by_gap = group[group["gap_percent"] > SMALLEST_GAP]
+        by_violation = group[group["excess"] > 1]
         for reason, part, column in (
             ("gap", by_gap, "gap_percent"),
             ("violation", by_violation, "excess"),
         ):
             ranked = part.sort_values([column, "instance"], ascending=[False, True])
             for _, row in ranked.head(count).iterrows():
-                kept = {name: row[name] for name in ("instance", "gap_percent", *VIOLATIONS, "excess")}
+                kept = {name: row[name] for name in ("instance", "gap_percent", *EXCESSES)}
                 head = {"regime": regime, "method": method, "settings": settings, "worst_by": reason}
                 rows.append(head | {"title": title(method, settings)} | kept)
     return table(rows, WORST_COLUMNS)
@@ -234,6 +234,13 @@ def excess(frame: pd.DataFrame) -> Array:
     """Largest violation of each row in units of the scorer's tolerance, shape (n_rows,)."""
     scaled = [frame[name].to_numpy(dtype=float) / limit for name, limit in FEASIBLE.items()]
     return np.max(scaled, axis=0) if len(frame) else np.zeros(0)
+
+
+def broken(frame: pd.DataFrame) -> list[str]:
+    """Which limit each row breaks most, measured in the scorer's tolerances; empty if it is within all."""
+    scaled = {name: frame[name].to_numpy(dtype=float) / limit for name, limit in FEASIBLE.items()}
+    largest = [max(scaled, key=lambda name: scaled[name][i]) for i in range(len(frame))]
+    return [LIMITS[name] if scaled[name][i] > 1 else "" for i, name in enumerate(largest)]
 
 
 def performance_profile(frame: pd.DataFrame, column: str) -> pd.DataFrame:
@@ -284,7 +291,7 @@ def timed_rows(frame: pd.DataFrame, calls: pd.DataFrame) -> pd.DataFrame:
 
 
 def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:
-    """Mean gap against time per schedule: one point per (regime, method, settings).
+    """Mean gap against time per schedule, of rows with their gaps: one point per (regime, method, settings).
 
     `seconds` is the median of the timing table where it has the method (`alone` is true), else that
     of the results table, taken under parallel load.
@@ -346,4 +353,5 @@ CLAIM_COLUMNS = [
     *HEAD,
     *("status", "meaning", "rows", "feasible", "feasible_strict", "infeasible", "not_scored"),
 ]
-WORST_COLUMNS = [*HEAD, "worst_by", "instance", "gap_percent", *VIOLATIONS, "excess"]
+EXCESSES = (*VIOLATIONS, "excess", "broken")
+WORST_COLUMNS = [*HEAD, "worst_by", "instance", "gap_percent", *EXCESSES]

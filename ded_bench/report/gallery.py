@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from ded_bench.evaluate.ablation import main_rows
 from ded_bench.evaluate.summary import (
     GROUP,
-    REFERENCE,
     STUDY,
     groups,
     performance_profile,
@@ -88,21 +87,27 @@ def paint(
     save_figure(figure(*arguments), stem, formats, dpi)
 
 
-def draw(sources: Sources, pool: Workers | None = None) -> Gallery:
+def draw(
+    sources: Sources,
+    pool: Workers | None = None,
+    more: Sequence[Callable[[Gallery], Iterator[Call]]] = (),
+) -> Gallery:
     """Draw every figure that there is data for into `<results>/figures`.
 
     Args:
+        more: what yields further calls (see `sections.Section`).
         pool: processes that draw; this one does, if there are none.
     """
     gallery = Gallery(sources)
     frame = sources.judged[sources.judged["regime"].isin(list(sources.case.regimes))]
-    chosen = plan(frame, gallery.has, gallery.load_change)
+    chosen = plan(frame, sources.reference.run, gallery.has, gallery.load_change)
     before = (
         _simulations(gallery, chosen),
         _draw_training(gallery),
         _draw_problem(gallery),
         _draw_tradeoff(gallery, frame),
         _draw_eigenvalues(gallery),
+        *(calls(gallery) for calls in more),
     )
     for answer in _answers(pool, itertools.chain(*before)):
         if isinstance(answer, dict):
@@ -250,18 +255,20 @@ def _draw_models(gallery: Gallery) -> Iterator[Call]:
 
 
 def _draw_worst(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
+    reference = gallery.sources.reference
     for (regime, method, settings), pairs in chosen.worst.items():
-        is_reference = (method, settings) == REFERENCE
+        is_reference = (method, settings) == reference.run
         columns = []
         for key, reason in pairs:
             if key in gallery.trajectories:
-                compared = [] if is_reference else _shown(gallery, [Key(key.instance, regime, *REFERENCE)])
+                other = Key(key.instance, regime, *reference.run)
+                compared = [] if is_reference else _shown(gallery, [other])
                 shown = Shown(method, settings, gallery.trajectories[key])
                 columns.append(Worst(reason, shown, compared[0] if compared else None))
         if columns:
             heading = plain(f"{title(method, settings)}, {regime}")
             what = "violations" if is_reference else "gaps"
-            dashed = "" if is_reference else f"dashed: {title(*REFERENCE)}; "
+            dashed = "" if is_reference else f"dashed: {reference.title}; "
             caption = (
                 f"{title(method, settings)}, {regime}: the instances with the largest {what} among those "
                 f"whose schedules are in the folder; {dashed}dotted: bounds."
@@ -274,13 +281,14 @@ def _draw_worst(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
 def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame) -> Iterator[Call]:
     frame = main_rows(frame)
     points = tradeoff(frame, gallery.sources.timing)
+    reference = gallery.sources.reference.title
     if points["gap_percent"].notna().any():
         caption = (
-            f"Mean gap to {title(*REFERENCE)} against time per schedule; words name settings other than the "
+            f"Mean gap to {reference} against time per schedule; words name settings other than the "
             "default. Hollow: some schedules are infeasible; * timed under parallel load, not by "
             "`ded-bench bench`. The vertical scale is linear within ±0.01 %."
         )
-        yield gallery.add("tradeoff", "tradeoff", caption, summaries.tradeoff_figure, points)
+        yield gallery.add("tradeoff", "tradeoff", caption, summaries.tradeoff_figure, points, reference)
     usual = frame[frame["settings"] == "default"]
     times = performance_profile(timed_rows(usual, gallery.sources.calls), "solve_s")
     objectives = performance_profile(usual, "objective")

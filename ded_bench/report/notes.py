@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pandas as pd
 
-from ded_bench.evaluate.summary import REFERENCE, groups, title
+from ded_bench.evaluate.summary import groups, title
 from ded_bench.report.sources import Sources
 from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 
@@ -45,7 +45,7 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
     versions = sorted(set(everything["problems_version"]))
     if not len(everything):
         notes.append(
-            f"No rows yet: `ded-bench solve --case {case.id} --method {REFERENCE[0]} "
+            f"No rows yet: `ded-bench solve --case {case.id} --method {sources.reference.method} "
             f"--regime {','.join(case.regimes)}` makes some."
         )
     if len(versions) > 1:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench.evaluate.ablation import (
-    ROLLOUTS,
     SAME,
+    STARTED,
     ablation_table,
     main_rows,
     model_table,
@@ -18,7 +18,6 @@ from ded_bench.evaluate.ablation import (
 )
 from ded_bench.evaluate.certificate import Certificate
 from ded_bench.evaluate.summary import (
-    REFERENCE,
     TIME_SHIFT_S,
     claims,
     coverage,
@@ -30,6 +29,7 @@ from ded_bench.evaluate.summary import (
     worst,
 )
 from ded_bench.files.strict import write_atomically
+from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import (
     ABLATION,
@@ -67,6 +67,7 @@ from ded_bench.report.page import (
 from ded_bench.report.paper import Line, paper_lines
 from ded_bench.report.provenance import provenance, provenance_notes
 from ded_bench.report.render import to_latex, to_markdown
+from ded_bench.report.sections import SECTIONS
 from ded_bench.report.sources import Sources, read_sources
 from ded_bench.run.environment import environment, now
 from ded_bench.run.pool import Workers
@@ -89,9 +90,9 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
         InputError: a table of the folder is there, but wrong.
     """
     sources = read_sources(case, folder, problems)
-    lines = paper_lines(main_rows(sources.judged), sources.timing, sources.paper)
+    lines = paper_lines(main_rows(sources.judged), sources.timing, sources.paper, sources.reference.run)
     frames = _frames(sources, lines)
-    gallery = draw(sources, pool)
+    gallery = draw(sources, pool, [section.draw for section in SECTIONS])
     captions = _captions(sources)
     files = _write_tables(sources.results.folder / "tables", frames, captions)
     notes = [
@@ -105,6 +106,7 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
         *_results(frames, captions, gallery),
         *_details(sources, frames, gallery),
         *_training(sources, frames, gallery),
+        *(block for section in SECTIONS for block in section.blocks(gallery)),
         *_closing(sources.rows, frames["provenance"], gallery),
     ]
     write_atomically(folder / "report.md", render_markdown(blocks))
@@ -233,7 +235,7 @@ def _details(sources: Sources, frames: dict[str, pd.DataFrame], gallery: Gallery
     rows_from = rows_caption(sources.judged, sources.rows)
     blocks: list[Block] = [
         Heading("Each method in detail"),
-        Table(frames["summary"], GAPS, f"Gap to {title(*REFERENCE)}, % ({rows_from})"),
+        Table(frames["summary"], GAPS, f"Gap to {sources.reference.title}, % ({rows_from})"),
         Table(frames["summary"], RATES, "Claimed and verified: shares of all rows"),
         Table(frames["claims"], CLAIMS, "Solver status against the scorer's verdict, rows"),
         Table(frames["summary"], VIOLATIONS, "Largest violation of each schedule"),
@@ -243,7 +245,7 @@ def _details(sources: Sources, frames: dict[str, pd.DataFrame], gallery: Gallery
         blocks.append(Table(frames["coverage"], COVERAGE, caption))
     if len(frames["starts"]):
         caption = (
-            f"{title(*REFERENCE)} from other starting points: the optimum that its solver claims against "
+            f"{title(*STARTED)} from other starting points: the optimum that its solver claims against "
             f"that from the cold start (the same: within {SAME:g} of its objective)"
         )
         blocks.append(Table(frames["starts"], STARTS, caption))
@@ -322,8 +324,8 @@ def _rollout_errors(rollouts: Mapping[str, pd.DataFrame]) -> list[Block]:
     for name, errors in rollouts.items():
         columns = tuple(Column(str(name), str(name)) for name in errors.columns)
         where = (
-            f"under the schedules of {title(*REFERENCE)}, test instances"
-            if ROLLOUTS.startswith(f"{name}.")
+            f"under the schedules of {title(name)}, test instances"
+            if name in METHODS
             else f"on simulated trajectories held out from the identification of `{name}`"
         )
         caption = f"Errors of rollouts over the whole horizon {where}"

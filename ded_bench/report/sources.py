@@ -10,7 +10,9 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench.evaluate.certificate import Certificate, read_certificates
-from ded_bench.evaluate.summary import judged_rows
+from ded_bench.evaluate.paper_numbers import Paper, read_paper
+from ded_bench.evaluate.reference import Reference, reference_objectives
+from ded_bench.evaluate.summary import gaps, judged_rows
 from ded_bench.evaluate.timing import TIMING, WARM_UP, read_timing, timing_summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
@@ -22,7 +24,6 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_manifest, load_split
-from ded_bench.report.paper import Paper, read_paper
 from ded_bench.run.results import Results
 
 
@@ -46,7 +47,9 @@ class Sources:
     """What a report of one case is made from.
 
     Attributes:
-        rows: all rows of the case in the results table; `judged`: those that the tables are about.
+        reference: what gaps are measured against.
+        rows: all rows of the case in the results table with their gaps; `judged`: those that the tables are
+            about.
         calls: the timing table; `timing`: one row per (regime, method, settings), see `timing_summary`.
         other_times: how many more the timing table has, of other cases.
         paper: the paper's numbers, if they are about this very case.
@@ -59,6 +62,7 @@ class Sources:
 
     case: Case
     results: Results
+    reference: Reference
     rows: pd.DataFrame
     judged: pd.DataFrame
     calls: pd.DataFrame
@@ -88,6 +92,8 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     results = Results(folder)
     rows = results.frame()
     rows = rows[rows["case"].isin([case.id, ""])].reset_index(drop=True)
+    reference = reference_objectives(case.id, rows, problems)
+    rows = gaps(rows, reference.objectives)
     calls = read_timing(paths.timing)
     timings = timing_summary(calls)
     timing = timings[timings["case"] == case.id]
@@ -96,6 +102,7 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     return Sources(
         case,
         results,
+        reference,
         rows,
         judged_rows(rows),
         TIMING.frame([call for call in calls if call.case == case.id and call.round != WARM_UP]),
@@ -129,7 +136,9 @@ def _benchmark(case: Case, problems: Path, notes: list[str]) -> tuple[dict[str, 
 
 
 def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
-    paper = read_paper(problems, case)
+    paper = read_paper(problems)
+    if paper and (unknown := sorted(set(paper.regimes) - set(case.regimes))):
+        raise InputError(problems / "paper.json", f"regimes.{unknown[0]}", f"is no regime of case {case.id}")
     if paper and paper.case_fingerprint != case.fingerprint:
         notes.append("The paper's numbers are about another version of the case and left out.")
         return None

@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from ded_bench.evaluate.ablation import (
-    ROLLOUTS,
     ablation_table,
     main_rows,
     model_table,
@@ -18,6 +17,7 @@ from ded_bench.evaluate.ablation import (
     starts_table,
     training_table,
 )
+from ded_bench.evaluate.reference import reference_objectives
 from ded_bench.evaluate.summary import judged_rows, summary
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
@@ -26,7 +26,7 @@ from ded_bench.methods.policy_file import policy_file
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.results import Key, Results
-from tests.evaluate.test_summary import frame_of, row
+from tests.evaluate.test_summary import frame_of, row, with_gaps
 
 
 @pytest.fixture
@@ -65,12 +65,12 @@ def test_the_papers_tables_keep_to_one_model_and_to_no_study(table: pd.DataFrame
 
 
 def test_models_stand_side_by_side(table: pd.DataFrame) -> None:
-    models = model_table(summary(judged_rows(table)))
+    models = model_table(summary(with_gaps(judged_rows(table))))
     assert models["model"].to_list() == ["koopman", "koopman-paper", "linear"]
     assert set(models["title"]) == {"DED-KO"}
     np.testing.assert_allclose(models["gap_percent_mean"], [1.0, 2.0, 3.0])
-    assert not len(model_table(summary(frame_of(row("a", "ded", 1.0)))))
-    assert not len(model_table(summary(frame_of())))
+    assert not len(model_table(summary(with_gaps(frame_of(row("a", "ded", 1.0))))))
+    assert not len(model_table(summary(with_gaps(frame_of()))))
 
 
 def test_ablation_says_what_differs_and_what_it_cost(table: pd.DataFrame, tmp_path: Path) -> None:
@@ -130,19 +130,20 @@ def test_training_table_names_files_that_cannot_be_read(tmp_path: Path) -> None:
     assert "broken.safetensors" in rows.loc["broken", "problem"]
 
 
-def test_rollout_errors_under_full_ded(threebus: Case, quiet_instance, tmp_path: Path) -> None:
+def test_rollout_errors_of_the_references_schedules(threebus: Case, quiet_instance, tmp_path: Path) -> None:
     """A quiet instance held at its equilibrium: the linear model at the nominal point is nearly exact."""
     results = Results(tmp_path)
     instance = quiet_instance(threebus, horizon_s=1.0)
+    reference = reference_objectives(threebus.id, results.frame())
     with pytest.raises(InputError, match="ded-bench solve"):
-        rollout_errors(threebus, results, [instance], [linear_model(threebus)])
+        rollout_errors(threebus, results, [instance], [linear_model(threebus)], reference)
     regime = next(iter(threebus.regimes))
     power = instance.p_initial(threebus)
     schedule = Schedule(np.array([0.0, 1.0]), np.array([power, power]))
-    schedule.write(results.schedule_path(Key(instance.id, regime, "ded", "default")), threebus.generators)
-    table = rollout_errors(threebus, results, [instance], [linear_model(threebus)])
-    assert table["schedules"].to_list() == [f"DED, {regime}"]
+    schedule.write(results.schedule_path(Key(instance.id, regime, *reference.run)), threebus.generators)
+    table = rollout_errors(threebus, results, [instance], [linear_model(threebus)], reference)
+    assert table["schedules"].to_list() == [f"{reference.title}, {regime}"]
     assert table["n"].to_list() == [1]
     assert table["max |Δω| (Hz)"].iloc[0] < 1e-3
-    written = pd.read_csv(tmp_path / "koopman" / ROLLOUTS)
+    written = pd.read_csv(tmp_path / "koopman" / "ded-radau.errors.csv")
     pd.testing.assert_frame_equal(written, table, check_exact=True)

@@ -15,7 +15,7 @@ from ded_bench.report.comparison import to_json, to_text
 from ded_bench.run.results import Results, Row
 
 
-def row(instance: str, method: str = "ded", objective: float | None = 100.0, **changes) -> Row:
+def row(instance: str, method: str = "ded-radau", objective: float | None = 100.0, **changes) -> Row:
     facts = {
         "instance": instance,
         "split": "test",
@@ -132,8 +132,9 @@ def test_other_problems_cannot_be_compared(folders) -> None:
     found = compare(*folders([dataclasses.replace(r, problems_version="1-def", objective=1.0) for r in BASE]))
     assert not found.same
     assert found.changes == ()
-    assert "4 common rows are of different problems, such as a TO ded: grid 1-abc in A, grid 1-def in B" in (
-        found.incomparable
+    assert (
+        "4 common rows are of different problems, such as a TO ded-radau: grid 1-abc in A, grid 1-def in B"
+        in (found.incomparable)
     )
     assert to_text(found).splitlines()[-1].startswith("not comparable: ")
 
@@ -148,17 +149,19 @@ def test_long_lists_are_cut_and_the_largest_change_comes_first(folders) -> None:
         compare(*folders([dataclasses.replace(r, objective=100.0 + k) for k, r in enumerate(base)], base))
     )
     lines = text[text.index("objective: 29 of 30") :].splitlines()
-    assert lines[1] == "  i29 TO ded: 100 → 129 (relative 0.22)"
+    assert lines[1] == "  i29 TO ded-radau: 100 → 129 (relative 0.22)"
     assert lines[11] == "  … and 19 more"
 
 
 def test_times_taken_alone_are_told_where_both_have_them(folders) -> None:
     a, b = folders(BASE)
     for folder, seconds in ((a, 2.0), (b, 5.0)):
-        timed = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", solve_s=seconds, case="grid")
+        timed = TimingRow(
+            "run", 1, "TO", "ded-radau", "default", "a", "Optimal", solve_s=seconds, case="grid"
+        )
         TIMING.write(folder / "timing.csv", [timed])
     summary = compare(a, b).summary.set_index("method")
-    assert summary.loc["ded", "time_ratio_alone"] == 2.5
+    assert summary.loc["ded-radau", "time_ratio_alone"] == 2.5
     assert summary["time_ratio_alone"].isna().to_list() == [False, True]
 
 

@@ -41,5 +41,5 @@ def test_trained_methods_are_shown_first_then_those_nearest_to_the_reference() -
         ("ed", None),
     ]
     rows = pd.DataFrame(cells, columns=["method", "gap_percent"]).assign(settings="default")
-    assert challengers(rows) == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]
-    assert challengers(rows[:1]) == []
+    assert challengers(rows, "ded") == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]
+    assert challengers(rows[:1], "ded") == []

@@ -30,6 +30,7 @@ from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results, Row
 from ded_bench.run.runner import scored_row
 from ded_bench.truth.score import score
+from tests.evaluate.test_summary import DED, with_gaps
 from tests.reading import Page
 from tests.report.conftest import TEST, TRAIN
 
@@ -262,16 +263,16 @@ def test_the_second_report_has_the_same_tables(
 
 def test_the_instance_shown_is_usual_and_its_loads_move(finished: Path) -> None:
     """Of five instances the two with gaps nearest to the median take part."""
-    frame = Results(finished).frame().query("split == 'test'")
+    frame = with_gaps(Results(finished).frame().query("split == 'test'"))
     wide = frame[frame["regime"] == "TO"].pivot_table(index="instance", columns="method", values="objective")
     gap = 100 * wide["ded-dpc-paper"] / wide["ded"]
     nearest = (gap - gap.median()).abs().sort_values().index.to_list()
     for wanted in nearest[:2]:
         moves = dict.fromkeys(gap.index, 0.0) | {wanted: 1.0, nearest[2]: 9.0}
-        chosen = plan(frame, lambda key: True, moves.__getitem__).representative["TO"]
+        chosen = plan(frame, DED, lambda key: True, moves.__getitem__).representative["TO"]
         assert [key.method for key in chosen] == ["ded", "ded-dpc-paper"]
         assert {key.instance for key in chosen} == {wanted}
-    without = plan(frame, lambda key: key.instance != nearest[0], lambda name: 0.0).representative["TO"]
+    without = plan(frame, DED, lambda key: key.instance != nearest[0], lambda name: 0.0).representative["TO"]
     assert without[0].instance in nearest[1:3]
 
 
@@ -281,8 +282,8 @@ def test_broken_pieces_are_named_and_left_out(
 ) -> None:
     folder = copy(finished, tmp_path)
     results = Results(folder)
-    rows = results.frame().query("split == 'test'")
-    broken = results.schedule_path(plan(rows, lambda key: True, len).representative["TO"][1])
+    rows = with_gaps(results.frame().query("split == 'test'"))
+    broken = results.schedule_path(plan(rows, DED, lambda key: True, len).representative["TO"][1])
     broken.write_bytes(b"no gzip")
     (folder / "koopman").mkdir(exist_ok=True)
     (folder / "policies").mkdir(exist_ok=True)
@@ -354,14 +355,14 @@ def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
 
 
 def test_only_runs_that_can_be_drawn_are_among_the_worst(finished: Path) -> None:
-    frame = Results(finished).frame()
+    frame = with_gaps(Results(finished).frame())
     kept = frame["instance"].iloc[0]
-    chosen = plan(frame, lambda key: key.instance == kept, len)
+    chosen = plan(frame, DED, lambda key: key.instance == kept, len)
     assert {key.instance for pairs in chosen.worst.values() for key, _ in pairs} == {kept}
 
 
 def test_keys_of_the_plan_include_ded_for_comparison(finished: Path) -> None:
-    chosen = plan(Results(finished).frame(), lambda key: True, len)
+    chosen = plan(with_gaps(Results(finished).frame()), DED, lambda key: True, len)
     for (regime, method, settings), pairs in chosen.worst.items():
         for key, _ in pairs:
             assert key[1:] == (regime, method, settings)

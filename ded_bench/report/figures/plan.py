@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.summary import REFERENCE, gaps, groups, worst
+from ded_bench.evaluate.summary import groups, worst
 from ded_bench.methods.registry import METHODS
 from ded_bench.run.results import Key
 
@@ -21,8 +21,12 @@ class Plan:
     """What to draw: per regime the runs of one representative instance, per method its worst runs.
 
     Of a method with several settings, those of the default are drawn.
+
+    Attributes:
+        reference: method and settings that gaps are measured against.
     """
 
+    reference: tuple[str, str]
     representative: dict[str, list[Key]] = field(default_factory=dict)
     worst: dict[tuple[str, str, str], list[tuple[Key, str]]] = field(default_factory=dict)
 
@@ -31,12 +35,17 @@ class Plan:
         """Every run that the figures show, the reference's for comparison included."""
         keys = [key for chosen in self.representative.values() for key in chosen]
         keys += [key for pairs in self.worst.values() for key, _ in pairs]
-        keys += [Key(key.instance, key.regime, *REFERENCE) for key in keys]
+        keys += [Key(key.instance, key.regime, *self.reference) for key in keys]
         return list(dict.fromkeys(keys))
 
 
-def plan(frame: pd.DataFrame, available: Callable[[Key], bool], load_change: Callable[[str], float]) -> Plan:
-    """Choose the runs to show from the rows of a results table.
+def plan(
+    frame: pd.DataFrame,
+    reference: tuple[str, str],
+    available: Callable[[Key], bool],
+    load_change: Callable[[str], float],
+) -> Plan:
+    """Choose the runs to show from the rows of a results table with their gaps.
 
     The worst runs are those of the runs that can be drawn.
 
@@ -44,13 +53,13 @@ def plan(frame: pd.DataFrame, available: Callable[[Key], bool], load_change: Cal
         available: whether the schedule of a run can be drawn.
         load_change: how much an instance's loads move in all, pu.
     """
-    scored = gaps(frame).dropna(subset=["objective"])
+    scored = frame.dropna(subset=["objective"])
     keys = scored[list(Key._fields)].itertuples(index=False)
     drawable = scored[np.array([available(Key(*key)) for key in keys], dtype=bool)]
-    chosen = Plan()
+    chosen = Plan(reference)
     for regime in sorted(set(scored["regime"])):
         chosen.representative[regime] = _representative(
-            scored[scored["regime"] == regime], regime, available, load_change
+            scored[scored["regime"] == regime], regime, reference, available, load_change
         )
     for regime, method, settings, group in groups(worst(first_settings(drawable), WORST)):
         ranked = []
@@ -76,7 +85,7 @@ def first_settings(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[ranked["_name"] == first]
 
 
-def challengers(rows: pd.DataFrame) -> list[str]:
+def challengers(rows: pd.DataFrame, reference: str) -> list[str]:
     """The methods whose schedule the paper's figures may show beside the reference's, first choice first.
 
     Trained methods come before others, and the smaller the mean distance to the reference, the earlier.
@@ -84,7 +93,7 @@ def challengers(rows: pd.DataFrame) -> list[str]:
     Args:
         rows: of one regime, with their gaps.
     """
-    others = rows[(rows["settings"] == "default") & (rows["method"] != REFERENCE[0])]
+    others = rows[(rows["settings"] == "default") & (rows["method"] != reference)]
     distance = others["gap_percent"].abs().groupby(others["method"]).mean().dropna()
     return sorted(distance.index, key=lambda name: (not is_trained(name), distance[name], name))
 
@@ -95,14 +104,18 @@ def is_trained(name: str) -> bool:
 
 
 def _representative(
-    rows: pd.DataFrame, regime: str, available: Callable[[Key], bool], load_change: Callable[[str], float]
+    rows: pd.DataFrame,
+    regime: str,
+    reference: tuple[str, str],
+    available: Callable[[Key], bool],
+    load_change: Callable[[str], float],
 ) -> list[Key]:
     """The reference's and a challenger's run on one instance: usual by its gap, and one where loads move.
 
     Of the instances that can be drawn, the third whose gaps are nearest to the challenger's median takes
     part; the one whose loads change most is chosen.
     """
-    for method in (*challengers(rows), REFERENCE[0]):
+    for method in (*challengers(rows, reference[0]), reference[0]):
         mine = rows[(rows["method"] == method) & (rows["settings"] == "default")].dropna(
             subset=["gap_percent"]
         )
@@ -111,7 +124,7 @@ def _representative(
         distance = (mine["gap_percent"] - mine["gap_percent"].median()).abs()
         ranked = mine.assign(distance=distance).sort_values(["distance", "instance"])["instance"]
         pairs = [
-            list(dict.fromkeys([Key(name, regime, *REFERENCE), Key(name, regime, method, "default")]))
+            list(dict.fromkeys([Key(name, regime, *reference), Key(name, regime, method, "default")]))
             for name in ranked
         ]
         drawable = [keys for keys in pairs if all(available(key) for key in keys)]

@@ -20,7 +20,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.evaluate.summary import REFERENCE, title
+from ded_bench.evaluate.reference import ACCURATE
+from ded_bench.evaluate.summary import title
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array
@@ -37,6 +38,8 @@ DASHES: tuple[tuple[float, ...], ...] = (
     *((), (5, 2), (1.5, 1.5), (6, 2, 1.5, 2), (3, 1.5), (8, 3)),
     *((6, 1.5, 1.5, 1.5, 1.5, 1.5), (10, 2, 3, 2)),
 )
+#: Methods that may be a case's reference.
+SOLID = ("ded", *ACCURATE)
 MARKERS = "osD^vP*Xph<>"
 RAD_TO_HZ = 1 / (2 * np.pi)
 DPI = 160
@@ -106,12 +109,12 @@ def marker(method: str) -> str:
 
 
 def dashes(method: str, variant: int = 0) -> tuple[float, ...]:
-    """A line style that distinguishes methods in print, and a method's settings; the reference is solid.
+    """A line style that distinguishes methods in print, and a method's settings; full DED is solid.
 
     Args:
         variant: which of the method's settings in the figure; 0 are its default.
     """
-    if (method, variant) == (REFERENCE[0], 0):
+    if variant == 0 and method in SOLID:
         return ()
     return DASHES[1 + (_place(method) + variant) % (len(DASHES) - 1)]
 

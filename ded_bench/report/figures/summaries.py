@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from ded_bench.evaluate.summary import GROUP, REFERENCE, natural, title
+from ded_bench.evaluate.summary import GROUP, natural, title
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -47,14 +47,15 @@ SMALLEST_EXCESS = 1e-4
 LINEAR_SPREAD = 5.0
 
 
-def tradeoff_figure(points: pd.DataFrame) -> Figure:
+def tradeoff_figure(points: pd.DataFrame, reference: str) -> Figure:
     """Mean gap to the reference against time per schedule, one panel per regime.
 
     A method's settings share its colour and marker; a thin line joins them and a word names each but the
     default.
 
     Args:
-        points: see `metrics.tradeoff`. Hollow markers: some schedules are infeasible.
+        points: see `summary.tradeoff`. Hollow markers: some schedules are infeasible.
+        reference: its title.
     """
     points = points.dropna(subset=["gap_percent"])
     regimes = sorted(points["regime"].unique())
@@ -76,7 +77,7 @@ def tradeoff_figure(points: pd.DataFrame) -> Figure:
             ax.margins(0.14)
             ax.set_title(regime)
             ax.set_xlabel("time per schedule (s), median")
-        axes[0].set_ylabel(f"mean gap to {title(*REFERENCE)} (%)")
+        axes[0].set_ylabel(f"mean gap to {reference} (%)")
         if (points["correct_rate"] < 1).any():
             hollow: dict[str, Any] = {
                 "marker": "o",

@@ -1,28 +1,60 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report quick radau starts solve-starts models ablation certify test clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report suite quick radau starts models rollouts ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
+CASES   ?= 9bus two-area 39bus 68bus 140bus
 RESULTS ?= results/$(CASE)
 SPLIT   ?= test
 LIMIT   ?=
 WORKERS ?= $(shell nproc 2>/dev/null || echo 2)
+REGIME  ?=
+TRAIN   ?=
+BENCH   ?=
 BIN     := .venv/bin
 DED     := $(BIN)/ded-bench
 STAMP   := .venv/installed
-MODELS  := linear koopman-single koopman-paper
-REGIME  ?=
 
+# How many instances slow methods answer, on one case or on all others; 0: none. A smaller LIMIT comes first.
+# Full DED: by Euler steps on 9bus, as in the paper; elsewhere by Radau collocation, and by Euler to compare.
+LIMIT_ded              ?= 0
+LIMIT_ded_9bus         ?= all
+LIMIT_ded_two-area     ?= 10
+LIMIT_ded_39bus        ?= 10
+LIMIT_ded-radau_9bus   ?= 0
+LIMIT_ded-radau_68bus  ?= 10
+LIMIT_ded-radau_140bus ?= 5
+LIMIT_ded-ko_68bus     ?= 10
+LIMIT_ded-ko_140bus    ?= 5
+
+BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
+MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)
+# Policies: on 9bus trained, the paper's too; elsewhere trained if TRAIN asks, or taken from the reference run.
+POLICIES  := $(if $(filter 9bus,$(CASE)),ded-dpc-paper) ded-dpc
+TRAINED   := $(or $(filter 9bus,$(CASE)),$(TRAIN))
+ANSWERING := $(or $(TRAINED),$(wildcard results/$(CASE)-reference/policies))
+
+define NEWLINE
+
+
+endef
+COMMA   := ,
 ONLY     = $(if $(REGIME),--regime $(REGIME))
-CHOICE   = --case $(CASE) --split $(SPLIT) $(ONLY) $(if $(LIMIT),--limit $(LIMIT)) \
+LIMITED  = $(or $(LIMIT_$(1)_$(CASE)),$(LIMIT_$(1)),all)
+FEWEST   = $(firstword $(shell printf '%s\n' $(filter-out all,$(LIMIT) $(call LIMITED,$(1))) | sort -n))
+CHOICE   = --case $(CASE) --split $(SPLIT) $(ONLY) $(if $(FEWEST),--limit $(FEWEST)) \
   --workers $(WORKERS) --out $(RESULTS)
-VALIDATION = --case $(CASE) --split validation $(ONLY) $(if $(LIMIT),--limit $(LIMIT)) \
-  --workers $(WORKERS) --out $(RESULTS)
+# $(call SOLVE,methods,options): a command for each method, none for one that is limited to 0 instances
+SOLVE    = $(foreach m,$(1),$(if $(filter-out 0,$(call LIMITED,$m)),$(DED) solve --method $m$(2) \
+  $(call CHOICE,$m)$(NEWLINE)))
+VALIDATION = $(subst --split $(SPLIT),--split validation,$(CHOICE))
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "  Settings: CASE=$(CASE) RESULTS=$(RESULTS) SPLIT=test|train|all REGIME=r LIMIT=n WORKERS=$(WORKERS)"
+	@echo "  CASE: a shipped case ($(CASES)) or a folder"
+	@echo "  Fewer instances for slow methods: $(foreach v,$(sort $(filter LIMIT_%,$(.VARIABLES))),$v=$($v))"
 
 venv: $(STAMP)  ## make .venv with the pinned versions
 $(STAMP): constraints.txt setup.cfg pyproject.toml
@@ -30,36 +62,34 @@ $(STAMP): constraints.txt setup.cfg pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
-instances: $(STAMP)  ## draw the 500 instances and their split (the same files every time)
+instances: $(STAMP)  ## draw the instances and their split (the same files every time)
 	$(DED) instances --case $(CASE)
 
 train-ko: $(STAMP)  ## identify the Koopman model from simulated trajectories
 	$(DED) train-ko --case $(CASE) --results $(RESULTS)
 
 solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in all regimes (SPLIT=all: all instances)
-	$(DED) solve --method ded,ed,ded-ko,ded-ko-knots $(CHOICE)
-	$(DED) solve --method ded --settings accelerated $(CHOICE)
-	$(DED) solve --method ed --settings '1*s' $(CHOICE)
+	$(call SOLVE,ed, --settings '*')
+	$(call SOLVE,$(BASELINES))
+	$(if $(filter 9bus,$(CASE)),$(call SOLVE,ded, --settings accelerated))
 
 radau: train-ko  ## full DED by Radau collocation: the accurate reference
 	$(DED) solve --method ded-radau $(CHOICE)
 
 starts: train-ko  ## ten instances of full DED from three other starting points: are its optima the same?
-	$(MAKE) solve-starts LIMIT=10
-
-solve-starts:
-	$(DED) solve --method ded --settings 'start-*' $(CHOICE)
+	$(DED) solve --method ded --settings 'start-*' $(CHOICE) --limit 10
 
 train-dpc: train-ko  ## train the policies on the training instances
-	$(DED) train-dpc --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS) $(TRAIN)
+	$(DED) train-dpc --method $(subst $( ) ,$(COMMA),$(strip $(POLICIES))) --case $(CASE) $(ONLY) \
+	  --results $(RESULTS) --workers $(WORKERS) $(TRAIN)
 
-solve-dpc: train-dpc
-	$(DED) solve --method ded-dpc-paper,ded-dpc,ded-dpc-refined $(CHOICE)
-	$(DED) solve --method ded-dpc-refined --settings 'steps*' $(CHOICE)
+solve-dpc: $(if $(TRAINED),train-dpc,train-ko)  ## solve and score with the policies
+	$(call SOLVE,$(POLICIES) ded-dpc-refined)
+	$(call SOLVE,ded-dpc-refined, --settings 'steps*')
 
-models: solve-baselines  ## DED-KO on other Koopman models, and the errors of each model
+models: solve-baselines  ## DED-KO on other models of the dynamics, and the errors of each
 	$(DED) train-ko --kind koopman-paper --case $(CASE) --results $(RESULTS)
-	for model in $(MODELS); do $(DED) solve --method ded-ko,ded-ko-knots --model $$model $(CHOICE) || exit 1; done
+	$(foreach model,$(MODELS),$(call SOLVE,ded-ko ded-ko-knots, --model $(model)))
 	$(DED) rollouts --case $(CASE) --results $(RESULTS)
 
 ablation: models  ## short trainings of DED-DPC, each with one thing changed, judged on validation instances
@@ -74,13 +104,17 @@ ablation: models  ## short trainings of DED-DPC, each with one thing changed, ju
 certify: train-dpc  ## certify DED-DPC on 10,000 fresh instances per regime
 	$(DED) certify --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
 
-bench: solve-baselines solve-dpc  ## time each method alone on the machine
+bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),,models)  ## time each method alone on the machine
 	$(DED) bench --case $(CASE) --results $(RESULTS) $(BENCH)
 
-report: bench  ## everything that is missing, then Tables V and VI and the report
+report: bench  ## everything that is missing, then the tables and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
-quick:  ## the same road with 4 instances and little training, about ten minutes
+suite:  ## the reports of all cases, then one page over them
+	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done
+	$(DED) overview --results $(CASES:%=results/%)
+
+quick:  ## the same road with 4 instances and little training, in some minutes
 	$(MAKE) report RESULTS=results/quick LIMIT=4 TRAIN="--seconds 20 --limit 40" BENCH="--instances 1 --repeats 1"
 
 test: $(STAMP)  ## lint, type check and tests

@@ -27,6 +27,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.run.pool import Workers
+from ded_bench.solvers.status import Status
 
 
 def add_commands(commands: Any) -> None:
@@ -104,13 +105,11 @@ def _bench(a: argparse.Namespace) -> int:
         force=a.force,
         problems_version=chosen.version,
     )
-    failed = 0
     for row in timing_summary(rows).to_dict("records"):
         timed = row["solve_s"] == row["solve_s"]
         said = f"{row['solve_s']:.6f} s, {row['repeats']} rounds" if timed else row["error"]
         print(f"{row['method']:<16} {row['settings']:<12} {row['regime']:<4} {said}", flush=True)
-        failed += not timed
-    return 1 if failed else 0
+    return 1 if any(row.status == Status.FAILED for row in rows) else 0
 
 
 def _certify(a: argparse.Namespace) -> int:

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
-import pyomo.environ as pyo
 import pytest
 
-from ded_bench.methods.ded_radau import (
-    BETWEEN,
-    POINTS,
-    WEIGHTS,
-    build_ded_radau,
-    collocation_points,
-    element_count,
-    element_ends,
-    lagrange,
-    point_times,
-    prepare,
-    schedule_of,
-    set_instance,
-)
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.collocation import BETWEEN, POINTS, WEIGHTS, differentiation, lagrange
+from ded_bench.methods.ded_radau import SETTINGS, element_count, element_ends, element_length, prepare
+from ded_bench.methods.ded_radau_model import build_ded_radau, collocation_points
+from ded_bench.methods.radau_program import RadauProgram
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
@@ -49,26 +39,10 @@ def ramping(case: Case, quiet_instance, start: float = 0.5, duration: float = 0.
     return quiet_instance(case, **{"horizon_s": HORIZON, "load": load} | changes)
 
 
-def with_inputs(case: Case, instance: Instance, elements: int, schedule: Schedule) -> pyo.ConcreteModel:
-    """The model solved with its generator powers fixed and its frequencies free."""
-    model = build_ded_radau(case, elements)
-    set_instance(model, case, instance, "NO")
-    times = instance.grid[element_ends(instance, elements)]
-    for j, g in enumerate(case.generators):
-        for end, value in zip(model.end, schedule.at(times)[:, j].tolist(), strict=True):
-            model.p_gen[g, end].setlb(value)
-            model.p_gen[g, end].setub(value)
-            model.p_gen[g, end].set_value(value)
-        for tau in list(model.tau)[1:]:
-            model.omega[g, tau].setlb(None)
-            model.omega[g, tau].setub(None)
-    assert CasadiIpopt(model).solve().status == Status.OPTIMAL
-    return model
-
-
 def test_points_and_weights_are_radaus(threebus: Case) -> None:
     """They are Pyomo's, and integrate polynomials up to degree 4 exactly."""
-    model = build_ded_radau(threebus, 2)
+    instance = short(threebus, 0)
+    model = build_ded_radau(threebus, instance, "NO", element_ends(instance, 3))
     info = model.tau.get_discretization_info()
     np.testing.assert_allclose(info["tau_points"], [0.0, *POINTS], atol=1e-12)
     for degree in range(5):
@@ -76,6 +50,16 @@ def test_points_and_weights_are_radaus(threebus: Case) -> None:
     assert np.dot(WEIGHTS, np.power(POINTS, 5)) != pytest.approx(1 / 6, abs=1e-4)
     for tau, (e, c) in collocation_points(model).items():
         assert tau == pytest.approx(e - 1 + c, abs=1e-6)
+
+
+def test_values_and_slopes_at_any_place_are_those_of_the_cubic() -> None:
+    """The weights reproduce cubics."""
+    nodes = np.array([0.0, *POINTS])
+    for degree in range(4):
+        for c in (*BETWEEN, 0.1, 1.0):
+            assert np.dot(lagrange(c), nodes**degree) == pytest.approx(c**degree, abs=1e-14)
+        slopes = degree * np.power(POINTS, max(degree - 1, 0))
+        np.testing.assert_allclose(differentiation() @ nodes**degree, slopes, atol=1e-13)
 
 
 def test_elements_end_where_loads_kink(ninebus: Case) -> None:
@@ -106,6 +90,29 @@ def test_elements_are_never_finer_than_the_grid_nor_fewer_than_the_kinks(
     assert element_ends(still, 4).tolist() == [0, 50, 100, 150, 200]
 
 
+def test_fast_modes_ask_for_short_elements(ninebus: Case) -> None:
+    """An eighth of the period of the fastest mode: docs/grids.md has their frequencies."""
+    default = SETTINGS["default"]
+    assert element_length(ninebus, **default) == 0.1
+    assert element_length(Case.load("39bus"), **default) == pytest.approx(0.125 / 1.57, rel=5e-3)
+    assert element_length(Case.load("140bus"), **SETTINGS["200ms"]) == 0.2
+
+
+@pytest.mark.parametrize(("regime", "index"), [("NO", 2), ("TO", 0)])
+def test_the_arrays_are_the_model(case: Case, regime: str, index: int) -> None:
+    """IPOPT finds the same optimum of Pyomo's program, through its .nl form and symbolic derivatives."""
+    instance = short(case, index)
+    ends = element_ends(instance, element_count(case, instance, 0.2))
+    arrays = RadauProgram(case, len(ends) - 1)
+    outcome, x = arrays.program.solve(arrays.numbers(instance, regime, ends))
+    model = build_ded_radau(case, instance, regime, ends)
+    whole = CasadiIpopt(model).solve()
+    assert whole.status == outcome.status == Status.OPTIMAL
+    assert outcome.objective == pytest.approx(whole.objective, rel=1e-7)
+    powers = [[model.p_gen[g, end].value for g in case.generators] for end in model.end]
+    np.testing.assert_allclose(arrays.schedule(x, instance, ends).p, powers, atol=2e-3)
+
+
 def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> None:
     """Inputs and loads are linear in every element, kinks lie at ends: order 4 or more, Euler's is 1."""
     instance = ramping(case, quiet_instance)
@@ -119,14 +126,18 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
     coarsest = max(3, 3 * round(2 * HORIZON / period))  # six elements a period of the fastest mode
     errors, gaps = [], []
     for elements in (coarsest, 2 * coarsest, 4 * coarsest):
-        model = with_inputs(case, instance, elements, schedule)
         ends = element_ends(instance, elements)
-        omega = np.array([[model.omega[g, end].value for g in case.generators] for end in model.end])
-        errors.append(np.abs(omega - truth.omega[ends]).max())
+        arrays = RadauProgram(case, elements)
+        numbers = arrays.numbers(instance, "NO", ends)
+        lower, upper = numbers.lower.copy(), numbers.upper.copy()
+        lower[arrays.p_gen] = upper[arrays.p_gen] = schedule.at(instance.grid[ends])
+        lower[arrays.omega], upper[arrays.omega] = -np.inf, np.inf
+        outcome, x = arrays.program.solve(dataclasses.replace(numbers, lower=lower, upper=upper))
+        assert outcome.status == Status.OPTIMAL
+        errors.append(np.abs(x[arrays.omega[:, -1]] - truth.omega[ends[1:]]).max())
         cost = truth.p_gen @ instance.cost_gen(case)
         cost = cost + instance.cost_slack(case) * np.abs(truth.p_slack)
-        gaps.append(abs(pyo.value(model.cost_total) / cost.sum() - 1))
-        assert point_times(model)[3::3] == pytest.approx(instance.grid[ends][1:], abs=1e-12)
+        gaps.append(abs(outcome.objective / cost.sum() - 1))
     assert errors[0] < 1e-4
     assert errors[0] / errors[1] > 2**4
     assert errors[2] < 1e-7
@@ -166,28 +177,19 @@ def test_where_nothing_may_move_the_optimum_is_the_static_one(case: Case, quiet_
     assert solution.solver_objective == pytest.approx(static * (instance.steps + 1), rel=1e-4)
 
 
-def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, quiet_instance) -> None:
+def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_instance) -> None:
     """Other data, and other element lengths."""
     instances = [short(case, 0), ramping(case, quiet_instance, start=0.31, duration=1.07)]
     solve = prepare(case, "TO", Settings())
     solve(instances[1])
     for instance in instances:
         again = solve(instance)
-        elements = element_count(case, instance, get_method("ded-radau").settings["default"]["length_s"])
-        model = build_ded_radau(case, elements)
-        set_instance(model, case, instance, "TO")
-        fresh = CasadiIpopt(model).solve()
-        assert again.status == fresh.status == Status.OPTIMAL
-        assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
-        np.testing.assert_allclose(again.schedule.p, schedule_of(model, case, instance).p, atol=1e-9)
-
-
-def test_frequencies_between_the_points_are_those_of_the_cubic() -> None:
-    """Lagrange's weights reproduce cubics, anywhere in an element."""
-    nodes = np.array([0.0, *POINTS])
-    for c in (*BETWEEN, 0.1, 1.0):
-        for degree in range(4):
-            assert np.dot(lagrange(c), nodes**degree) == pytest.approx(c**degree, abs=1e-14)
+        ends = element_ends(instance, len(again.schedule.t) - 1)
+        fresh = RadauProgram(case, len(ends) - 1)
+        outcome, x = fresh.program.solve(fresh.numbers(instance, "TO", ends))
+        assert again.status == outcome.status == Status.OPTIMAL
+        assert again.solver_objective == pytest.approx(outcome.objective, rel=1e-12)
+        np.testing.assert_allclose(again.schedule.p, fresh.schedule(x, instance, ends).p, atol=1e-12)
 
 
 def test_impossible_instances_and_time_limits_are_reported_as_such(threebus: Case) -> None:

@@ -174,7 +174,8 @@ def _needing_torch() -> Iterator[None]:
 
 def _rollouts(a: argparse.Namespace) -> int:
     from ded_bench.evaluate.ablation import rollout_errors
-    from ded_bench.evaluate.reference import reference_objectives
+    from ded_bench.evaluate.paper_numbers import read_paper
+    from ded_bench.evaluate.reference import choose_reference
     from ded_bench.koopman.surrogates import MODELS, find_model
     from ded_bench.run.results import Results
 
@@ -189,7 +190,7 @@ def _rollouts(a: argparse.Namespace) -> int:
             print(f"ded-bench: left out: {error}", file=sys.stderr)
     instances = [instance for instance, _ in chosen.instances]
     results = Results(folder)
-    reference = reference_objectives(case.id, results.frame(), problem_folder(a.case, case))
+    reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
     table = rollout_errors(case, results, instances, models, reference)
     print(table.to_string(index=False, float_format="{:.3g}".format))
     return 0

@@ -99,4 +99,5 @@ def _print_row(row: OnlineRow) -> None:
         return
     over = "no hindsight" if row.increase_percent is None else f"{row.increase_percent:.4f} % over hindsight"
     excess = f"largest excess {1e3 * row.max_excess_hz:.4f} mHz"
-    print(f"{name} {over}, {excess}, {row.late} late, {row.failed} failed of {row.plans}", flush=True)
+    plans = f"{row.late} late, {row.failed} failed, {row.infeasible} infeasible of {row.plans}"
+    print(f"{name} {over}, {excess}, {plans}", flush=True)

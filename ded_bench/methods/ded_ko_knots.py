@@ -3,6 +3,10 @@
 On the condensed rollout (ω, P_s) at every point are affine in the knots, so the knots are the only
 variables. Few of the many frequency limits bind and P_s changes sign at few points; what is needed
 of both is added as the solution asks for it, until all points are right.
+
+In operation a frequency limit may be out of reach: a load has begun to ramp that nobody announced. Then
+every piece of the horizon gets a variable for the frequency excess in it, and the sum of all is the
+least one.
 """
 
 from __future__ import annotations
@@ -41,6 +45,9 @@ N_PIECES = 70
 #: row), cost as a fraction of all (a hundredth of the smallest gap that tables show).
 OMEGA_TOLERANCE = 1e-7
 COST_TOLERANCE = 1e-6
+#: What a frequency excess of 1 rad/s in one piece costs, in sums of all knots' costs: so much that none is
+#: worth what it saves.
+EXCESS_PRICE = 100.0
 #: With a limit broken somewhere, every peak of |ω| above this part of the bound gets its row.
 NEAR = 0.9
 MAX_ROUNDS = 100
@@ -56,12 +63,37 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     return prepare_with(case, find_model(case, settings.model, settings.search), regime, settings)
 
 
-def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:
+def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances; one condensed rollout per process serves them all."""
     case.check_regimes([regime])
     limit = np.inf if settings.time_limit_s is None else settings.time_limit_s
+    return KnotSolver(case, koopman, regime, limit)
 
-    def solve(instance: Instance) -> Solution:
+
+@dataclass(frozen=True)
+class KnotSolver:
+    """Solves instances of one case and regime on one Koopman model."""
+
+    case: Case
+    koopman: Koopman
+    regime: str
+    time_limit_s: float
+
+    def __call__(self, instance: Instance) -> Solution:
+        """Solve."""
+        return self._solution(instance, soft=False)
+
+    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
+
+        Args:
+            instance: what to solve.
+            last: of no use to this method.
+        """
+        return self._solution(instance, soft=True)
+
+    def _solution(self, instance: Instance, soft: bool) -> Solution:
+        case, koopman = self.case, self.koopman
         check_step(koopman, instance)
         started = time.perf_counter()
         program = _program(_Model(case, koopman.fingerprint, instance.steps, koopman))
@@ -69,12 +101,16 @@ def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) 
         free = np.ascontiguousarray(program.rollout.free_response(psi, instance.p_load(case)[None])[0])
         build_s = time.perf_counter() - started
         started = time.perf_counter()
-        answer = _solve(case, program, instance, regime, free, started + limit)
+        bound, deadline = case.omega_bound(self.regime), started + self.time_limit_s
+        answer = _solve(case, program, instance, bound, free, deadline)
+        if soft and answer.status == Status.INFEASIBLE:
+            nearest = _solve(case, program, instance, bound, free, deadline, soft=True)
+            if nearest.status == Status.OPTIMAL:
+                answer = nearest._replace(status=Status.INFEASIBLE, found=True)
         done = answer.status == Status.OPTIMAL
-        schedule = Schedule(program.rollout.knots, answer.p_knots) if done else None
         return Solution(
             status=answer.status,
-            schedule=schedule,
+            schedule=Schedule(program.rollout.knots, answer.p_knots) if answer.found else None,
             iterations=answer.iterations,
             build_s=build_s,
             setup_s=0.0,
@@ -83,8 +119,6 @@ def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) 
             solver_version=program.lp.version,
             error="" if done else answer.status.sentence,
         )
-
-    return solve
 
 
 @dataclass(frozen=True)
@@ -103,7 +137,7 @@ class _Program(NamedTuple):
     rollout: CondensedRollout
     p_slack_sum: Array  # (n_points + 1, n_knots n_gen): Γ of P_s summed over all points before one
     first: Indices  # first point of each piece, shape (n_pieces,)
-    lp: GrowingProgram  # variables (knots, cost of each piece); rows: ramps, pieces as +P_s, as -P_s
+    lp: GrowingProgram  # rows: ramps, pieces as +P_s, as -P_s; columns: see `_split`
 
 
 @functools.lru_cache(maxsize=1)
@@ -117,7 +151,8 @@ def _program(model: _Model) -> _Program:
     pieces = sp.csr_matrix(np.diff(p_slack_sum[np.append(first, len(grid))], axis=0))
     ramps = sp.csr_matrix(np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen)))
     above = sp.eye(len(first))
-    blocks: Any = [[ramps, None], [pieces, -above], [-pieces, -above]]
+    excess = sp.csr_matrix((ramps.shape[0], len(first)))
+    blocks: Any = [[ramps, None, excess], [pieces, -above, None], [-pieces, -above, None]]
     return _Program(rollout, p_slack_sum, first, GrowingProgram(sp.csr_matrix(sp.bmat(blocks))))
 
 
@@ -131,55 +166,76 @@ class _Answer(NamedTuple):
     p_knots: Array  # (n_knots, n_gen), pu; of no use unless the status is optimal
     objective: float
     iterations: int
+    found: bool = False  # whether p_knots is a schedule
 
 
 def _solve(
-    case: Case, program: _Program, instance: Instance, regime: str, free: Array, deadline: float
+    case: Case,
+    program: _Program,
+    instance: Instance,
+    bound: float,
+    free: Array,
+    deadline: float,
+    soft: bool = False,
 ) -> _Answer:
     """Solve, look at all points, add what is missing, and again.
 
     Args:
+        bound: of |ω|, rad/s.
         free: the free response, shape (n_gen + 1, n_points).
         deadline: on the clock of `time.perf_counter`.
+        soft: the bound may be exceeded, at a price.
     """
     n_gen, rollout, lp = len(case.generators), program.rollout, program.lp
-    n_knots, n_pieces = len(rollout.knots), len(program.first)
-    n_x = n_knots * n_gen
-    bound, price = case.omega_bound(regime), instance.cost_slack(case)
+    n_pieces, price = len(program.first), instance.cost_slack(case)
+    lengths = np.diff(np.append(program.first, len(rollout.points)))
     cost = np.outer(rollout.hat_weights, instance.cost_gen(case)).ravel()
-    _restart(case, program, instance, np.append(cost, np.full(n_pieces, price)), free)
+    _restart(case, program, instance, cost, free, soft)
     iterations, free_sum = 0, _sums(free[n_gen])
     limited: set[tuple[int, int]] = set()  # (generator, point) whose frequency has a row
     for _ in range(MAX_ROUNDS):
         status, solution, count = lp.solve(max(deadline - time.perf_counter(), 0.0))
         iterations += count
-        x, pieces = solution[:n_x], solution[n_x:]
-        p_knots = x.reshape(n_knots, n_gen)
+        x, pieces, excess = _split(program, solution)
+        p_knots = x.reshape(-1, n_gen)
         if status != Status.OPTIMAL:
             return _Answer(status, p_knots, np.nan, iterations)
         outputs = rollout.apply(p_knots[None])[0] + free
         omega, p_slack = outputs[:n_gen], outputs[n_gen]
         short = np.add.reduceat(np.abs(p_slack), program.first) - pieces
         objective = float(cost @ x + price * (pieces + short).sum())
-        peaks = _peaks(omega, bound) - limited
+        peaks = _peaks(omega, bound + np.repeat(excess, lengths)) - limited
         cuts = _short_pieces(price * short, COST_TOLERANCE * abs(objective))
         if not peaks and not len(cuts):
-            return _Answer(Status.OPTIMAL, p_knots, objective, iterations)
+            return _Answer(Status.OPTIMAL, p_knots, objective, iterations, found=True)
         if peaks:
             g, k = np.array(sorted(peaks)).T
-            rows = np.hstack([rollout.gamma[g, k], np.zeros((len(k), n_pieces))])
-            lp.add(rows, -bound - free[g, k], bound - free[g, k])
+            rows = np.hstack([rollout.gamma[g, k], np.zeros((len(k), 2 * n_pieces))])
+            low, high, none = -bound - free[g, k], bound - free[g, k], np.full(len(k), np.inf)
+            if soft:
+                own = np.searchsorted(program.first, k, side="right") - 1 - n_pieces
+                rows, low, high = np.vstack([rows, rows]), np.append(-none, low), np.append(high, none)
+                rows[np.arange(len(low)), np.tile(own, 2)] = np.repeat([-1.0, 1.0], len(k))
+            lp.add(rows, low, high)
             limited |= peaks
         if len(cuts):
             lp.add(*_cuts(program, free_sum, p_slack, cuts))
     return _Answer(Status.FAILED, p_knots, np.nan, iterations)
 
 
-def _restart(case: Case, program: _Program, instance: Instance, cost: Array, free: Array) -> None:
+def _split(program: _Program, solution: Array) -> tuple[Array, Array, Array]:
+    """Columns of the program: powers at knots, cost of each piece, frequency excess in each piece."""
+    n_pieces = len(program.first)
+    return solution[: -2 * n_pieces], solution[-2 * n_pieces : -n_pieces], solution[-n_pieces:]
+
+
+def _restart(case: Case, program: _Program, instance: Instance, cost: Array, free: Array, soft: bool) -> None:
     """Give the LP an instance's numbers: P_0, ramps between knots, and ±P_s summed over each piece."""
     n_gen, n_pieces, knots = len(case.generators), len(program.first), program.rollout.knots
-    lower = np.append(np.tile(case.p_min, len(knots)), np.zeros(n_pieces))
-    upper = np.append(np.tile(case.p_max, len(knots)), np.full(n_pieces, np.inf))
+    prices = instance.cost_slack(case), EXCESS_PRICE * max(float(cost.sum()), 1.0)
+    cost = np.append(cost, np.repeat(prices, n_pieces))
+    lower = np.append(np.tile(case.p_min, len(knots)), np.zeros(2 * n_pieces))
+    upper = np.append(np.tile(case.p_max, len(knots)), np.repeat([np.inf, np.inf if soft else 0.0], n_pieces))
     p_initial = instance.p_initial(case)
     lower[:n_gen] = upper[:n_gen] = p_initial
     # P_0 is given, wherever it lies, but the limits hold from t_1 on, long before the next knot.
@@ -194,19 +250,21 @@ def _restart(case: Case, program: _Program, instance: Instance, cost: Array, fre
     program.lp.restart(cost, lower, upper, row_lower, row_upper)
 
 
-def _peaks(omega: Array, bound: float) -> set[tuple[int, int]]:
-    """(generator, point) of every peak of |ω| near its bound, if some |ω| is beyond it after t_0.
+def _peaks(omega: Array, bound: Array) -> set[tuple[int, int]]:
+    """(generator, point) of every peak of |ω| - bound near the bound, if some |ω| is beyond it after t_0.
 
     Args:
         omega: shape (n_gen, n_points), rad/s.
+        bound: shape (n_points,), rad/s.
     """
     size = np.abs(omega)
     size[:, 0] = 0.0  # x_0 is given, wherever it lies
-    if size.max() <= bound + OMEGA_TOLERANCE:
+    over = size - bound
+    if over.max() <= OMEGA_TOLERANCE:
         return set()
-    after = np.append(size[:, 1:], np.zeros((len(size), 1)), axis=1)
-    before = np.append(np.zeros((len(size), 1)), size[:, :-1], axis=1)
-    g, k = np.nonzero((size >= before) & (size >= after) & (size > NEAR * bound))
+    none = np.full((len(over), 1), -np.inf)
+    after, before = np.append(over[:, 1:], none, axis=1), np.append(none, over[:, :-1], axis=1)
+    g, k = np.nonzero((over >= before) & (over >= after) & (size > NEAR * bound))
     return set(zip(g.tolist(), k.tolist(), strict=True))
 
 
@@ -229,5 +287,5 @@ def _cuts(program: _Program, free_sum: Array, p_slack: Array, pieces: Indices) -
     ends, piece = np.append(start, len(sign)), np.searchsorted(start, first)
     across = np.add.reduceat(sign[start, None] * np.diff(program.p_slack_sum[ends], axis=0), piece)
     known = np.add.reduceat(sign[start] * np.diff(free_sum[ends]), piece)
-    rows = np.hstack([across[pieces], -np.eye(n_pieces)[pieces]])
+    rows = np.hstack([across[pieces], -np.eye(n_pieces)[pieces], np.zeros((len(pieces), n_pieces))])
     return rows, np.full(len(pieces), -np.inf), -known[pieces]

@@ -62,21 +62,25 @@ class SlpSolver:
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve from the static dispatch of every second."""
-        return self.solve(instance)
+        return self._solution(instance, None, soft=False)
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
-        """Solve.
+        """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
 
         Args:
             instance: what to solve.
             last: its schedule, if it has one, is where to start; its time is the instance's.
         """
+        return self._solution(instance, last, soft=True)
+
+    def _solution(self, instance: Instance, last: Solution | None, soft: bool) -> Solution:
         started = time.perf_counter()
         limit = np.inf if self.time_limit_s is None else self.time_limit_s
         near = last.schedule if last is not None else None
         start = ed.dispatch(self.case, instance, 1.0) if near is None else near
         points = self._knots(instance)
-        sequence = _Sequence(self.case, instance, self.case.omega_bound(self.regime), points, started + limit)
+        bound = self.case.omega_bound(self.regime)
+        sequence = _Sequence(self.case, instance, bound, points, started + limit, soft)
         status, schedule = sequence.run(start, is_near=near is not None)
         return Solution(
             status=status,
@@ -87,11 +91,7 @@ class SlpSolver:
             solve_s=time.perf_counter() - started,
             solver_objective=sequence.claimed if status == Status.OPTIMAL else None,
             solver_version=sequence.version,
-            error=""
-            if schedule is not None
-            else sequence.message
-            if status == Status.FAILED
-            else status.sentence,
+            error=sequence.error(status, schedule),
         )
 
     def _knots(self, instance: Instance) -> Indices:
@@ -111,6 +111,7 @@ class _Sequence:
     bound: float  # rad/s
     points: Indices
     deadline: float  # on the clock of `time.perf_counter`
+    soft: bool = False  # an infeasible instance has a schedule, too: that of least excess
     limits: set[tuple[int, int]] = field(default_factory=set)  # (generator, grid point) with a row
     iterations: int = 0
     claimed: float = np.inf  # cost that the last program predicts
@@ -152,10 +153,17 @@ class _Sequence:
                 return found, self._best
             infeasible = infeasible + 1 if found == Status.INFEASIBLE else 0
             if infeasible == 2:
-                return Status.INFEASIBLE, None
+                nearest = Schedule(t=schedule.t, p=prediction.p_gen)
+                return Status.INFEASIBLE, nearest if self.soft else None
             p_before, p_gen, self.claimed = p_gen, prediction.p_gen, prediction.objective
         self.message = self.message or f"no convergence in {MAX_ROUNDS} trajectories"
         return (Status.FAILED if self._best is None else Status.FEASIBLE), self._best
+
+    def error(self, status: Status, schedule: Schedule | None) -> str:
+        """Why there is no schedule that meets every limit; nothing if there is one."""
+        if status == Status.FAILED:
+            return self.message
+        return status.sentence if schedule is None or status == Status.INFEASIBLE else ""
 
     def _reachable(self) -> bool:
         """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides."""
@@ -216,13 +224,14 @@ class _Sequence:
 
     def _relaxed(self, program: KnotProgram, rows: Indices) -> tuple[Status, Prediction | None]:
         """Widen the bound as little as possible where the program has no solution, or PIQP finds none."""
-        answer = program.solve_relaxed(rows, self.deadline - time.perf_counter())
+        left = self.deadline - time.perf_counter()
+        answer, widening = program.solve_relaxed(rows, left, by_interval=self.soft)
         self._count(answer.iterations, answer.version, answer.message)
         if answer.status != Status.OPTIMAL:
             return answer.status, None
-        prediction = program.predict(answer.x[:-1])
+        prediction = program.predict(answer.x)
         self.limits |= self._near(prediction.omega)
-        return (Status.INFEASIBLE if answer.x[-1] > OPEN else Status.OPTIMAL), prediction
+        return (Status.INFEASIBLE if widening > OPEN else Status.OPTIMAL), prediction
 
     def _count(self, iterations: int, version: str, message: str) -> None:
         self.iterations += iterations

@@ -11,7 +11,7 @@ every piece p of a few grid points, so that every row is local to one interval b
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,10 +82,21 @@ class KnotProgram:
         """
         return solve_staged(self._form(limits), time_limit_s)
 
-    def solve_relaxed(self, limits: Indices, time_limit_s: float) -> StagedAnswer:
-        """Solve with one more column, the last: the least by which all limits of |ω| must be widened, rad/s.
+    def solve_relaxed(
+        self, limits: Indices, time_limit_s: float, by_interval: bool = False
+    ) -> tuple[StagedAnswer, float]:
+        """Solve with the limits of |ω| widened as little as possible.
 
         The cost counts, but so little that the widening is the least one but for round-off.
+
+        Args:
+            limits: see `solve`.
+            time_limit_s: see `solve`.
+            by_interval: every interval has a widening of its own, and their sum is the least; else all
+                have the same.
+
+        Returns:
+            The answer, and the largest widening in rad/s.
         """
         form = self._form(limits)
         n, speed = self._n_columns, self._x[:, self._n_gen :].ravel()
@@ -96,22 +107,38 @@ class KnotProgram:
         low, high = (
             np.append(a[speed], b[kept:]) for a, b in ((form.lower, form.low), (form.upper, form.high))
         )
-        widening = sp.csc_matrix(np.ones((omega.shape[0], 1)))
-        below = np.full(len(low), -np.inf)
-        lower, upper = np.append(form.lower, 0.0), np.append(form.upper, np.inf)
+        owner = np.append(np.repeat(np.arange(self._n), self._n_gen), self._interval_of(limits))
+        stage = (
+            self._x[:, -1] if by_interval else np.array([n])
+        )  # of a widening: after the column of that number
+        widening = sp.csc_matrix(
+            (np.ones(len(owner)), (np.arange(len(owner)), owner if by_interval else 0 * owner)),
+            (len(owner), len(stage)),
+        )
+        below, none = np.full(len(low), -np.inf), np.zeros(len(stage))
+        lower, upper = np.append(form.lower, none), np.append(form.upper, none + np.inf)
         lower[speed], upper[speed] = -np.inf, np.inf
         rows: Any = [[form.between[:kept], None], [omega, -widening], [-omega, -widening]]
+        equal = sp.hstack([form.equal, sp.csc_matrix((form.equal.shape[0], len(stage)))])
+        order = np.argsort(np.append(np.arange(n), stage + 0.5))
         relaxed = FreeForm(
-            cost=np.append(form.cost, WIDENING_PRICE * max(form.cost.sum(), 1.0)),
-            equal=sp.csc_matrix(sp.hstack([form.equal, sp.csc_matrix((form.equal.shape[0], 1))])),
+            cost=np.append(form.cost, none + WIDENING_PRICE * max(form.cost.sum(), 1.0))[order],
+            equal=sp.csc_matrix(equal)[:, order],
             right=form.right,
-            between=sp.csc_matrix(sp.bmat(rows)),
+            between=sp.csc_matrix(sp.bmat(rows))[:, order],
             low=np.concatenate([form.low[:kept], below, below]),
             high=np.concatenate([form.high[:kept], high, -low]),
-            lower=lower,
-            upper=upper,
+            lower=lower[order],
+            upper=upper[order],
         )
-        return solve_staged(relaxed, time_limit_s)
+        answer = solve_staged(relaxed, time_limit_s)
+        x = np.empty(len(order))
+        x[order] = answer.x
+        return replace(answer, x=x[:n]), float(x[n:].max())
+
+    def _interval_of(self, limits: Indices) -> Indices:
+        """Intervals of (generator, grid point) pairs, shape (n_limits,)."""
+        return np.searchsorted(self.model.points, limits[:, 1]) - 1
 
     def _form(self, limits: Indices) -> FreeForm:
         model = self.model

@@ -34,7 +34,7 @@ class LoopOptions:
     latency_s: float = 0.0
     forecast: str = "announced"
     predict: bool = True  # plan from the state predicted for τ + latency; False: from that at τ
-    warm: bool = True  # methods that can start from their last plan do so
+    warm: bool = True  # methods that can use the plan in force are given it
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class Outcome:
     plans: int  # asked for
     late: int  # did not come in time
     failed: int  # came without a schedule that can be followed
-    warm: bool  # some plan was started from the last one
+    infeasible: int  # came with one, though by their method none meets every limit
+    warm: bool  # the method was given the plan in force, at least once
     method_s: float  # the methods' own time, s of the clock
     error: str  # the first failure
 
@@ -173,6 +174,7 @@ class _Loop:
             plans=len(self.plans),
             late=sum(plan.late for plan in missing),
             failed=sum(not plan.late for plan in missing),
+            infeasible=sum(plan.infeasible and plan.schedule is not None for plan in self.plans),
             warm=any(plan.warm for plan in self.plans),
             method_s=sum(plan.seconds for plan in self.plans),
             error=missing[0].error if missing else "",

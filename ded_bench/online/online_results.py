@@ -43,8 +43,10 @@ class OnlineRow:
     """One scenario operated with one method's plans, judged on the true DAE (see `Judgement`).
 
     `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
-    the time they took effect; `warm` that the method might start from its last plan, and `warm_used` that
-    it did. `method_s` and `loop_s` are wall-clock seconds of the method, and of all else.
+    the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
+    that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
+    method's own word, exceeds limits as little as it can. `method_s` and `loop_s` are wall-clock seconds of
+    the method, and of all else.
     """
 
     scenario: str = cell(check=plain_name)
@@ -67,6 +69,7 @@ class OnlineRow:
     plans: int = cell(default=0, lowest=0)
     late: int = cell(default=0, lowest=0)
     failed: int = cell(default=0, lowest=0)
+    infeasible: int = cell(default=0, lowest=0)
     warm_used: bool = False
     error: str = ""
     limit_s: float | None = None

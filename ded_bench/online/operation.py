@@ -147,6 +147,7 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
         plans=outcome.plans,
         late=outcome.late,
         failed=outcome.failed,
+        infeasible=outcome.infeasible,
         warm_used=outcome.warm,
         method_s=outcome.method_s,
         loop_s=time.perf_counter() - started - outcome.method_s,

@@ -29,7 +29,8 @@ class Plan:
 
     schedule: Schedule | None
     late: bool = False  # it did not come in time
-    warm: bool = False  # the method started from its last plan
+    warm: bool = False  # the method was given the plan in force
+    infeasible: bool = False  # no schedule meets every limit, says the method; this one, if any, comes near
     seconds: float = 0.0  # of the clock, with the way to the method's process and back
     error: str = ""
 
@@ -62,8 +63,8 @@ class Planner:
         if not isinstance(answer, tuple):
             return self._none(answer, started)
         solution, warm = answer
-        seconds = time.perf_counter() - started
-        return Plan(solution.schedule, warm=warm, seconds=seconds, error=solution.error)
+        seconds, infeasible = time.perf_counter() - started, solution.status == Status.INFEASIBLE
+        return Plan(solution.schedule, False, warm, infeasible, seconds, solution.error)
 
     def _none(self, error: object, started: float) -> Plan:
         self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
@@ -98,16 +99,14 @@ def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:
 def _solve(
     case: Case, method: str, regime: str, settings: Settings, instance: Instance, last: Schedule | None
 ) -> tuple[Solution, bool]:
-    """Solve in this process, from the last plan if there is one and the method can; tells if it did."""
+    """Solve in this process as in operation, if the method knows how; tells if it was given the last plan."""
     started = time.perf_counter()
     solver = _prepared(case, method, regime, settings)
-    start = getattr(solver, "solve", None) if last is not None else None
-    answer = solver(instance) if start is None else start(instance, last=_as_solution(last))
-    return accept(answer, case, instance, time.perf_counter() - started), start is not None
-
-
-def _as_solution(schedule: Schedule | None) -> Solution:
-    return Solution(Status.FEASIBLE, schedule)
+    operate = getattr(solver, "solve", None)
+    start = None if last is None else Solution(Status.FEASIBLE, last)
+    answer = solver(instance) if operate is None else operate(instance, last=start)
+    warm = operate is not None and start is not None
+    return accept(answer, case, instance, time.perf_counter() - started), warm
 
 
 @functools.lru_cache(maxsize=4)

@@ -179,6 +179,55 @@ def test_knots_answer_alike_whatever_was_solved_before(case: Case, koopman: Koop
     assert again.iterations == fresh.iterations
 
 
+def least_excess(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
+    """The least sum, over pieces of the horizon, of the largest frequency excess in each; with every row."""
+    n_gen, grid = len(case.generators), instance.grid
+    knots = case.knot_times(grid[-1])
+    condensed = CondensedRollout.make(case, koopman, grid, knots)
+    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
+    first = np.unique(np.linspace(0, len(grid), ded_ko_knots.N_PIECES, endpoint=False).astype(int))
+    excess = np.eye(len(first))[np.searchsorted(first, np.arange(1, len(grid)), side="right") - 1]
+    excess = np.tile(excess, (n_gen, 1))
+    omega = condensed.gamma[:n_gen, 1:].reshape(-1, len(knots) * n_gen)
+    ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
+    rows, right, bound = [], [], case.omega_bound(regime)
+    for sign in (1, -1):
+        rows += [
+            np.hstack([sign * omega, -excess]),
+            np.hstack([sign * ramps, np.zeros((len(ramps), len(first)))]),
+        ]
+        right += [bound - sign * free[:n_gen, 1:].ravel(), np.tile(case.ramp * knots[1], len(knots) - 1)]
+    bounds = [(p, p) for p in instance.p_initial(case)]
+    bounds += (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True)) + len(first) * [(0, None)]
+    cost = np.append(np.zeros(len(knots) * n_gen), np.ones(len(first)))
+    answer = linprog(cost, A_ub=np.vstack(rows), b_ub=np.concatenate(right), bounds=bounds)
+    assert answer.status == 0
+    return float(answer.fun)
+
+
+def test_in_operation_what_is_infeasible_is_exceeded_least(ninebus: Case) -> None:
+    """A start beyond the bound: no schedule, but in operation the one of least excess; honest in both."""
+    koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))
+    instance, bound = short(ninebus, 0), ninebus.omega_bound("TO")
+    omega = {bus: 1.2 * bound for bus in ninebus.generators}
+    instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": omega})})
+    solver = ded_ko_knots.prepare_with(ninebus, koopman, "TO", Settings())
+    refused = solver(instance)
+    assert (refused.status, refused.schedule) == (Status.INFEASIBLE, None)
+    solution = solver.solve(instance)
+    assert (solution.status, solution.solver_objective) == (Status.INFEASIBLE, None)
+    grid = instance.grid
+    first = np.unique(np.linspace(0, len(grid), ded_ko_knots.N_PIECES, endpoint=False).astype(int))
+    over = np.abs(replay(ninebus, koopman, instance, solution.schedule).omega).max(axis=1) - bound
+    over[0] = 0.0
+    total = np.maximum(np.maximum.reduceat(over, first), 0.0).sum()
+    least = least_excess(ninebus, koopman, instance, "TO")
+    assert least > 0.2 * bound
+    assert total == pytest.approx(least, rel=1e-4)
+    feasible = short(ninebus, 1)
+    np.testing.assert_array_equal(solver.solve(feasible).schedule.p, solver(feasible).schedule.p)
+
+
 def test_tight_bounds_and_signs_need_more_rounds_than_one(ninebus: Case) -> None:
     """Where frequency limits bind and P_s changes sign, rows must have been added, or nothing was tested."""
     koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))

@@ -166,3 +166,24 @@ def test_knots_and_pieces_share_the_horizon():
     assert set(POINTS[:-1]) <= set(starts)
     assert 0 < np.diff(starts).min() <= np.diff(starts).max() <= PIECE
     assert MARGIN > 0
+
+
+def test_in_operation_what_cannot_be_met_is_exceeded_least(case, alter):
+    """The sum over knot intervals of the largest excess is below that of what is optimal at looser bounds."""
+    instance = short(case, 0)
+    initial = instance.model_dump(by_alias=True)["initial"]
+    fast = alter(instance, initial=initial | {"omega": dict.fromkeys(case.generators, 0.05)})
+    knots, bound = np.rint(case.knot_times(HORIZON) / fast.dt_s).astype(int), case.omega_bound("TO")
+
+    def excess(schedule):
+        over = np.abs(simulate(case, fast, schedule).omega[1:]).max(axis=1) - bound
+        return np.maximum(np.maximum.reduceat(over, knots[:-1]), 0.0).sum()
+
+    solution = prepare(case, "TO", Settings()).solve(fast)
+    assert (solution.status, solution.error) == (Status.INFEASIBLE, Status.INFEASIBLE.sentence)
+    least = excess(solution.schedule)
+    assert least > 0
+    loose = case.regimes["TO"].model_copy(update={"omega_hz": 0.05 / (2 * np.pi)})
+    others = [prepare(case.model_copy(update={"regimes": {"TO": loose}}), "TO", Settings())(fast).schedule]
+    others.append(ed.dispatch(case, fast, 1.0))
+    assert least < 0.999 * min(map(excess, others))

@@ -7,9 +7,11 @@ import time
 import numpy as np
 
 from ded_bench.methods import ed
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
 
 
 def _third(instance: Instance) -> bool:
@@ -41,3 +43,20 @@ def sleeps(instance: Instance, regime: str, case: Case) -> Schedule:
 def never(instance: Instance, regime: str, case: Case) -> Schedule:
     """Have no answer at all."""
     raise ValueError("never")
+
+
+class Strained:
+    """Goes on as before, and says at every third plan that no schedule meets every limit."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+
+    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Answer with the plan in force, if there is one."""
+        schedule = ed.dispatch(self.case, instance, 1.0) if last is None else last.schedule
+        return Solution(Status.INFEASIBLE if _third(instance) else Status.FEASIBLE, schedule)
+
+
+def strained(case: Case, regime: str, settings: Settings) -> Strained:
+    """Return an object that solves."""
+    return Strained(case)

@@ -147,6 +147,15 @@ def test_a_faulty_method_is_counted_and_the_loop_goes_on(threebus, name, late, f
     assert (moved == 0) == (name == "never")
 
 
+@pytest.mark.parametrize("warm", [True, False])
+def test_plans_that_meet_not_every_limit_are_followed_and_counted(threebus, warm):
+    """By a method of others, which is given the plan in force if that is wanted."""
+    planner = Planner(threebus, REGIME, "tests.online.faulty_methods:strained", Settings())
+    outcome = run_loop(threebus, drawn(threebus, 1), planner, LoopOptions(warm=warm))
+    assert (outcome.plans, outcome.late, outcome.failed, outcome.infeasible) == (6, 0, 0, 2)
+    assert (outcome.warm, outcome.error) == (warm, "")
+
+
 def test_following_respects_ramps():
     """Towards a jump at the limit; unchanged where the plan is within it."""
     step = np.array([0.1, 1.0])

@@ -17,9 +17,8 @@ from tqdm import tqdm
 
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.model import Koopman
-from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Channels, Inputs
-from ded_bench.methods.dpc.loss import Objective
+from ded_bench.methods.dpc.loss import Objective, coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.policy import METHOD, DispatchPolicy
 from ded_bench.methods.dpc.response import Response
@@ -192,7 +191,7 @@ def train(
         "torch": torch.__version__,
         "device": device,
     }
-    policy = DispatchPolicy.of(scope, network, training)
+    policy = DispatchPolicy(scope, network.cpu().eval(), training)
     policy.save(out)
     write_history(out, run.history)
     return policy

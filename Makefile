@@ -1,6 +1,6 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report suite quick radau starts models rollouts ablation certify test clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report online suite quick radau starts models rollouts ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
@@ -28,6 +28,15 @@ LIMIT_ded-radau_140bus ?= 5
 LIMIT_ded-ko_68bus     ?= 10
 LIMIT_ded-ko_140bus    ?= 5
 
+# How many scenarios of the closed loop slow methods operate; the sweeps over latency and forecast take fewer.
+SCENARIOS              ?= 20
+SCENARIOS_ded_9bus     ?= 2
+SCENARIOS_ded          ?= 0
+SCENARIOS_ded-radau    ?= 0
+SCENARIOS_ded-ko       ?= 0
+SCENARIOS_ded-slp_9bus ?= 5
+SCENARIOS_sweep        ?= 10
+
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
 MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)
 # Policies: on 9bus trained, the paper's too; elsewhere trained if TRAIN asks, or taken from the reference run.
@@ -48,6 +57,12 @@ CHOICE   = --case $(CASE) --split $(SPLIT) $(ONLY) $(if $(FEWEST),--limit $(FEWE
 # $(call SOLVE,methods,options): a command for each method, none for one that is limited to 0 instances
 SOLVE    = $(foreach m,$(1),$(if $(filter-out 0,$(call LIMITED,$m)),$(DED) solve --method $m$(2) \
   $(call CHOICE,$m)$(NEWLINE)))
+# $(call OPERATE,method,study): a command of the closed loop; a study, if named, tells how many scenarios
+SCENES   = $(or $(SCENARIOS_$(1)_$(CASE)),$(SCENARIOS_$(1)),$(SCENARIOS))
+OPERATE  = $(DED) online --method $(1) --case $(CASE) $(ONLY) --scenarios $(call SCENES,$(or $(2),$(1))) \
+  --workers $(WORKERS) --out $(RESULTS)
+LATENCIES  := 0,0.03,0.1,0.3,1,3,7,15,30
+SURROGATE  := $(if $(filter 9bus,$(CASE)),,--model trajectory)
 VALIDATION = $(subst --split $(SPLIT),--split validation,$(CHOICE))
 
 help:  ## show this list
@@ -109,6 +124,15 @@ bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),
 
 report: bench  ## everything that is missing, then the tables and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
+
+online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency and forecast
+	for s in 1 10; do $(call OPERATE,ed) --settings $${s}s --period $$s || exit 1; done
+	$(call OPERATE,ed) --period 60
+	$(foreach m,ded-slp ded-ko-knots $(if $(ANSWERING),$(POLICIES) ded-dpc-refined) ded,$(if \
+	  $(filter-out 0,$(call SCENES,$m)),$(call OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
+	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency $(LATENCIES)
+	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency 0,1,7,30 --forecast perfect,worse,persistence
+	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency 1,7,30 --state present
 
 suite:  ## the reports of all cases, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done

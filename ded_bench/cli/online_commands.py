@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from ded_bench.problem.scenario_sampling import scenario_files, scenario_folder
 
 if TYPE_CHECKING:
     from ded_bench.online.online_results import OnlineRow
+    from ded_bench.online.operation import Operation
 
 
 def add_commands(commands: Any) -> None:
@@ -45,8 +47,20 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
     p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans (1 s)")
-    p.add_argument("--latency", default="timing", metavar="L", help="timing (default), zero, or seconds")
-    p.add_argument("--forecast", choices=QUALITIES, default=QUALITIES[0])
+    p.add_argument(
+        "--latency",
+        type=names,
+        default=("timing",),
+        metavar="L[,L]",
+        help="timing (default), zero, or seconds",
+    )
+    p.add_argument(
+        "--forecast",
+        type=_qualities,
+        default=QUALITIES[:1],
+        metavar="F[,F]",
+        help=f"{', '.join(QUALITIES)} (default: {QUALITIES[0]})",
+    )
     p.add_argument(
         "--state",
         choices=("predicted", "present"),
@@ -60,15 +74,31 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_online)
 
 
+def _qualities(text: str) -> tuple[str, ...]:
+    """Read qualities of forecasts separated by commas."""
+    for name in names(text):
+        if name not in QUALITIES:
+            raise argparse.ArgumentTypeError(f"{name}: not one of {', '.join(QUALITIES)}")
+    return names(text)
+
+
 def _online(a: argparse.Namespace) -> int:
-    from ded_bench.methods.registry import get_method
-    from ded_bench.online.loop import LoopOptions
     from ded_bench.online.online_results import OnlineResults
-    from ded_bench.online.operation import make_operations, operate
-    from ded_bench.online.planner import LIMIT_S
+    from ded_bench.online.operation import operate
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
+    rows = operate(case, _operations(a, case, folder), OnlineResults(folder), a.workers, _print_row)
+    return 1 if any(row.objective is None for row in rows) else 0
+
+
+def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operation]:
+    """Every row asked for: all methods, then the next latency or forecast."""
+    from ded_bench.methods.registry import get_method
+    from ded_bench.online.loop import LoopOptions
+    from ded_bench.online.operation import make_operations
+    from ded_bench.online.planner import LIMIT_S
+
     search = search_folders(case, folder)
     files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
     methods = [
@@ -78,18 +108,21 @@ def _online(a: argparse.Namespace) -> int:
     ]
     if not methods:
         raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
-    operations = make_operations(
-        case,
-        load_scenarios(files, case),
-        methods,
-        a.regime or tuple(case.regimes),
-        LoopOptions(a.period, forecast=a.forecast, predict=a.state == "predicted", warm=not a.cold),
-        a.latency,
-        search,
-        a.time_limit or LIMIT_S,
-    )
-    rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row)
-    return 1 if any(row.objective is None for row in rows) else 0
+    scenarios, regimes = load_scenarios(files, case), a.regime or tuple(case.regimes)
+    return [
+        operation
+        for forecast, latency in itertools.product(a.forecast, a.latency)
+        for operation in make_operations(
+            case,
+            scenarios,
+            methods,
+            regimes,
+            LoopOptions(a.period, forecast=forecast, predict=a.state == "predicted", warm=not a.cold),
+            latency,
+            search,
+            a.time_limit or LIMIT_S,
+        )
+    ]
 
 
 def _print_row(row: OnlineRow) -> None:

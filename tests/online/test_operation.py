@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import shutil
 
 import numpy as np
@@ -130,7 +131,12 @@ def test_the_command(scenarios, tmp_path, capsys):
     assert "over hindsight" in capsys.readouterr().out
     assert main([*line, "--latency", "0"]) == 0
     assert capsys.readouterr().out == ""
-    assert (tmp_path / "online.csv").is_file()
+    assert main([*line, "--latency", "0,1.5", "--forecast", "announced,perfect"]) == 0
+    assert capsys.readouterr().out.count("over hindsight") == 3
+    rows = OnlineResults(tmp_path).table.rows
+    assert {(key.latency_s, key.forecast) for key in rows} == set(
+        itertools.product((0.0, 1.5), ("announced", "perfect"))
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,6 +144,7 @@ def test_the_command(scenarios, tmp_path, capsys):
     [
         (["--latency", "soon"], "--latency"),
         (["--latency", "timing"], "not timed"),
+        (["--latency", "0,-1"], "neither timing nor zero nor a number"),
         (["--method", "nobody"], "unknown method"),
         (["--regime", "XX"], "unknown regime"),
         (["--scenario", "nowhere.json"], "cannot be read"),

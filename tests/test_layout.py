@@ -30,8 +30,6 @@ FLOORS = (
 )
 MAX_LINES = 400
 MAX_FUNCTION, MAX_ARGUMENTS = 80, 9
-#: May take more: its keywords are what a certificate promises, each with the promise's default.
-MANY_ARGUMENTS = ("certify",)
 #: Twelve hexadecimal digits or more.
 FINGERPRINT = re.compile(r"\b[0-9a-f]{12,}\b")
 #: What the ground floors may use besides Python's own library: no solver, no model builder, no torch.
@@ -172,8 +170,7 @@ def oversized(source: str) -> list[str]:
             count = len(names) - (names[:1] in (["self"], ["cls"]))
             first = node.body[1] if ast.get_docstring(node) and node.body[1:] else node.body[0]
             lines = (node.end_lineno or 0) - first.lineno + 1
-            crowded = count > MAX_ARGUMENTS and node.name not in MANY_ARGUMENTS
-            if lines > MAX_FUNCTION or crowded:
+            if lines > MAX_FUNCTION or count > MAX_ARGUMENTS:
                 found.append(f"{node.name}: {lines} lines, {count} arguments")
     return found
 

@@ -113,7 +113,7 @@ def _bench(a: argparse.Namespace) -> int:
 
 
 def _certify(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.certificate import certify, rows_file, save_certificate
+    from ded_bench.evaluate.certificate import Criteria, certify, rows_file, save_certificate
 
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
@@ -127,11 +127,9 @@ def _certify(a: argparse.Namespace) -> int:
             regime,
             settings,
             rows_file(folder, a.method, regime, settings),
+            Criteria(gap_percent=a.gap, tolerance_hz=a.tolerance, delta=a.delta),
             count=a.count,
             seed=a.seed,
-            gap_percent=a.gap,
-            tolerance_hz=a.tolerance,
-            delta=a.delta,
             workers=a.workers,
         )
         save_certificate(folder, certificate)

@@ -36,7 +36,7 @@ from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.code import code_of_method
+from ded_bench.run.code import code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results
@@ -323,12 +323,9 @@ def _facts(case: Case, job: Job) -> dict[str, str]:
     """What the rows of one method and regime have in common."""
     method = get_method(job.method)
     used = method.artifacts(case, job.regime, job.settings)
-    named = {
-        kind: "+".join(f"{a.name}@{a.fingerprint}" for a in used if a.kind == kind)
-        for kind in ("model", "policy")
-    }
+    shaped_by = {kind: named(used, kind) for kind in ("model", "policy")}
     made_by = {"code": code_of_method(method, used), "version": version(), "host": host()}
-    return named | made_by | {"case": case.id}
+    return shaped_by | made_by | {"case": case.id}
 
 
 def _run_id(

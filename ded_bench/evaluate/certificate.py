@@ -33,7 +33,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.code import code_of, code_of_method
+from ded_bench.run.code import code_of, code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.truth import score as scorer
@@ -41,11 +41,20 @@ from ded_bench.truth.score import STRICT_HZ, STRICT_PU, Score, score
 from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import SimulationError
 
-REFERENCE = "ded-ko-knots"
-COUNT, DELTA, GAP_PERCENT = 10_000, 0.01, 1.0
 FILE = "certificate.json"
 #: Instances answered, re-simulated and saved together.
 CHUNK = 50
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """What counts as a success, and how sure a bound is: its confidence is 1 - delta."""
+
+    reference: str = "ded-ko-knots"
+    gap_percent: float = 1.0
+    tolerance_hz: float = STRICT_HZ
+    tolerance_pu: float = STRICT_PU
+    delta: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -157,14 +166,10 @@ def certify(
     regime: str,
     settings: Settings,
     rows_path: Path,
+    criteria: Criteria,
     *,
-    count: int = COUNT,
+    count: int = 10_000,
     seed: int = 0,
-    reference: str = REFERENCE,
-    gap_percent: float = GAP_PERCENT,
-    tolerance_hz: float = STRICT_HZ,
-    tolerance_pu: float = STRICT_PU,
-    delta: float = DELTA,
     workers: int = 1,
 ) -> Certificate:
     """Answer and re-simulate what `rows_path` lacks of the instances, and certify.
@@ -179,6 +184,7 @@ def certify(
         InputError: unknown method or regime, a missing policy or model, or a wrong file of rows.
     """
     case.check_regimes([regime])
+    reference = criteria.reference
     made_by = _made_by(case, method, reference, regime, settings)
     fingerprint = _fingerprint(case, method, reference, settings, seed, made_by)
     done = {r.index: r for r in read_rows(rows_path) if r.fingerprint == fingerprint and r.index < count}
@@ -191,13 +197,13 @@ def certify(
             ROWS.write(rows_path, [done[index] for index in sorted(done)])
             bar.update(len(made))
     rows = ROWS.frame(done.values())
-    limits = meets_limits(rows, tolerance_hz, tolerance_pu)
-    near = gaps(rows) <= gap_percent
+    limits = meets_limits(rows, criteria.tolerance_hz, criteria.tolerance_pu)
+    near = gaps(rows) <= criteria.gap_percent
     successes = int((limits & near).sum())
+    promise: dict[str, Any] = asdict(criteria) | made_by
     return Certificate(
         case=case.id,
         method=method,
-        reference=reference,
         regime=regime,
         settings=settings.slug,
         seed=CERTIFICATE_SEED + seed,
@@ -205,17 +211,13 @@ def certify(
         successes=successes,
         meets_limits=int(limits.sum()),
         near_reference=int(near.sum()),
-        tolerance_hz=tolerance_hz,
-        tolerance_pu=tolerance_pu,
-        gap_percent=gap_percent,
-        delta=delta,
-        clopper_pearson=clopper_pearson(successes, count, delta),
-        hoeffding=hoeffding(successes, count, delta),
+        clopper_pearson=clopper_pearson(successes, count, criteria.delta),
+        hoeffding=hoeffding(successes, count, criteria.delta),
         artifacts=fingerprint,
         version=version(),
         host=host(),
         date=now(),
-        **made_by,
+        **promise,
     )
 
 
@@ -312,7 +314,7 @@ def _made_by(case: Case, method: str, reference: str, regime: str, settings: Set
         found[field] = code_of_method(answering, artifacts)
         used += [artifact for artifact in artifacts if artifact not in used]
     for kind in ("model", "policy"):
-        found[kind] = "+".join(f"{a.name}@{a.fingerprint}" for a in used if a.kind == kind)
+        found[kind] = named(used, kind)
     return found | {"score_code": code_of(scorer.__name__)}
 
 

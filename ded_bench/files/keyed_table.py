@@ -12,19 +12,31 @@ import fcntl
 import os
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.files.table import Table, csv_line, records
 
 K = TypeVar("K", bound=Hashable)
-T = TypeVar("T")
+T = TypeVar("T", bound="Keyed")
 
 #: A table is compacted when more lines than it has rows, and than this, are superseded.
 FEW_SUPERSEDED = 100
 #: So many bytes before a known end of a file tell whether it has only grown since.
 _TAIL = 256
+
+
+class Keyed(Protocol):
+    """A row that knows its place in the table and what it was made from."""
+
+    @property
+    def key(self) -> Any:
+        """What makes the row unique."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes with all that decides on the row."""
 
 
 class _Seen(NamedTuple):
@@ -42,15 +54,20 @@ class KeyedTable(Generic[K, T]):
         rows: those on disk at the last `reload` or `add`.
     """
 
-    def __init__(self, path: Path, table: Table[T], key: Callable[[T], K]) -> None:
+    def __init__(self, path: Path, table: Table[T]) -> None:
         self.path = path
         self.rows: dict[K, T] = {}
-        self._table, self._key = table, key
+        self._table = table
         self._others: dict[K, dict[str, str]] = {}  # cells of columns that `table` does not declare
         self._header: tuple[str, ...] = table.names
         self._superseded = 0
         self._seen: _Seen | None = None
         self.reload()
+
+    def made_from(self, key: K, fingerprint: str) -> bool:
+        """Whether there is a row of this key, made from the same input."""
+        row = self.rows.get(key)
+        return row is not None and row.fingerprint == fingerprint
 
     def reload(self) -> None:
         """Read what other processes have added; InputError if the file is wrong."""
@@ -123,7 +140,7 @@ class KeyedTable(Generic[K, T]):
     def _take(self, found: Iterable[tuple[T, dict[str, str]]]) -> None:
         rows = dict(self.rows)  # whoever iterates over the present ones may add rows meanwhile
         for row, others in list(found):  # all of them are right, or none is taken
-            key = self._key(row)
+            key = row.key
             self._superseded += key in rows
             rows[key] = row
             self._others[key] = others

@@ -157,18 +157,8 @@ class OnlineResults:
 
     def __init__(self, folder: Path) -> None:
         self.files = OnlineFiles(folder)
-        self.table = KeyedTable(self.files.table, ONLINE, lambda row: row.key)
-        self.hindsight = KeyedTable(self.files.hindsight, HINDSIGHT, lambda row: row.key)
-
-    def finished(self, key: OnlineKey, fingerprint: str) -> bool:
-        """Whether a row is there and was made from the same input."""
-        row = self.table.rows.get(key)
-        return row is not None and row.fingerprint == fingerprint
-
-    def looked_back(self, scenario: str, regime: str, fingerprint: str) -> bool:
-        """Whether a scenario's hindsight is there and was made from the same input."""
-        row = self.hindsight.rows.get((scenario, regime))
-        return row is not None and row.fingerprint == fingerprint
+        self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
+        self.hindsight = KeyedTable[tuple[str, str], HindsightRow](self.files.hindsight, HINDSIGHT)
 
 
 def keep_trajectory(path: Path, trajectory: Trajectory) -> None:

@@ -33,7 +33,7 @@ from ded_bench.online.online_results import (
 from ded_bench.online.planner import LIMIT_S, Planner
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
-from ded_bench.run.code import code_of, code_of_method
+from ded_bench.run.code import code_of, code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import reason_of
@@ -120,7 +120,7 @@ def operate(
     Raises:
         WorkersLostError: the workers cannot run this package.
     """
-    todo = [o for o in operations if not results.finished(o.key, o.fingerprint)]
+    todo = [o for o in operations if not results.table.made_from(o.key, o.fingerprint)]
     with Workers(workers) as pool:
         _look_back(case, todo, results, pool)
         calls = ((operate_one, (case, o, results.files)) for o in todo)
@@ -174,7 +174,7 @@ def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, po
     missing = [
         (scenario, regime)
         for scenario, regime in wanted.values()
-        if not results.looked_back(scenario.id, regime, _fingerprint(case, scenario))
+        if not results.hindsight.made_from((scenario.id, regime), _fingerprint(case, scenario))
     ]
     calls = ((look_back, (case, *pair, results.files)) for pair in missing)
     for (scenario, regime), answer in tqdm(
@@ -205,8 +205,8 @@ def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> O
         limit_s=o.limit_s,
         latency_source=o.latency_source,
         case=o.scenario.case,
-        model=_named(o, "model"),
-        policy=_named(o, "policy"),
+        model=named(o.artifacts, "model"),
+        policy=named(o.artifacts, "policy"),
         fingerprint=o.fingerprint,
         code=o.code,
         online_code=code_of(loop_module.__name__),
@@ -214,10 +214,6 @@ def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> O
         host=host(),
         date=now(),
     )
-
-
-def _named(o: Operation, kind: str) -> str:
-    return "+".join(f"{a.name}@{a.fingerprint}" for a in o.artifacts if a.kind == kind)
 
 
 def _hindsight_row(case: Case, scenario: Scenario, regime: str) -> HindsightRow:

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from tqdm import tqdm
-
-from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
-from ded_bench.files.table import LARGEST, Table, cell, plain_name
+from ded_bench.files.table import Table, cell, plain_name
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results, Row
-from ded_bench.run.scoring import FAILED, SCORE_BATCH
-from ded_bench.run.tasks import reason_of
+from ded_bench.run.scoring import score_cells, score_schedules, tasks_of
 from ded_bench.truth import ac_simulate
 from ded_bench.truth.ac_simulate import score_ac
-from ded_bench.truth.score import Score
-from ded_bench.truth.simulate import SimulationError
 
 #: The table's name in a results folder.
 FILE = "ac.csv"
@@ -68,7 +61,7 @@ class AcResults(KeyedTable[Key, AcRow]):
     """The rows of a results folder on the AC network; InputError if there is a table, but a wrong one."""
 
     def __init__(self, folder: str | Path) -> None:
-        super().__init__(Path(folder) / FILE, AC_ROWS, lambda row: row.key)
+        super().__init__(Path(folder) / FILE, AC_ROWS)
 
 
 def score_on_ac(
@@ -90,64 +83,20 @@ def score_on_ac(
         InputError: none of the rows' schedules is kept, or case and data do not fit together.
     """
     data.machines_of(case)
-    known = [row for row in results.rows.values() if row.instance in instances]
-    kept = [row for row in known if results.schedule_path(row.key).is_file()]
-    if not kept:
-        raise InputError(results.paths.schedules, "", "holds no schedule of these rows")
+    tasks = tasks_of(results.kept(instances), instances)
     table, made = AcResults(results.folder), []
-    batches = [kept[start : start + SCORE_BATCH] for start in range(0, len(kept), SCORE_BATCH)]
-    calls = (
-        (_score_batch, (case, data, [_problem(row, case, instances, results) for row in batch]))
-        for batch in batches
-    )
-    with Workers(workers) as pool, tqdm(total=len(kept), unit="row", disable=None, desc="score") as bar:
-        for batch, answer in pool.imap(calls, batches):
-            verdicts = answer if isinstance(answer, list) else [answer] * len(batch)
-            rows = [_row(row, data, verdict) for row, verdict in zip(batch, verdicts, strict=True)]
+    with Workers(workers) as pool:
+        for batch, verdicts in score_schedules(case, tasks, results, pool, partial(score_ac, data=data)):
+            rows = [
+                _row(results.rows[task.key], data, verdict)
+                for task, verdict in zip(batch, verdicts, strict=True)
+            ]
             table.add(rows)
             made += rows
-            bar.update(len(batch))
     table.compact()
     return table.path, made
 
 
-Problem = tuple[Instance, Schedule, str]
-
-
-def _problem(
-    row: Row, case: Case, instances: Mapping[str, Instance], results: Results
-) -> Problem | InputError:
-    """What is to be scored, or why it cannot be read."""
-    instance = instances[row.instance]
-    try:
-        return instance, results.schedule(row.key, case, instance), row.regime
-    except InputError as error:
-        return error
-
-
-def _score_batch(
-    case: Case, data: AcCase, problems: Sequence[Problem | InputError]
-) -> list[Score | SimulationError | InputError]:
-    verdicts: list[Score | SimulationError | InputError] = []
-    for problem in problems:
-        try:
-            verdicts.append(problem if isinstance(problem, InputError) else score_ac(case, data, *problem))
-        except SimulationError as error:
-            verdicts.append(error)
-    return verdicts
-
-
 def _row(row: Row, data: AcCase, verdict: object) -> AcRow:
-    made = AcRow(*row.key, case=row.case, fingerprint=row.fingerprint, data=data.fingerprint)
-    if not isinstance(verdict, Score):
-        return dataclasses.replace(made, error=f"{FAILED}{reason_of(verdict)}")
-    numbers = dataclasses.asdict(verdict)
-    if not all(abs(value) <= LARGEST for value in numbers.values()):
-        return dataclasses.replace(made, error=f"{FAILED}cost or violations are above {LARGEST:g}")
-    return dataclasses.replace(
-        made,
-        feasible=verdict.feasible,
-        feasible_strict=verdict.feasible_strict,
-        score_code=code_of(ac_simulate.__name__),
-        **numbers,
-    )
+    cells = score_cells(verdict, code_of(ac_simulate.__name__))
+    return AcRow(*row.key, case=row.case, fingerprint=row.fingerprint, data=data.fingerprint, **cells)

@@ -6,7 +6,7 @@ import ast
 import functools
 import hashlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import ded_bench
@@ -38,6 +38,11 @@ def code_of_method(method: Method, artifacts: tuple[Artifact, ...]) -> str:
     """The code of one of our methods, or what one of others says of its own."""
     foreign = [artifact.fingerprint for artifact in artifacts if artifact.kind == "code"]
     return code_of(method.module) if _path(method.module) else "-".join(foreign)
+
+
+def named(artifacts: Iterable[Artifact], kind: str) -> str:
+    """The models, or the policies, that shaped an answer: `name@fingerprint`, joined by +, as rows name them."""
+    return "+".join(f"{a.name}@{a.fingerprint}" for a in artifacts if a.kind == kind)
 
 
 def content_of(source: str) -> str:

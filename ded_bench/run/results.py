@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.files.table import Table, cell, plain_name
@@ -94,7 +96,7 @@ class Results(KeyedTable[Key, Row]):
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.paths = ResultsFolder(self.folder)
-        super().__init__(self.paths.results, ROWS, lambda row: row.key)
+        super().__init__(self.paths.results, ROWS)
 
     def has(self, key: Key, fingerprint: str) -> bool:
         """Whether a row is finished: same fingerprint, and scored.
@@ -102,15 +104,14 @@ class Results(KeyedTable[Key, Row]):
         One without an objective, for which scoring has failed, needs its schedule as well. Others are
         finished without: a published folder keeps a part of its schedules only.
         """
-        row = self.rows.get(key)
-        if row is None or row.fingerprint != fingerprint:
+        if not self.made_from(key, fingerprint):
             return False
+        row = self.rows[key]
         return row.objective is not None or (row.scored and self.schedule_path(key).is_file())
 
     def solved(self, key: Key, fingerprint: str) -> bool:
         """Whether a schedule for this row is on disk, scored or not."""
-        row = self.rows.get(key)
-        return row is not None and row.fingerprint == fingerprint and self.schedule_path(key).is_file()
+        return self.made_from(key, fingerprint) and self.schedule_path(key).is_file()
 
     def schedule_path(self, key: Key) -> Path:
         """Where the schedule of a row is kept."""
@@ -119,6 +120,18 @@ class Results(KeyedTable[Key, Row]):
     def schedule(self, key: Key, case: Case, instance: Instance) -> Schedule:
         """Read the schedule of a row; InputError if it is missing or wrong."""
         return Schedule.read(self.schedule_path(key), case, instance.horizon_s)
+
+    def kept(self, instances: Container[str]) -> list[Row]:
+        """The rows of some instances, by id, whose schedules are kept.
+
+        Raises:
+            InputError: there is none.
+        """
+        known = [row for row in self.rows.values() if row.instance in instances]
+        kept = [row for row in known if self.schedule_path(row.key).is_file()]
+        if not kept:
+            raise InputError(self.paths.schedules, "", "holds no schedule of these rows")
+        return kept
 
     def frame(self) -> pd.DataFrame:
         """The table, one row each, typed columns; empty cells are missing values."""

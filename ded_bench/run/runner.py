@@ -19,7 +19,7 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.run.cluster import open_workers
-from ded_bench.run.code import code_of_method
+from ded_bench.run.code import code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Results, Row
@@ -189,14 +189,10 @@ def unscored_row(task: Task, solution: Solution, workers: int, problems_version:
         seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
         fingerprint=task.fingerprint,
         time_limit_s=task.settings.time_limit_s,
-        model=_named(task, "model"),
-        policy=_named(task, "policy"),
+        model=named(task.artifacts, "model"),
+        policy=named(task.artifacts, "policy"),
         code=task.code,
     )
-
-
-def _named(task: Task, kind: str) -> str:
-    return "+".join(f"{a.name}@{a.fingerprint}" for a in task.artifacts if a.kind == kind)
 
 
 def _storable(value: float | None) -> float | None:

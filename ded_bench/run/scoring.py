@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from tqdm import tqdm
 
@@ -18,9 +19,9 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Results, Row
-from ded_bench.run.tasks import Task, reason_of, score_tasks
-from ded_bench.truth import score as scorer
-from ded_bench.truth.score import Score
+from ded_bench.run.tasks import Scorer, Task, reason_of, score_tasks
+from ded_bench.truth import score as score_module
+from ded_bench.truth.score import Score, score
 
 #: Schedules scored side by side in one task; more gains little, fewer costs overhead.
 SCORE_BATCH = 50
@@ -51,7 +52,7 @@ class Check:
 
 
 def score_schedules(
-    case: Case, tasks: Sequence[Task], results: Results, pool: Workers
+    case: Case, tasks: Sequence[Task], results: Results, pool: Workers, scorer: Scorer = score
 ) -> Iterator[tuple[list[Task], list[object]]]:
     """Score the kept schedules of tasks, batch by batch; a schedule that cannot be read has an InputError."""
     batches = list(_batches(tasks))
@@ -67,7 +68,7 @@ def score_schedules(
                     wrong[id(task)] = error
             return [task for task, _ in sound], [schedule for _, schedule in sound]
 
-        calls = ((score_tasks, (case, *read(batch))) for batch in batches)  # read as they are needed
+        calls = ((score_tasks, (case, *read(batch), scorer)) for batch in batches)  # read as they are needed
         for batch, answer in pool.imap(calls, batches):
             verdicts = iter(answer) if isinstance(answer, list) else None
             yield (
@@ -79,19 +80,23 @@ def score_schedules(
 
 def scored_row(row: Row, verdict: object) -> Row:
     """A row with the scorer's verdict filled in, or with the reason why there is none."""
-    row = without_score(row)
+    return dataclasses.replace(without_score(row), **score_cells(verdict, code_of(score_module.__name__)))
+
+
+def score_cells(verdict: object, code: str) -> dict[str, Any]:
+    """What a verdict says as the cells of a row, or the error that says why there is none.
+
+    Args:
+        verdict: a Score, or anything else for a schedule that could not be scored.
+        code: of the scorer.
+    """
     if not isinstance(verdict, Score):
-        return dataclasses.replace(row, error=f"{FAILED}{reason_of(verdict)}")
+        return {"error": f"{FAILED}{reason_of(verdict)}"}
     numbers = dataclasses.asdict(verdict)
     if not all(abs(value) <= LARGEST for value in numbers.values()):
-        return dataclasses.replace(row, error=f"{FAILED}cost or violations are above {LARGEST:g}")
-    return dataclasses.replace(
-        row,
-        feasible=verdict.feasible,
-        feasible_strict=verdict.feasible_strict,
-        score_code=code_of(scorer.__name__),
-        **numbers,
-    )
+        return {"error": f"{FAILED}cost or violations are above {LARGEST:g}"}
+    feasible = {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
+    return numbers | feasible | {"score_code": code}
 
 
 def without_score(row: Row) -> Row:
@@ -120,15 +125,8 @@ def rescore(
     Raises:
         InputError: none of the rows' schedules is kept.
     """
-    known = [row for row in results.rows.values() if row.instance in instances]
-    kept = [row for row in known if results.schedule_path(row.key).is_file()]
-    if not kept:
-        raise InputError(results.paths.schedules, "", "holds no schedule of these rows")
-    chosen = kept if update else [row for row in kept if row.scored]
-    tasks = [
-        Task(instances[row.instance], row.split, row.regime, row.method, Settings(row.settings), "")
-        for row in chosen
-    ]
+    kept = results.kept(instances)
+    tasks = tasks_of(kept if update else [row for row in kept if row.scored], instances)
     rows, differences = [], []
     with Workers(workers) as pool:
         for batch, verdicts in score_schedules(case, tasks, results, pool):
@@ -145,13 +143,22 @@ def rescore(
                 results.add(new for _, new in pairs)
     if update:
         results.compact()
+    unknown = sum(row.instance not in instances for row in results.rows.values())
     return Check(
         rows,
         differences,
-        without_schedule=len(known) - len(kept),
+        without_schedule=len(results.rows) - unknown - len(kept),
         unscored=sum(not row.scored for row in kept) if not update else 0,
-        unknown=len(results.rows) - len(known),
+        unknown=unknown,
     )
+
+
+def tasks_of(rows: Iterable[Row], instances: Mapping[str, Instance]) -> list[Task]:
+    """Rows whose schedules are kept, as tasks to be scored."""
+    return [
+        Task(instances[row.instance], row.split, row.regime, row.method, Settings(row.settings), "")
+        for row in rows
+    ]
 
 
 def _differences(old: Row, new: Row) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ded_bench.methods.artifact import Artifact
@@ -57,14 +57,18 @@ def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
         return failed(error), host()
 
 
+#: How a schedule is judged: `scorer(case, instance=…, schedule=…, regime=…)`, a function that can be pickled.
+Scorer = Callable[..., Score]
+
+
 def score_tasks(
-    case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule]
+    case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule], scorer: Scorer = score
 ) -> list[Score | SimulationError]:
     """Score tasks one by one; the error stands for those that lose synchronism."""
     verdicts: list[Score | SimulationError] = []
     for task, schedule in zip(tasks, schedules, strict=True):
         try:
-            verdicts.append(score(case, task.instance, schedule, task.regime))
+            verdicts.append(scorer(case, instance=task.instance, schedule=schedule, regime=task.regime))
         except SimulationError as error:
             verdicts.append(error)
     return verdicts

@@ -13,6 +13,7 @@ from scipy.stats import binom
 from ded_bench.evaluate import certificate
 from ded_bench.evaluate.certificate import (
     ROWS,
+    Criteria,
     certify,
     clopper_pearson,
     gaps,
@@ -89,8 +90,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     certificate._prepared.cache_clear()
 
 
-def run(case: Case, file: Path, regime: str, count: int = 4, **options: object) -> certificate.Certificate:
-    return certify(case, "ded-dpc-paper", regime, SETTINGS, file, count=count, reference="ded", **options)
+def run(case: Case, file: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:
+    chosen = Criteria("ded", **criteria)
+    return certify(case, "ded-dpc-paper", regime, SETTINGS, file, chosen, count=4, seed=seed)
 
 
 def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case, tmp_path: Path) -> None:

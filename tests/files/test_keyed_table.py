@@ -20,15 +20,30 @@ from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table
 
 
+class Named:
+    """A row's key is its name; what it was made from is its note."""
+
+    name: str
+    note: str
+
+    @property
+    def key(self) -> str:
+        return self.name
+
+    @property
+    def fingerprint(self) -> str:
+        return self.note
+
+
 @dataclass(frozen=True)
-class Old:
+class Old(Named):
     name: str
     number: int
     note: str = ""
 
 
 @dataclass(frozen=True)
-class New:
+class New(Named):
     name: str
     number: int
     code: str = ""
@@ -36,11 +51,11 @@ class New:
 
 
 def old(folder: Path) -> KeyedTable[str, Old]:
-    return KeyedTable(folder / "table.csv", Table(Old), lambda row: row.name)
+    return KeyedTable(folder / "table.csv", Table(Old))
 
 
 def new(folder: Path) -> KeyedTable[str, New]:
-    return KeyedTable(folder / "table.csv", Table(New), lambda row: row.name)
+    return KeyedTable(folder / "table.csv", Table(New))
 
 
 def lines(folder: Path) -> list[str]:
@@ -61,6 +76,14 @@ def test_later_lines_win_and_rows_keep_their_places(tmp_path: Path) -> None:
     table.compact()
     assert (tmp_path / "table.csv").stat() == before
     assert [p.name for p in tmp_path.iterdir() if p.name != ".lock"] == ["table.csv"]
+
+
+def test_a_row_counts_only_for_what_it_was_made_from(tmp_path: Path) -> None:
+    table = old(tmp_path)
+    table.add([Old("a", 1, "one instance")])
+    assert table.made_from("a", "one instance")
+    assert not table.made_from("a", "another")
+    assert not table.made_from("b", "one instance")
 
 
 def test_adding_a_row_does_not_rewrite_the_table(tmp_path: Path) -> None:

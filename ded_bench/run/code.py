@@ -41,7 +41,7 @@ def code_of_method(method: Method, artifacts: tuple[Artifact, ...]) -> str:
 
 
 def named(artifacts: Iterable[Artifact], kind: str) -> str:
-    """The models, or the policies, that shaped an answer: `name@fingerprint`, joined by +, as rows name them."""
+    """The models, or the policies, that shaped an answer, as rows say it: `name@fingerprint`, joined by +."""
     return "+".join(f"{a.name}@{a.fingerprint}" for a in artifacts if a.kind == kind)
 
 

@@ -133,7 +133,8 @@ def test_an_interrupted_certificate_goes_on(
     assert len(read_rows(file)) == 2
     first = run(threebus, file, regime)
     assert set(calls().values()) == {2}  # once by each method: nothing was done twice
-    assert run(threebus, file, regime) == first
+    again = run(threebus, file, regime)
+    assert again.model_copy(update={"date": first.date}) == first
     assert set(calls().values()) == {2}
     run(threebus, file, regime, seed=1)  # other instances: rows of these do not count
     assert sum(calls().values()) == 16

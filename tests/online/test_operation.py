@@ -92,7 +92,7 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
     assert len(made) == 1
     assert [row.objective for row in again] == [row.objective for row in first_run[0]]
     changed = operations(threebus, scenarios, limit_s=30.0)
-    assert not any(results.finished(o.key, o.fingerprint) for o in changed)
+    assert not any(results.table.made_from(o.key, o.fingerprint) for o in changed)
 
 
 def test_faults_are_in_the_row(threebus, scenarios, tmp_path):

@@ -39,6 +39,30 @@ def test_help_waits_for_no_compiler() -> None:
     assert "numba" not in loaded_after("import ded_bench.cli.commands")
 
 
+WITHOUT_TORCH = "import sys; sys.modules['torch'] = None\n"
+
+
+def test_answers_need_no_torch() -> None:
+    """Of any method, our policies among them; only training imports it."""
+    code = "from ded_bench.cli import commands\n"
+    code += "from ded_bench.methods.registry import METHODS\n"
+    code += "[m.settings for m in METHODS.values()]\n"
+    code += "import ded_bench.run.runner, ded_bench.evaluate.certificate, ded_bench.report.report\n"
+    assert "torch" not in loaded_after(code)
+
+
+def test_training_says_what_to_install(tmp_path) -> None:
+    """One line, before anything is made."""
+    for command in (["train-dpc", "--regime", "TO"], ["train-ko", "--kind", "koopman-paper"]):
+        arguments = [*command, "--out", str(tmp_path / "new.safetensors"), "--method", "ded-dpc"]
+        arguments = arguments if "train-dpc" in command else arguments[:-2]
+        code = f"{WITHOUT_TORCH}from ded_bench.cli import main; sys.exit(main({arguments}))"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert done.stderr == "ded-bench: torch: training needs PyTorch: pip install 'ded-bench[train]'\n"
+        assert not list(tmp_path.iterdir())
+
+
 def test_the_scorer_needs_no_method() -> None:
     code = "from ded_bench import Schedule, load_instances, score\nimport numpy as np\n"
     code += "from ded_bench.problem.instance import Instance\n"

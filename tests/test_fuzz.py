@@ -35,7 +35,7 @@ from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc_paper import paper_policy
 from ded_bench.methods.dpc_paper.paper_features import n_channels
 from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
-from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import Manifest, Split
 from ded_bench.problem.schedule import Schedule
@@ -103,8 +103,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
         plain = PaperNetwork(n_channels(case), case.p_min, case.p_max)
         response = Response.make(case, case.knot_times(instance.horizon_s))
         network = StagedNetwork(case, response, 2, 4, (1, 2))
-    paper_policy.Policy(scope, plain, {"seed": 0}).save(folder / "paper.safetensors")
-    dpc_policy.DispatchPolicy(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
+    paper_policy.Policy(scope, weights_of(plain), {"seed": 0}).save(folder / "paper.safetensors")
+    dpc_policy.DispatchPolicy.of(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
     return folder
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +69,6 @@ def add_commands(commands: Any) -> None:
 
 def _train_ko(a: argparse.Namespace) -> int:
     from ded_bench.koopman.identify import held_out, identify, rollout_table
-    from ded_bench.koopman.identify_paper import identify_paper
     from ded_bench.koopman.linear import linear_model
     from ded_bench.koopman.surrogates import model_file
 
@@ -77,7 +78,12 @@ def _train_ko(a: argparse.Namespace) -> int:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     _check_writable(out)
-    model = (identify if a.kind == "koopman" else identify_paper)(case, a.seed)
+    if a.kind == "koopman":
+        model = identify(case, a.seed)
+    else:
+        with _needing_torch():
+            from ded_bench.koopman.identify_paper import identify_paper
+        model = identify_paper(case, a.seed)
     model.save(out)
     table = rollout_table(case, [linear_model(case), model], held_out(case, a.seed))
     write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))
@@ -129,11 +135,12 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     method, case = get_method(name), Case.load(a.case)
     setting: dict[str, Any] = dict(method.options(Settings(slug)))
     setting |= {"epochs": a.epochs} if a.epochs else {}
-    train = method.train
     results = a.results or default_results(case)
     out: Path = a.out or policy_file(results, name, regime, a.model, slug)
     if out.exists() and not (a.force or a.resume):
         return f"{out} is there already (--force trains anew)"
+    with _needing_torch():
+        train = method.train
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     _check_writable(out)
@@ -154,9 +161,21 @@ def _check_writable(out: Path) -> None:
         raise InputError(out, "", f"cannot be written ({error.strerror})") from None
 
 
+@contextlib.contextmanager
+def _needing_torch() -> Iterator[None]:
+    """Say what to install where an import fails for want of PyTorch; only training needs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise InputError("torch", "", "training needs PyTorch: pip install 'ded-bench[train]'") from None
+
+
 def _rollouts(a: argparse.Namespace) -> int:
     from ded_bench.evaluate.ablation import rollout_errors
-    from ded_bench.evaluate.reference import reference_objectives
+    from ded_bench.evaluate.paper_numbers import read_paper
+    from ded_bench.evaluate.reference import choose_reference
     from ded_bench.koopman.surrogates import MODELS, find_model
     from ded_bench.run.results import Results
 
@@ -171,7 +190,7 @@ def _rollouts(a: argparse.Namespace) -> int:
             print(f"ded-bench: left out: {error}", file=sys.stderr)
     instances = [instance for instance, _ in chosen.instances]
     results = Results(folder)
-    reference = reference_objectives(case.id, results.frame(), problem_folder(a.case, case))
+    reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
     table = rollout_errors(case, results, instances, models, reference)
     print(table.to_string(index=False, float_format="{:.3g}".format))
     return 0

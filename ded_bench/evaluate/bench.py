@@ -18,6 +18,7 @@ import gc
 import hashlib
 import itertools
 import os
+import resource
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -60,11 +61,17 @@ class Job(NamedTuple):
 
 
 class Call(NamedTuple):
-    """One call of a method: its answer, its wall-clock seconds, the machine's load average after it."""
+    """One call of a method: its answer, its wall-clock seconds, and what was so when it ended.
+
+    Attributes:
+        load_average: of the machine.
+        peak_memory_mib: the most that the method's process has held so far; None if the process died.
+    """
 
     solution: Solution
     seconds: float | None
     load_average: float
+    peak_memory_mib: float | None = None
 
 
 def bench(
@@ -183,6 +190,7 @@ class _Turns:
             call_s=call.seconds,
             schedule_difference_pu=self._difference(job, instance, solution.schedule),
             load_average=call.load_average,
+            peak_memory_mib=call.peak_memory_mib,
             error="" if solution.schedule is not None else solution.error or solution.status.sentence,
             solver_version=solution.solver_version,
             date=now(),
@@ -255,10 +263,16 @@ def timed(solve: Solver, instance: Instance) -> Call:
         if solution.solve_s is None:  # a method that does not time itself is timed as a whole
             solution = dataclasses.replace(solution, solve_s=elapsed)
     except Exception as error:  # the boundary to other people's methods: a failure is a row
-        return Call(failed(error), None, os.getloadavg()[0])
+        return Call(failed(error), None, os.getloadavg()[0], _peak_memory_mib())
     finally:
         gc.enable()
-    return Call(solution, elapsed, os.getloadavg()[0])
+    return Call(solution, elapsed, os.getloadavg()[0], _peak_memory_mib())
+
+
+def _peak_memory_mib() -> float:
+    """The most memory that this process has held, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, KiB elsewhere
 
 
 @functools.lru_cache(maxsize=1)

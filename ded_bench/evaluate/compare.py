@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.evaluate.reference import reference_objectives
+from ded_bench.evaluate.paper_numbers import read_paper
+from ded_bench.evaluate.reference import choose_reference
 from ded_bench.evaluate.summary import GROUP, gaps, groups, table, title
 from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.errors import InputError
+from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.run.results import Key, Results, Row
 
 
@@ -182,7 +184,7 @@ def _summary(a: Path, b: Path) -> pd.DataFrame:
 def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows with their gaps, each case's to its own reference."""
     parts = [
-        gaps(rows, reference_objectives(str(case), rows).objectives)
+        gaps(rows, choose_reference(rows, read_paper(SHIPPED_CASES / str(case))).objectives)
         for case, rows in frame.groupby("case", sort=False)
     ]
     return pd.concat(parts) if parts else gaps(frame, pd.Series(dtype=float))

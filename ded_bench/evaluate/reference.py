@@ -2,20 +2,18 @@
 
 Where a case carries a paper's numbers, it is the method that the paper measures against; elsewhere an
 accurate one, whose claims the scorer confirms. Objectives come from the rows of a results folder; where it
-lacks some, from the table that lies beside the case's instances.
+lacks some, from the reference run that ships with the case.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ded_bench.evaluate.paper_numbers import read_paper
+from ded_bench.evaluate.paper_numbers import Paper
 from ded_bench.evaluate.summary import title
-from ded_bench.files.table import Table, cell, plain_name
-from ded_bench.problem.case import SHIPPED_CASES
-from ded_bench.problem.sampling import load_manifest
+from ded_bench.run.objectives import OBJECTIVES, Objective
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,20 +24,6 @@ ACCURATE = ("ded-radau", "ded-slp")
 DEFAULT = "default"
 
 
-@dataclass(frozen=True)
-class ReferenceRow:
-    """A re-simulated objective of a reference method with default settings; `version` is the problems'."""
-
-    instance: str = cell(check=plain_name)
-    regime: str = cell(check=plain_name)
-    method: str = cell(check=plain_name)
-    objective: float = cell(lowest=0)
-    version: str = cell()
-
-
-REFERENCE_ROWS = Table(ReferenceRow)
-
-
 @dataclass(frozen=True, eq=False)
 class Reference:
     """What gaps are measured against.
@@ -47,7 +31,7 @@ class Reference:
     Attributes:
         method: its name; the settings are the default ones.
         objectives: by (instance, regime).
-        shipped: how many of them come from the table beside the case, not from rows.
+        shipped: how many of them come from the case's reference run, not from rows.
     """
 
     method: str
@@ -65,51 +49,29 @@ class Reference:
         return title(*self.run)
 
 
-def shipped_table(problems: Path) -> Path:
-    """Where the reference objectives of a case lie: beside its instances."""
-    return problems / "reference.csv"
-
-
-def read_shipped(problems: Path) -> list[ReferenceRow]:
-    """The reference objectives beside a case's instances, none if there is no table; InputError if wrong."""
-    path = shipped_table(problems)
-    return REFERENCE_ROWS.read(path) if path.is_file() else []
-
-
-def reference_objectives(case_id: str, rows: pd.DataFrame, problems: Path | None = None) -> Reference:
+def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[Objective] = ()) -> Reference:
     """Choose the reference of a case, and collect its objectives.
 
     A shipped objective is used only for instances whose rows are of the same problem version.
 
     Args:
-        rows: of a results folder (see `run.results.Results.frame`).
-        problems: folder of the case's instances and of the paper's numbers; None: the shipped one.
-
-    Raises:
-        InputError: the paper's numbers, the manifest or the table beside the case are wrong.
+        rows: of one case in a results folder (see `run.results.Results.frame`).
+        paper: the paper's numbers about the case.
+        shipped: objectives of the case's reference run.
     """
-    folder = problems or SHIPPED_CASES / case_id
-    paper = read_paper(folder)
     candidates = paper.references if paper else ACCURATE
-    shipped = _shipped(folder, rows)
+    ours = set(zip(rows["instance"], rows["problems_version"], strict=True))
+    usable = OBJECTIVES.frame([o for o in shipped if (o.instance, o.problems_version) in ours])
     for method in candidates:
         is_reference = (rows["method"] == method) & (rows["settings"] == DEFAULT)
-        own = rows[is_reference].dropna(subset=["objective"]).set_index(["instance", "regime"])["objective"]
-        own = own[~own.index.duplicated()]
-        known = shipped[shipped["method"] == method].set_index(["instance", "regime"])["objective"]
-        more = known[~known.index.isin(own.index)]
-        objectives = own.reindex(own.index.append(more.index))
-        objectives.update(more)
+        own = _by_instance(rows[is_reference].dropna(subset=["objective"]))
+        known = _by_instance(usable[usable["method"] == method])
+        objectives = own.combine_first(known)
         if len(objectives):
-            return Reference(method, objectives.astype(float), len(more))
-    return Reference(candidates[0], rows[:0].set_index(["instance", "regime"])["objective"].astype(float))
+            return Reference(method, objectives, len(objectives) - len(own))
+    return Reference(candidates[0], _by_instance(rows[:0]))
 
 
-def _shipped(folder: Path, rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows beside the case that are about the very instances of these results."""
-    found = REFERENCE_ROWS.frame(read_shipped(folder))
-    manifest = load_manifest(folder) if len(found) else None
-    if manifest is None:
-        return found[:0]
-    ours = set(rows.loc[rows["problems_version"] == manifest.version, "instance"])
-    return found[(found["version"] == manifest.version) & found["instance"].isin(ours)]
+def _by_instance(rows: pd.DataFrame) -> pd.Series[float]:
+    found = rows.set_index(["instance", "regime"])["objective"].astype(float)
+    return found[~found.index.duplicated()]

@@ -24,7 +24,8 @@ class TimingRow:
 
     `call_s` is the whole call as its process saw it, `load_average` the machine's over the last minute,
     when the call ended: at most about 1 if bench was alone. `schedule_difference_pu` is max |ΔP| between
-    this call's schedule and the one that the results folder keeps.
+    this call's schedule and the one that the results folder keeps, `peak_memory_mib` the most that its
+    process had held by the end of the call, all that it imports included.
     """
 
     run: str
@@ -40,6 +41,7 @@ class TimingRow:
     call_s: float | None = cell(default=None, lowest=0)
     schedule_difference_pu: float | None = cell(default=None, lowest=0)
     load_average: float | None = cell(default=None, lowest=0)
+    peak_memory_mib: float | None = cell(default=None, lowest=0)
     error: str = ""
     model: str = ""
     policy: str = ""
@@ -73,14 +75,17 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     """Median and quartiles per (case, regime, method, settings) over instances and rounds, s.
 
     The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
-    enter no median. `load_average` is the median of the calls', `schedule_difference_pu` the largest.
+    enter no median. `load_average` is the median of the calls', `schedule_difference_pu` and
+    `peak_memory_mib` are the largest.
     """
     parts: dict[tuple[str, ...], list[TimingRow]] = {}
     for row in rows:
         parts.setdefault((row.case, row.regime, row.method, row.settings), []).append(row)
     found = [_summary(calls) for calls in parts.values()]
     frame = pd.DataFrame(found, columns=list(SUMMARY_COLUMNS))
-    numbers = [name for name in SUMMARY_COLUMNS if name.endswith(("_s", "_q1", "_q3", "_pu", "_average"))]
+    numbers = [
+        name for name in SUMMARY_COLUMNS if name.endswith(("_s", "_q1", "_q3", "_pu", "_average", "_mib"))
+    ]
     return frame.astype(dict.fromkeys(numbers, "float64"))
 
 
@@ -89,7 +94,7 @@ SUMMARY_COLUMNS = (
     *("regime", "method", "settings", "instances", "repeats", "failures"),
     *(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3")),
     *(f"first_{name}" for name in PARTS),
-    *("load_average", "schedule_difference_pu", "error", "run", *_NAMES),
+    *("load_average", "schedule_difference_pu", "peak_memory_mib", "error", "run", *_NAMES),
 )
 
 
@@ -108,6 +113,7 @@ def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
         "failures": len(errors),
         "load_average": float(np.median(_values(warm, "load_average") or [np.nan])),
         "schedule_difference_pu": max(_values(warm, "schedule_difference_pu"), default=None),
+        "peak_memory_mib": max(_values(warm, "peak_memory_mib"), default=None),
         "error": "" if good or not errors else errors[0],
         "run": last.run,
     }

@@ -12,6 +12,7 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.network import Network
 from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import simulate
 
@@ -26,7 +27,8 @@ class Trajectories:
     instances: tuple[Instance, ...]
     kinds: tuple[str, ...]
     inputs: Array  # (n_points, batch, n_gen + n_load), pu
-    theta: Array  # (n_points, batch, n_bus), rad
+    theta_initial: Array  # (batch, n_bus), rad
+    theta: Array  # of the generators, (n_points, batch, n_gen), rad
     omega: Array  # (n_points, batch, n_gen), rad/s
     p_slack: Array  # (n_points, batch), pu
 
@@ -40,15 +42,17 @@ def trajectories(
     case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
 ) -> Trajectories:
     """Simulate schedules and stack the result."""
-    runs = [simulate(case, *pair) for pair in zip(instances, schedules, strict=True)]
-    return Trajectories(
-        tuple(instances),
-        tuple(kinds),
-        np.stack([np.hstack([run.p_gen, run.p_load]) for run in runs], axis=1),
-        np.stack([run.theta for run in runs], axis=1),
-        np.stack([run.omega for run in runs], axis=1),
-        np.stack([run.p_slack for run in runs], axis=1),
-    )
+    shape = (instances[0].steps + 1, len(instances))
+    inputs = np.empty((*shape, len(case.generators) + len(case.loads)))
+    theta, omega = np.empty((2, *shape, len(case.generators)))
+    p_slack, initial = np.empty(shape), np.empty((len(instances), len(case.buses)))
+    generators = Network(case).generators
+    for i, (instance, schedule) in enumerate(zip(instances, schedules, strict=True)):
+        run = simulate(case, instance, schedule)
+        inputs[:, i] = np.hstack([run.p_gen, run.p_load])
+        initial[i], theta[:, i] = run.theta[0], run.theta[:, generators]
+        omega[:, i], p_slack[:, i] = run.omega, run.p_slack
+    return Trajectories(tuple(instances), tuple(kinds), inputs, initial, theta, omega, p_slack)
 
 
 def sample_trajectories(

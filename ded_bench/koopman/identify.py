@@ -1,13 +1,15 @@
 """Identification of our Koopman model (kind `koopman`): physics first, then full rollouts.
 
-Starts from the energy form of the swing equations linearised at the nominal point and fits all its
-parameters to rollouts over the whole horizon by nonlinear least squares in double precision.
-Stability and exact equilibria hold for every parameter value.
+Starts from the swing equations linearised at the nominal point and fits parameters to rollouts over the
+whole horizon by nonlinear least squares in double precision: on a grid of few generators all of the energy
+form (`energy_form`), elsewhere the weights of the lines and the damping (`line_form`). Stability and exact
+equilibria hold for every parameter value of either.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,18 @@ from scipy.optimize import least_squares
 
 from ded_bench.koopman.data import Trajectories, sample_trajectories
 from ded_bench.koopman.energy_form import EnergyForm, energy_form, injection_lift, steady_state
+from ded_bench.koopman.line_fit import fit_lines
+from ded_bench.koopman.line_form import LineForm, discretise
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 
 TRAIN, HELD_OUT = 120, 60
+#: The whole energy form is fitted if it has at most so many parameters: each costs a rollout of all
+#: trajectories at every evaluation.
+ENERGY_FORM_PARAMETERS = 60
+#: Trajectories where line weights are fitted: there are more generators on each.
+LINE_FORM_TRAIN = 40
 #: Kinds of schedules to train on; the held-out ones have all kinds, two of which were never seen.
 TRAIN_MIX = ("tracking", "tracking", "hurried", "random knots")
 #: Residuals are taken every so many steps and in these units: rad/s and pu.
@@ -29,22 +38,23 @@ STRIDE, OMEGA_UNIT, SLACK_UNIT = 20, 2 * np.pi * 5e-6, 1e-4
 EVALUATIONS = 10
 
 
-def identify(case: Case, seed: int = 0, count: int = TRAIN) -> Koopman:
-    """Identify the model of a case from `count` trajectories.
+def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
+    """Identify the model of a case from `count` trajectories (default: `n_training`).
 
     Their instances come from masters that no benchmark uses (3,000,000 + seed), under
     schedules that need no optimisation.
     """
+    count = n_training(case) if count is None else count
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
-    network = Network(case)
-    start = energy_form(case, network.power_flow(case.p_nominal, case.load_nominal))
+    training: dict[str, int | float] = {"seed": seed, "trajectories": count}
+    if _whole_energy_form(case):
+        return _identify_energy_form(case, data, training)
+    return _identify_lines(case, data, training)
 
-    def residuals(x: Array) -> Array:
-        return _residuals(make_model(case, unpack(start, x)), network, data)
 
-    result = least_squares(residuals, np.zeros(n_parameters(start)), max_nfev=EVALUATIONS)
-    training = {"seed": seed, "trajectories": count, "cost": float(result.cost)}
-    return make_model(case, unpack(start, result.x), training)
+def n_training(case: Case) -> int:
+    """Trajectories that both kinds of models are identified from."""
+    return TRAIN if _whole_energy_form(case) else LINE_FORM_TRAIN
 
 
 def held_out(case: Case, seed: int = 0, count: int = HELD_OUT) -> Trajectories:
@@ -69,6 +79,32 @@ def make_model(case: Case, form: EnergyForm, training: dict[str, int | float] | 
     )
 
 
+def _whole_energy_form(case: Case) -> bool:
+    return n_parameters(*steady_state(case).shape) <= ENERGY_FORM_PARAMETERS
+
+
+def _identify_energy_form(case: Case, data: Trajectories, training: dict[str, int | float]) -> Koopman:
+    network = Network(case)
+    start = energy_form(case, network.power_flow(case.p_nominal, case.load_nominal))
+
+    def residuals(x: Array) -> Array:
+        return _residuals(make_model(case, unpack(start, x)), network, data)
+
+    result = least_squares(residuals, np.zeros(n_parameters(*start.feedthrough.shape)), max_nfev=EVALUATIONS)
+    return make_model(case, unpack(start, result.x), training | {"cost": float(result.cost)})
+
+
+def _identify_lines(case: Case, data: Trajectories, training: dict[str, int | float]) -> Koopman:
+    form, dt_s, b = LineForm.make(case), case.sampling.dt_s, steady_state(case)
+    p_load = data.inputs[0, :, len(case.generators) :]
+    nominal = make_model(case, energy_form(case, form.theta))
+    psi = nominal.observables(form.network, data.theta_initial, data.omega[0], p_load)
+    fit = fit_lines(form, dt_s, psi, data.inputs, data.outputs)
+    step = discretise(form.dynamics(fit.x), b, dt_s)
+    training = training | {"relative_cost": fit.relative_cost, "steps": fit.steps}
+    return replace(nominal, k=step.k, g=b + step.h, training=training)
+
+
 def unpack(start: EnergyForm, x: Array) -> EnergyForm:
     """The form whose parameters differ from `start` by x; any x is admissible."""
     n = len(start.skew)
@@ -82,16 +118,15 @@ def unpack(start: EnergyForm, x: Array) -> EnergyForm:
     )
 
 
-def n_parameters(form: EnergyForm) -> int:
-    """Length of x in `unpack`."""
-    n = len(form.skew)
-    return n * (n - 1) // 2 + n * (n + 1) + form.feedthrough.size
+def n_parameters(n: int, n_in: int) -> int:
+    """Length of x in `unpack`, for an energy form of n states and n_in inputs."""
+    return n * (n - 1) // 2 + n * (n + 1) + n * n_in
 
 
 def predict(model: Koopman, network: Network, data: Trajectories) -> Array:
     """The model's (ω, P_s) under the inputs of trajectories, shape (n_points, batch, n_gen + 1)."""
     n_gen = len(network.generators)
-    psi = model.observables(network, data.theta[0], data.omega[0], data.inputs[0, :, n_gen:])
+    psi = model.observables(network, data.theta_initial, data.omega[0], data.inputs[0, :, n_gen:])
     return model.rollout(psi, data.inputs)[..., : n_gen + 1]
 
 

@@ -14,12 +14,13 @@ from torch import Tensor, nn
 
 from ded_bench.koopman.data import Trajectories, sample_trajectories
 from ded_bench.koopman.energy_form import EPSILON
-from ded_bench.koopman.identify import TRAIN, TRAIN_MIX
+from ded_bench.koopman.identify import TRAIN_MIX, n_training
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 
-OBSERVABLES, HIDDEN = 8, 32
+#: Observables of the MLP, enough for two for each generator, and units of its hidden layer for each of them.
+OBSERVABLES_BY_GENERATOR, MORE_OBSERVABLES, HIDDEN_BY_OBSERVABLE = 2, 4, 4
 BATCH, STEPS, LEARNING_RATE = 2048, 5000, 2e-3
 #: ε of the paper's eq. for the model error, in units of the scaled state.
 LOSS_FLOOR = 1e-6
@@ -30,15 +31,16 @@ class PaperKoopman(nn.Module):
 
     def __init__(self, n_gen: int, n_in: int, dt: float) -> None:
         super().__init__()
-        n = n_gen + OBSERVABLES
+        n_observables = OBSERVABLES_BY_GENERATOR * n_gen + MORE_OBSERVABLES
+        hidden, n = HIDDEN_BY_OBSERVABLE * n_observables, n_gen + n_observables
         self.n_gen, self.dt = n_gen, dt
         self.skew = nn.Parameter(0.1 * torch.randn(n, n))
         self.dissipation = nn.Parameter(0.3 * torch.eye(n) + 0.05 * torch.randn(n, n))
         self.energy = nn.Parameter(torch.eye(n) + 0.05 * torch.randn(n, n))
         self.slack_row = nn.Parameter(0.1 * torch.randn(n))
-        self.steady = nn.Parameter(0.1 * torch.randn(OBSERVABLES, n_in))
-        self.first = nn.Linear(2 * n_gen + 1, HIDDEN)
-        self.last = nn.Linear(HIDDEN, OBSERVABLES)
+        self.steady = nn.Parameter(0.1 * torch.randn(n_observables, n_in))
+        self.first = nn.Linear(2 * n_gen + 1, hidden)
+        self.last = nn.Linear(hidden, n_observables)
 
     first: nn.Linear
     last: nn.Linear
@@ -68,8 +70,9 @@ class PaperKoopman(nn.Module):
         return error.square().sum(dim=1) / ((x - following).square().sum(dim=1) + LOSS_FLOOR)
 
 
-def identify_paper(case: Case, seed: int = 0, count: int = TRAIN, steps: int = STEPS) -> Koopman:
+def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: int = STEPS) -> Koopman:
     """Identify a model as the paper does, from the trajectories that `identify.identify` uses."""
+    count = n_training(case) if count is None else count
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
     state, offset, scale = _scaled_state(case, data)
     n_gen, n_in = len(case.generators), data.inputs.shape[-1]
@@ -95,8 +98,8 @@ def identify_paper(case: Case, seed: int = 0, count: int = TRAIN, steps: int = S
 
 def _scaled_state(case: Case, data: Trajectories) -> tuple[Tensor, Array, Array]:
     """x = (θ_gen, P_s, ω) shifted and scaled, (n_points, batch, 2 n_gen + 1); ω and P_s are not shifted."""
-    network, n_gen = Network(case), len(case.generators)
-    x = np.concatenate([data.theta[..., network.generators], data.p_slack[..., None], data.omega], axis=-1)
+    n_gen = len(case.generators)
+    x = np.concatenate([data.theta, data.p_slack[..., None], data.omega], axis=-1)
     offset, scale = x.mean(axis=(0, 1)), x.std(axis=(0, 1))
     offset[n_gen:] = 0.0
     scale[:n_gen], scale[n_gen + 1 :] = scale[:n_gen].mean(), scale[n_gen + 1 :].mean()
@@ -115,7 +118,7 @@ def _in_original_units(
             (weight, first.bias.numpy() - weight @ offset),
             (last.weight.numpy(), last.bias.numpy()),
         )
-    unit = np.concatenate([scale[n_gen + 1 :], scale[[n_gen]], np.ones(OBSERVABLES)])
+    unit = np.concatenate([scale[n_gen + 1 :], scale[[n_gen]], np.ones(len(model.steady))])
     k = unit[:, None] * k / unit
     b = unit[:, None] * b / scale[n_gen]
     lift = np.zeros((len(unit), 2 * n_bus + n_gen + len(case.loads) + 1))

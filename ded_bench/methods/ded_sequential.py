@@ -106,7 +106,7 @@ class SequentialDed:
         self._upper = np.tile(np.concatenate([endless, limit, case.p_max, np.full(2, np.inf)]), steps)
 
     def solve(self, instance: Instance, time_limit_s: float | None = None) -> tuple[Outcome, Schedule | None]:
-        """Solve one instance from the state at t = 0 held for the whole horizon.
+        """Solve one instance; the first trajectory stays in the state at t = 0.
 
         Returns:
             `Optimal` with a schedule, `TimeLimit`, or `Failed` if a program has no solution or the sequence

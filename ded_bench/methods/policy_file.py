@@ -1,9 +1,12 @@
-"""Policy files: weights and a JSON header in safetensors; their names, and what a policy refuses."""
+"""Policy files: weights and a JSON header in safetensors; their names, and what a policy refuses.
+
+Who answers reads weights as arrays; torch is for training alone.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 SCHEMA = "ded-bench/policy/1"
+#: Weights and buffers of a network by name, in the order of its state dict, float32.
+Weights = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,7 @@ class Scope:
                 )
 
 
-def write_policy(path: Path, method: str, scope: Scope, network: nn.Module, training: dict[str, Any]) -> None:
+def write_policy(path: Path, method: str, scope: Scope, weights: Weights, training: dict[str, Any]) -> None:
     """Write the weights and buffers of a network, with a header."""
     header = {
         "schema": SCHEMA,
@@ -55,8 +60,7 @@ def write_policy(path: Path, method: str, scope: Scope, network: nn.Module, trai
         "horizon_s": scope.horizon_s,
         "training": training,
     }
-    arrays = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
-    write_arrays(path, arrays, header)
+    write_arrays(path, weights, header)
 
 
 def read_policy(
@@ -86,21 +90,24 @@ def read_policy(
     return arrays, Scope(case, regime, float(horizon)), training
 
 
-def load_weights(network: nn.Module, arrays: dict[str, np.ndarray], path: str | Path) -> None:
-    """Fill a network with arrays of exactly its names and shapes; InputError otherwise."""
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    for name in expected.keys() | arrays.keys():
-        if name not in arrays or arrays[name].shape != expected.get(name):
+def checked_weights(
+    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], path: str | Path
+) -> Weights:
+    """Arrays as the weights of a network with exactly these names and shapes; InputError otherwise."""
+    for name in shapes.keys() | arrays.keys():
+        if name not in arrays or arrays[name].shape != shapes.get(name):
             raise InputError(path, name, "is missing, unknown or has the wrong shape")
-    import torch  # here only: who asks for a policy's name or header does without it
-
-    network.load_state_dict({name: torch.as_tensor(array) for name, array in arrays.items()})
+    return {name: arrays[name].astype(np.float32) for name in shapes}
 
 
-def weights_fingerprint(network: nn.Module) -> str:
+def weights_of(network: nn.Module) -> Weights:
+    """The weights and buffers of a network in torch, copied."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in network.state_dict().items()}
+
+
+def weights_fingerprint(weights: Weights) -> str:
     """Twelve hex digits that change when any weight does."""
-    values = [value.detach().cpu().numpy().tobytes() for value in network.state_dict().values()]
-    return hashlib.sha256(b"".join(values)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(value.tobytes() for value in weights.values())).hexdigest()[:12]
 
 
 def policy_file(

@@ -11,7 +11,7 @@ import pandas as pd
 
 from ded_bench.evaluate.certificate import Certificate, read_certificates
 from ded_bench.evaluate.paper_numbers import Paper, read_paper
-from ded_bench.evaluate.reference import Reference, reference_objectives
+from ded_bench.evaluate.reference import Reference, choose_reference
 from ded_bench.evaluate.summary import gaps, judged_rows
 from ded_bench.evaluate.timing import TIMING, WARM_UP, read_timing, timing_summary
 from ded_bench.files.arrays import read_arrays
@@ -24,6 +24,7 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_manifest, load_split
+from ded_bench.run.objectives import reference_objectives
 from ded_bench.run.results import Results
 
 
@@ -92,7 +93,7 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     results = Results(folder)
     rows = results.frame()
     rows = rows[rows["case"].isin([case.id, ""])].reset_index(drop=True)
-    reference = reference_objectives(case.id, rows, problems)
+    reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
     rows = gaps(rows, reference.objectives)
     calls = read_timing(paths.timing)
     timings = timing_summary(calls)

@@ -34,8 +34,15 @@ def now() -> str:
 def environment() -> dict[str, str]:
     """Versions and hardware for the report."""
     facts = {"ded-bench": version(), "python": platform.python_version()}
-    facts |= {name: importlib.metadata.version(name) for name in PACKAGES}
+    facts |= {name: _version(name) for name in PACKAGES}
     return facts | {"host": host(), "memory": _memory()}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"  # torch, where nothing is trained
 
 
 def _cpu() -> str:

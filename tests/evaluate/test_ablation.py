@@ -17,7 +17,7 @@ from ded_bench.evaluate.ablation import (
     starts_table,
     training_table,
 )
-from ded_bench.evaluate.reference import reference_objectives
+from ded_bench.evaluate.reference import choose_reference
 from ded_bench.evaluate.summary import judged_rows, summary
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
@@ -134,7 +134,7 @@ def test_rollout_errors_of_the_references_schedules(threebus: Case, quiet_instan
     """A quiet instance held at its equilibrium: the linear model at the nominal point is nearly exact."""
     results = Results(tmp_path)
     instance = quiet_instance(threebus, horizon_s=1.0)
-    reference = reference_objectives(threebus.id, results.frame())
+    reference = choose_reference(results.frame(), None)
     with pytest.raises(InputError, match="ded-bench solve"):
         rollout_errors(threebus, results, [instance], [linear_model(threebus)], reference)
     regime = next(iter(threebus.regimes))

@@ -183,6 +183,7 @@ def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     assert (row["first_build_s"], row["build_s"]) == (0.1, 0.1)
     assert np.isnan(row["setup_s"])  # the method does not tell: not available, not zero
     assert row["load_average"] >= 0
+    assert 20 < row["peak_memory_mib"] < 10_000  # Python and NumPy alone take some
     assert (row["policy"], row["model"], row["code"]) == ("fake@one", "", "abc")
     assert not len(timing_summary([]))
 

@@ -40,7 +40,7 @@ def test_every_parameter_value_is_stable_with_exact_equilibria(case: Case) -> No
     rng = np.random.default_rng(1)
     n_gen, n_in = len(case.generators), b.shape[1]
     for draw in range(10_000):
-        x = rng.normal(size=n_parameters(form)) * 10.0 ** rng.uniform(-2, 1)
+        x = rng.normal(size=n_parameters(*form.feedthrough.shape)) * 10.0 ** rng.uniform(-2, 1)
         k, g = unpack(form, x).discretise(b, dt)
         assert np.abs(np.linalg.eigvals(k)).max() < 1.0, draw
         inputs = rng.normal(size=n_in)

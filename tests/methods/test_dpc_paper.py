@@ -14,6 +14,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.koopman.condensed import free_response
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
+from ded_bench.methods.dpc_paper.paper_inference import FILTERS, WINDOWS, weight_shapes
 from ded_bench.methods.dpc_paper.paper_loss import (
     Q_INITIAL,
     Q_OMEGA,
@@ -21,10 +22,10 @@ from ded_bench.methods.dpc_paper.paper_loss import (
     Condensed,
     loss_terms,
 )
-from ded_bench.methods.dpc_paper.paper_network import FILTERS, WINDOWS, PaperNetwork
+from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
 from ded_bench.methods.dpc_paper.paper_policy import METHOD, SETTINGS, Policy, prepare
 from ded_bench.methods.dpc_paper.paper_training import LEARNING_RATE, Batch, Loss, Recipe, train
-from ded_bench.methods.policy_file import Scope, policy_file
+from ded_bench.methods.policy_file import Scope, policy_file, weights_of
 from ded_bench.methods.policy_solver import method
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import HISTORY, TrainingOptions
@@ -71,7 +72,10 @@ def test_the_policy_is_its_torch_network(case: Case, count: int) -> None:
     network.scale.uniform_(0.5, 2.0)
     with torch.inference_mode():
         expected = network(torch.as_tensor(seen, dtype=torch.float32)).double().numpy()
-    schedules = Policy(Scope(case, "NO", HORIZON), network, {})(instances)
+    weights = weights_of(network)
+    shapes = weight_shapes(n_channels(case), len(case.generators))
+    assert [(name, value.shape) for name, value in weights.items()] == list(shapes.items())
+    schedules = Policy(Scope(case, "NO", HORIZON), weights, {})(instances)
     # two orders of adding up a few hundred float32 products of order one
     np.testing.assert_allclose([s.p for s in schedules], expected, atol=2e-6)
     assert (np.ptp(expected, axis=1) > 1e-3).all()
@@ -207,8 +211,8 @@ def test_the_default_is_the_papers_recipe_and_nothing_else(threebus: Case, tmp_p
     expected = network.state_dict()
     assert (expected["mean"] == 0).all()
     assert (expected["scale"] == 1).all()
-    for name, value in policy.network.state_dict().items():
-        torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-6)
+    for name, value in policy.weights.items():
+        np.testing.assert_allclose(value, expected[name].numpy(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("slug", SETTINGS)
@@ -240,7 +244,7 @@ def test_what_the_averaged_recipe_adds(threebus: Case, tmp_path: Path) -> None:
     for policy, recipe in zip(policies, recipes, strict=True):
         assert policy.training["recipe"] == dataclasses.asdict(Recipe(epochs=5, **recipe))
     assert (policies[3].training["instances"], policies[3].training["held_out"]) == (8, 2)
-    assert (policies[1].network.scale != 1).any()
+    assert (policies[1].weights["scale"] != 1).any()
     assert Recipe(**SETTINGS["averaged"]) != Recipe()
 
 
@@ -255,7 +259,7 @@ def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def policy(threebus: Case) -> Policy:
     network = fresh_network(threebus).eval()
-    return Policy(Scope(threebus, next(iter(threebus.regimes)), HORIZON), network, {"seed": 0})
+    return Policy(Scope(threebus, next(iter(threebus.regimes)), HORIZON), weights_of(network), {"seed": 0})
 
 
 def test_policy_files_round_trip_and_batches_equal_single_calls(

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.optimize import linprog
 
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import refinement
+from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.methods.dpc.loss import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import DispatchPolicy
 from ded_bench.methods.dpc.refined import SETTINGS, artifacts, prepare
@@ -41,7 +40,7 @@ def static_policy(case: Case, regime: str) -> DispatchPolicy:
     horizon = case.sampling.horizon_s
     response = Response.make(case, case.knot_times(horizon))
     network = StagedNetwork(case, response, 1, 4, (1,)).eval()
-    return DispatchPolicy(Scope(case, regime, horizon), network, {"seed": 0})
+    return DispatchPolicy.of(Scope(case, regime, horizon), network, {"seed": 0})
 
 
 def optimum(case: Case, regime: str, instance: Instance) -> float:
@@ -144,6 +143,6 @@ def test_it_serves_as_a_method(threebus: Case, tmp_path: Path) -> None:
     assert answers["default"].solve_s > 0
     assert not np.array_equal(answers["default"].schedule.p, answers["steps25"].schedule.p)
     before = artifacts(threebus, regime, settings["default"])
-    torch.nn.init.ones_(policy.network.stages[0].last.bias)
+    policy.weights["stages.0.last.bias"][:] = 1.0
     policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
     assert artifacts(threebus, regime, settings["default"]) != before

@@ -12,6 +12,7 @@ import torch
 
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import training
+from ded_bench.methods.dpc.export import network_of
 from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs, sequence_groups
 from ded_bench.methods.dpc.network import StagedNetwork
@@ -136,9 +137,10 @@ def test_variants_of_the_study_are_what_they_say(threebus: Case, tmp_path: Path)
     start, free, sequence, constants = tensors(channels)
     other = sequence.clone()
     other[..., sequence_groups(threebus)["dispatch"]] += 0.3
+    network = network_of(policy)
     with torch.no_grad():
-        seen = policy.network(start, free, sequence, constants)
-        unseen = policy.network(start, free + 0.3, other, constants)
+        seen = network(start, free, sequence, constants)
+        unseen = network(start, free + 0.3, other, constants)
     torch.testing.assert_close(seen, unseen)
     np.testing.assert_allclose(policy.powers(inputs), seen.numpy(), atol=1e-5)
     with pytest.raises(TypeError, match="colour"):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from ded_bench.methods.dpc import kernels
-from ded_bench.methods.dpc.follower import Clip, Follow, follow
+from ded_bench.methods.dpc.differentiable_follower import Clip, Follow
+from ded_bench.methods.dpc.follower import follow
 
 
 def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:

@@ -10,10 +10,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ded_bench.methods.dpc.inputs import Channels
+from ded_bench.methods.dpc.inputs import Channels, n_channels
 from ded_bench.methods.dpc.kernels import NetworkInputs, PowerLimits, StageWeights, answer
 from ded_bench.methods.dpc.response import Response
 from ded_bench.problem.case import Array, Case
+
+#: Width of the layer that constants of an instance pass through.
+EMBEDDING = 64
 
 
 class CompiledStages:
@@ -42,6 +45,36 @@ class CompiledStages:
         )
         answer(p_gen, seen, self._of_power, self._limits, self._dilations, self._weights)
         return p_gen.swapaxes(1, 2)
+
+
+def weight_shapes(
+    case: Case, n_outputs: int, stages: int, width: int, n_blocks: int
+) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a StagedNetwork's weights, in the order of its state dict.
+
+    Args:
+        n_outputs: of the response, per knot.
+        n_blocks: how many dilations there are.
+    """
+    n_gen, (n_sequence, n_constants) = len(case.generators), n_channels(case)
+    n_seen = n_gen + n_outputs + n_sequence
+    stage: dict[str, tuple[int, ...]] = {
+        "sequence_mean": (n_seen,),
+        "sequence_scale": (n_seen,),
+        "constants_mean": (n_constants,),
+        "constants_scale": (n_constants,),
+    }
+    layers: dict[str, tuple[int, ...]] = {
+        "first": (width, n_seen, 1, 3),
+        "embed.0": (EMBEDDING, n_constants),
+        "embed.2": (width * (1 + n_blocks), EMBEDDING),
+        **{f"spread.{i}": (width, width, 1, 3) for i in range(n_blocks)},
+        **{f"mix.{i}": (width, width, 1, 1) for i in range(n_blocks)},
+        "last": (n_gen, width, 1, 1),
+    }
+    for name, shape in layers.items():
+        stage |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
+    return {f"stages.{i}.{name}": shape for i in range(stages) for name, shape in stage.items()}
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

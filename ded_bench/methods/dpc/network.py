@@ -16,12 +16,13 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from ded_bench.methods.dpc.follower import Clip, Follow
+from ded_bench.methods.dpc.differentiable_follower import Clip, Follow
+from ded_bench.methods.dpc.inference import EMBEDDING
 from ded_bench.methods.dpc.inputs import Channels, n_channels, sequence_groups
 from ded_bench.methods.dpc.response import Response
 from ded_bench.problem.case import Array, Case
 
-STAGES, WIDTH, EMBEDDING = 2, 24, 64
+STAGES, WIDTH = 2, 24
 #: With windows of three these dilations reach 16 knots to either side, in each stage.
 DILATIONS = (1, 2, 4, 8)
 #: Channels divided by this are no input any more.

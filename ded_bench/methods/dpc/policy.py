@@ -6,30 +6,28 @@ Bounds, ramps and P_0 hold for any weights.
 from __future__ import annotations
 
 import functools
-import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
 from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.dpc.inference import CompiledStages
-from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels
-from ded_bench.methods.dpc.network import StagedNetwork
+from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
+from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.variants import SETTINGS as SETTINGS
 from ded_bench.methods.policy_file import (
     Scope,
+    Weights,
+    checked_weights,
     find_policy_file,
-    load_weights,
     read_policy,
     weights_fingerprint,
+    weights_of,
     write_policy,
 )
 from ded_bench.methods.policy_solver import method
@@ -37,6 +35,9 @@ from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+
+if TYPE_CHECKING:
+    from ded_bench.methods.dpc.network import StagedNetwork
 
 METHOD = "ded-dpc"
 #: Instances that one thread takes at a time.
@@ -48,23 +49,23 @@ class DispatchPolicy:
     """A trained network with all that is needed to apply it."""
 
     scope: Scope
-    network: StagedNetwork
-    training: dict[str, Any]
+    response: Response  # what the network looks at
+    weights: Weights
+    training: dict[str, Any]  # facts of the training, and `stages`, `width`, `dilations` of the network
+
+    @staticmethod
+    def of(scope: Scope, network: StagedNetwork, training: dict[str, Any]) -> DispatchPolicy:
+        """The policy of a network in torch."""
+        return DispatchPolicy(scope, network.response, weights_of(network), training | network.shape)
 
     @property
     def knots(self) -> Array:
         """Knot times, shape (n_knots,), s."""
         return self.response.knots
 
-    @property
-    def response(self) -> Response:
-        """What the network looks at."""
-        return self.network.response
-
     @functools.cached_property
     def _compiled(self) -> CompiledStages:
-        state = {name: value.numpy() for name, value in self.network.state_dict().items()}
-        return CompiledStages(self.scope.case, self.response, state, self.network.dilations)
+        return CompiledStages(self.scope.case, self.response, self.weights, tuple(self.training["dilations"]))
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -94,20 +95,7 @@ class DispatchPolicy:
 
     def save(self, path: Path) -> None:
         """Write weights, normalisation and header."""
-        write_policy(path, METHOD, self.scope, self.network, self.training | self.network.shape)
-
-    def export(self, path: Path) -> None:
-        """Write the network (channels in, powers at the knots out) for runtimes that know `torch.export`."""
-        case = self.scope.case
-        n_sequence, n_constants = n_channels(case)
-        n_gen, n_outputs = len(case.generators), self.response.n_outputs
-        widths = (n_gen, n_outputs, n_sequence)
-        example = (*(torch.zeros(2, case.n_knots, n) for n in widths), torch.zeros(2, n_constants))
-        batch = {0: torch.export.Dim("batch")}
-        program = torch.export.export(self.network, example, dynamic_shapes=(batch,) * 4)
-        buffer = io.BytesIO()
-        torch.export.save(program, buffer)
-        write_atomically(path, buffer.getvalue())
+        write_policy(path, METHOD, self.scope, self.weights, self.training)
 
     @staticmethod
     def load(path: str | Path, case: Case, regime: str) -> DispatchPolicy:
@@ -125,14 +113,13 @@ class DispatchPolicy:
         if not isinstance(training.get("prior", True), bool):
             raise InputError(path, "training", "has a prior that is neither true nor false")
         response = Response.make(case, case.knot_times(scope.horizon_s))
-        network = StagedNetwork(case, response, stages, width, tuple(dilations))
-        load_weights(network, arrays, path)
-        return DispatchPolicy(scope, network.eval(), training)
+        shapes = weight_shapes(case, response.n_outputs, stages, width, len(dilations))
+        return DispatchPolicy(scope, response, checked_weights(arrays, shapes, path), training)
 
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits that change when any weight does."""
-        return weights_fingerprint(self.network)
+        return weights_fingerprint(self.weights)
 
 
 def find_policy(case: Case, regime: str, settings: Settings) -> DispatchPolicy:

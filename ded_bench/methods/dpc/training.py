@@ -17,8 +17,9 @@ from tqdm import tqdm
 
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.model import Koopman
+from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Channels, Inputs
-from ded_bench.methods.dpc.loss import Objective, coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.loss import Objective
 from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.policy import METHOD, DispatchPolicy
 from ded_bench.methods.dpc.response import Response
@@ -191,7 +192,7 @@ def train(
         "torch": torch.__version__,
         "device": device,
     }
-    policy = DispatchPolicy(scope, network.cpu().eval(), training)
+    policy = DispatchPolicy.of(scope, network, training)
     policy.save(out)
     write_history(out, run.history)
     return policy

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ded_bench.methods.dpc_paper.paper_inference import FILTERS, WINDOWS
 from ded_bench.problem.case import Array
-
-#: Output channels of the hidden layers, and the window of each layer (paper, section on the implementation).
-FILTERS, WINDOWS = 30, (5, 10, 5)
-ZERO = np.float32(0.0)
 
 
 class PaperNetwork(nn.Module):
@@ -55,41 +50,3 @@ class PaperNetwork(nn.Module):
 def _same_padding(window: int) -> nn.Module:
     """Zeros on both sides, so that a convolution with this window keeps the length."""
     return nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)
-
-
-class NumpyPaperNetwork:
-    """The same function as a PaperNetwork: for one instance torch's overhead would be most of the time."""
-
-    def __init__(self, network: PaperNetwork) -> None:
-        state = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
-        self._mean, self._scale = state["mean"], 1.0 / state["scale"]
-        self._low, self._half = state["p_min"], 0.5 * (state["p_max"] - state["p_min"])
-        weights = [value for name, value in state.items() if name.endswith(".weight")]  # (out, in, window)
-        matrices = [w.transpose(0, 2, 1).reshape(len(w), -1) for w in weights]
-        biases = [value[:, None] for name, value in state.items() if name.endswith(".bias")]
-        self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
-
-    def __call__(self, channels: Array) -> Array:
-        """See `PaperNetwork.forward`."""
-        h = (channels.astype(np.float32) - self._mean) * self._scale
-        for i, (window, weight, bias) in enumerate(self._layers):
-            if i:
-                np.maximum(h, ZERO, out=h)
-            h = np.matmul(weight, _windows(h, window))
-            h += bias
-        np.tanh(h, out=h)
-        h += 1.0
-        power = self._low + self._half * h
-        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
-
-
-def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
-    batch, width, n = x.shape
-    padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
-    before = (window - 1) // 2
-    padded[:, :, before : before + n] = x
-    per_instance, per_channel, per_knot = padded.strides
-    strides = per_instance, per_knot, per_channel, per_knot
-    seen = np.ndarray((batch, window, width, n), np.float32, padded, strides=strides)
-    return seen.reshape(batch, -1, n)

@@ -12,11 +12,12 @@ import numpy as np
 
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
-from ded_bench.methods.dpc_paper.paper_network import NumpyPaperNetwork, PaperNetwork
+from ded_bench.methods.dpc_paper.paper_inference import NumpyPaperNetwork, weight_shapes
 from ded_bench.methods.policy_file import (
     Scope,
+    Weights,
+    checked_weights,
     find_policy_file,
-    load_weights,
     read_policy,
     weights_fingerprint,
     write_policy,
@@ -42,7 +43,7 @@ class Policy:
     """A trained network with all that is needed to apply it."""
 
     scope: Scope
-    network: PaperNetwork
+    weights: Weights
     training: dict[str, Any]
 
     @functools.cached_property
@@ -56,7 +57,7 @@ class Policy:
 
     @functools.cached_property
     def _numpy(self) -> NumpyPaperNetwork:
-        return NumpyPaperNetwork(self.network)
+        return NumpyPaperNetwork(self.weights)
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -74,20 +75,19 @@ class Policy:
 
     def save(self, path: Path) -> None:
         """Write weights, normalisation and header."""
-        write_policy(path, METHOD, self.scope, self.network, self.training)
+        write_policy(path, METHOD, self.scope, self.weights, self.training)
 
     @staticmethod
     def load(path: str | Path, case: Case, regime: str) -> Policy:
         """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
         arrays, scope, training = read_policy(path, METHOD, case, regime)
-        network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
-        load_weights(network, arrays, path)
-        return Policy(scope, network.eval(), training)
+        shapes = weight_shapes(n_channels(case), len(case.generators))
+        return Policy(scope, checked_weights(arrays, shapes, path), training)
 
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits that change when any weight does."""
-        return weights_fingerprint(self.network)
+        return weights_fingerprint(self.weights)
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:

@@ -33,7 +33,7 @@ from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
 from ded_bench.methods.dpc_paper.paper_loss import Condensed, loss_terms
 from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
 from ded_bench.methods.dpc_paper.paper_policy import METHOD, Policy
-from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.problem.case import Case
@@ -158,7 +158,7 @@ def train(
         "device": options.device,
     }
     training["training_loss" if held_out is None else "held_out_loss"] = run.lowest
-    policy = Policy(Scope(case, regime, first.horizon_s), network.cpu().eval(), training)
+    policy = Policy(Scope(case, regime, first.horizon_s), weights_of(network), training)
     policy.save(out)
     write_history(out, run.history)
     return policy

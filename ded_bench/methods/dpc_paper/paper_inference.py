@@ -1,0 +1,62 @@
+"""The paper's network without torch, whose overhead would be most of the time of a single answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.problem.case import Array
+
+#: Output channels of the hidden layers, and the window of each layer (paper, section on the implementation).
+FILTERS, WINDOWS = 30, (5, 10, 5)
+ZERO = np.float32(0.0)
+
+
+def weight_shapes(n_channels: int, n_gen: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a PaperNetwork's weights, in the order of its state dict."""
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n_channels, 1), "scale": (n_channels, 1)}
+    shapes |= {"p_min": (n_gen, 1), "p_max": (n_gen, 1)}
+    sizes = (n_channels, FILTERS, FILTERS, n_gen)
+    for i, window in enumerate(WINDOWS):
+        place = f"layers.{3 * i + 1}"  # after the padding; a ReLU follows
+        shapes |= {f"{place}.weight": (sizes[i + 1], sizes[i], window), f"{place}.bias": (sizes[i + 1],)}
+    return shapes
+
+
+class NumpyPaperNetwork:
+    """The same function as a PaperNetwork with these weights (see `weight_shapes`)."""
+
+    def __init__(self, state: Mapping[str, np.ndarray]) -> None:
+        self._mean, self._scale = state["mean"], 1.0 / state["scale"]
+        self._low, self._half = state["p_min"], 0.5 * (state["p_max"] - state["p_min"])
+        weights = [value for name, value in state.items() if name.endswith(".weight")]  # (out, in, window)
+        matrices = [w.transpose(0, 2, 1).reshape(len(w), -1) for w in weights]
+        biases = [value[:, None] for name, value in state.items() if name.endswith(".bias")]
+        self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
+
+    def __call__(self, channels: Array) -> Array:
+        """See `paper_network.PaperNetwork.forward`."""
+        h = (channels.astype(np.float32) - self._mean) * self._scale
+        for i, (window, weight, bias) in enumerate(self._layers):
+            if i:
+                np.maximum(h, ZERO, out=h)
+            h = np.matmul(weight, _windows(h, window))
+            h += bias
+        np.tanh(h, out=h)
+        h += 1.0
+        power = self._low + self._half * h
+        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
+
+
+def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
+    batch, width, n = x.shape
+    padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
+    before = (window - 1) // 2
+    padded[:, :, before : before + n] = x
+    per_instance, per_channel, per_knot = padded.strides
+    strides = per_instance, per_knot, per_channel, per_knot
+    seen = np.ndarray((batch, window, width, n), np.float32, padded, strides=strides)
+    return seen.reshape(batch, -1, n)

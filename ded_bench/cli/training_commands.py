@@ -69,7 +69,7 @@ def add_commands(commands: Any) -> None:
 
 def _train_ko(a: argparse.Namespace) -> int:
     from ded_bench.koopman.identify import held_out, identify, rollout_table
-    from ded_bench.koopman.linear import linear_model
+    from ded_bench.koopman.linear import nominal_model
     from ded_bench.koopman.surrogates import model_file
 
     case = Case.load(a.case)
@@ -85,7 +85,7 @@ def _train_ko(a: argparse.Namespace) -> int:
             from ded_bench.koopman.identify_paper import identify_paper
         model = identify_paper(case, a.seed)
     model.save(out)
-    table = rollout_table(case, [linear_model(case), model], held_out(case, a.seed))
+    table = rollout_table(case, [nominal_model(case), model], held_out(case, a.seed))
     write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))
     print(table.to_string(index=False, float_format="{:.3g}".format))
     print(f"wrote {out}")

@@ -32,6 +32,8 @@ ENERGY_FORM_PARAMETERS = 60
 LINE_FORM_TRAIN = 40
 #: Kinds of schedules to train on; the held-out ones have all kinds, two of which were never seen.
 TRAIN_MIX = ("tracking", "tracking", "hurried", "random knots")
+#: Trajectories whose rollouts are judged together: all would fill the memory on large grids.
+AT_A_TIME = 10
 #: Residuals are taken every so many steps and in these units: rad/s and pu.
 STRIDE, OMEGA_UNIT, SLACK_UNIT = 20, 2 * np.pi * 5e-6, 1e-4
 #: Gauss-Newton evaluations; the cost changes in its fourth digit after about eight.
@@ -136,9 +138,12 @@ def rollout_table(case: Case, models: Sequence[Koopman], data: Trajectories) -> 
     n_gen = len(case.generators)
     rows = []
     for model in models:
-        error = predict(model, network, data) - data.outputs
-        worst = np.abs(error[..., :n_gen]).max(axis=(0, 2)) / (2 * np.pi)
-        rms = np.sqrt(np.square(error[..., n_gen]).mean(axis=0))
+        worst, rms = np.empty(len(data.kinds)), np.empty(len(data.kinds))
+        for first in range(0, len(data.kinds), AT_A_TIME):
+            part = slice(first, first + AT_A_TIME)
+            error = predict(model, network, data.take(part)) - data.outputs[:, part]
+            worst[part] = np.abs(error[..., :n_gen]).max(axis=(0, 2)) / (2 * np.pi)
+            rms[part] = np.sqrt(np.square(error[..., n_gen]).mean(axis=0))
         for kind in dict.fromkeys(data.kinds):
             chosen = np.array([k == kind for k in data.kinds])
             rows.append(

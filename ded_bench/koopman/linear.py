@@ -1,4 +1,4 @@
-"""The linearisation at the nominal point as a surrogate, and the single-sample form of any model."""
+"""The linearisation at the nominal point, the surrogate made of it, and the single-sample form of a model."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import expm, logm
 
-from ded_bench.koopman.energy_form import energy_form, injections_from_generators, steady_state
+from ded_bench.koopman.energy_form import (
+    energy_form,
+    injection_lift,
+    injections_from_generators,
+    steady_state,
+)
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Case
 from ded_bench.truth.network import Network
 
 
 def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
-    """The linearisation at the nominal point, exactly discretised: the yardstick (kind `linear`).
+    """The linearisation at the nominal point, exactly discretised, with the linearised P_s and N of x_0.
 
-    It starts from the linearised P_s and N of x_0, as a linear model of the DAE would.
+    At an equilibrium away from the nominal point it does not start where it rests; `nominal_model` does.
 
     Args:
         case: the grid.
@@ -61,6 +66,14 @@ def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
         lift=lift,
         training={"source": "linearisation at the nominal point"},
     )
+
+
+def nominal_model(case: Case) -> Koopman:
+    """The surrogate `linear`: the linearisation at the nominal point, with the true P_s and N = f(θ) of x_0.
+
+    It rests at every equilibrium of the nonlinear system, with the true slack power.
+    """
+    return replace(linear_model(case), lift=injection_lift(case))
 
 
 def single_sample(model: Koopman, case: Case) -> Koopman:

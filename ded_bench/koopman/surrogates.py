@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
-from ded_bench.koopman.linear import linear_model, single_sample
+from ded_bench.koopman.linear import nominal_model, single_sample
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import REPOSITORY, Case
 
@@ -40,7 +40,7 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
     """
     path = find_model_file(case, name, search)
     if path is None:
-        return linear_model(case)
+        return nominal_model(case)
     model = Koopman.load(path, case)
     return single_sample(model, case) if name == "koopman-single" else model
 

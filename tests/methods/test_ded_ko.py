@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.energy_form import injection_lift
-from ded_bench.koopman.linear import linear_model
+from ded_bench.koopman.linear import linear_model, nominal_model
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.artifact import Artifact
@@ -350,7 +350,7 @@ def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> N
 def test_prepare_finds_the_model_that_the_settings_name(method, case: Case) -> None:
     settings, instance = Settings(model="linear"), short(case, 0)
     assert method.artifacts(case, "NO", settings) == (
-        Artifact("model", "linear", linear_model(case).fingerprint),
+        Artifact("model", "linear", nominal_model(case).fingerprint),
     )
     solution = method.prepare(case, "NO", settings)(instance)
-    check_limits(case, linear_model(case), instance, solution, "NO")
+    check_limits(case, nominal_model(case), instance, solution, "NO")

@@ -86,6 +86,12 @@ class Koopman:
         increments = np.broadcast_to(increments, (len(increments), *start.shape))
         return linear_recurrence(self.k, start, increments) + steady
 
+    def check_step(self, instance: Instance) -> None:
+        """Raise InputError unless the model's time step is the instance's."""
+        if abs(self.dt_s - instance.dt_s) > 1e-9 * instance.dt_s:
+            problem = f"is {instance.dt_s:g}, but the Koopman model was identified at {self.dt_s:g}"
+            raise InputError(f"instance {instance.id}", "dt_s", problem)
+
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits that change when the model's arrays do."""

@@ -1,8 +1,10 @@
-"""Where trained models lie and which names they answer to."""
+"""The surrogates by name, and where trained ones lie."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
@@ -13,8 +15,27 @@ from ded_bench.problem.case import REPOSITORY, Case
 
 #: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")
-#: All models by name; those not trained follow from the case or from `koopman`.
-MODELS = (*TRAINED, "koopman-single", "linear")
+#: The linearisation along a simulated trajectory.
+TRAJECTORY = "trajectory"
+#: All models by name; those not trained follow from the case, from `koopman`, or from each instance.
+MODELS = (*TRAINED, "koopman-single", "linear", TRAJECTORY)
+
+
+@dataclass(frozen=True)
+class AlongTrajectory:
+    """The surrogate that is made anew for each instance: nothing of it is trained (see `instance_model`)."""
+
+    case: Case
+    kind: str = TRAJECTORY
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change with the case."""
+        return hashlib.sha256(f"{self.kind}|{self.case.fingerprint}".encode()).hexdigest()[:12]
+
+
+#: A lifted model has one K for all instances and times; the other kind is made for each instance.
+Surrogate = Koopman | AlongTrajectory
 
 
 def default_results(case: Case) -> Path:
@@ -32,12 +53,24 @@ def model_file(results: Path, kind: str) -> Path:
     return ResultsFolder(results).model(kind)
 
 
-def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
-    """Return a model by its kind, from the first folder that has it, or by its file's path.
+def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
+    """Return a surrogate by its kind, from the first folder that has it, or by its file's path.
 
     Raises:
         InputError: there is no such model yet (names the command that makes it), or its file is wrong.
     """
+    return AlongTrajectory(case) if name == TRAJECTORY else find_model(case, name, search)
+
+
+def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
+    """Return a lifted model by its kind, from the first folder that has it, or by its file's path.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it), its file is wrong, or the
+            surrogate of this name is made for each instance.
+    """
+    if name == TRAJECTORY:
+        raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
     path = find_model_file(case, name, search)
     if path is None:
         return nominal_model(case)
@@ -51,7 +84,7 @@ def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | Non
     Raises:
         InputError: there is no such model yet (names the command that makes it).
     """
-    if name == "linear":
+    if name in ("linear", TRAJECTORY):
         return None
     kind = "koopman" if name == "koopman-single" else name
     if kind in TRAINED:

@@ -1,12 +1,14 @@
-"""The swing DAE linearised along a simulated trajectory: linear and time-varying, nothing to train.
+"""Linear models along a trajectory, by the knots of the schedules that they answer to.
 
-Between two knots the reduced stiffness S is that of the middle of the interval (generator angles and
-loads determine the angles of all other buses, see `Network.linearise`). Deviations from the trajectory
-under an input increment δP, linear between grid points, obey
+Two kinds. The swing DAE linearised along a simulated trajectory is linear and time-varying, with nothing to
+train: between two knots the reduced stiffness S is that of the middle of the interval (generator angles
+and loads determine the angles of all other buses, see `Network.linearise`), and deviations from the
+trajectory under an input increment δP, linear between grid points, obey
 
     dδθ/dt = δω,    M dδω/dt = -D δω - S δθ + δP,    δP_s = -1ᵀ S δθ,
 
-and are advanced from grid point to grid point by the exact map of that equation (first-order hold).
+advanced from grid point to grid point by the exact map of that equation (first-order hold). A lifted model
+(`Koopman`) has the same form, the same for all intervals, around its own rollout under any powers.
 The loads are those of the trajectory, so that they enter through it alone.
 """
 
@@ -35,9 +37,9 @@ class Hold(NamedTuple):
     Arrays have one map for each of several intervals.
     """
 
-    f: Array  # (n_maps, 2 n_gen, 2 n_gen)
-    g: Array  # (n_maps, 2 n_gen, n_gen)
-    h: Array  # (n_maps, 2 n_gen, n_gen)
+    f: Array  # (n_maps, n_state, n_state)
+    g: Array  # (n_maps, n_state, n_gen)
+    h: Array  # (n_maps, n_state, n_gen)
 
     def then(self, other: Hold, steps: int) -> Hold:
         """This map over `steps` steps, followed by another one."""
@@ -53,7 +55,7 @@ class LocalRows(NamedTuple):
     """Rows in the variables of one interval each: x and u at its start, u at its end."""
 
     interval: Indices  # (n_rows,)
-    x: Array  # (n_rows, 2 n_gen)
+    x: Array  # (n_rows, n_state)
     start: Array  # (n_rows, n_gen)
     end: Array  # (n_rows, n_gen)
 
@@ -62,14 +64,15 @@ class LocalRows(NamedTuple):
 class TrajectoryModel:
     """(ω, P_s) at all grid points as affine functions of generator power at the knots.
 
-    The state is x = (δθ, δω) of the generators at a knot, the input u = δP at the knots; both are
-    deviations from the trajectory. Interval j lies between knots j and j + 1.
+    The state x is (δθ, δω) of the generators at a knot, or δψ of a lifted model; the input is u = δP at the
+    knots; both are deviations from the trajectory. Interval j lies between knots j and j + 1.
     """
 
     points: Indices  # (n_knots,): grid point of each knot
     step: Hold  # over one grid step, of each interval
     across: Hold  # over the whole of each interval
-    slack: Array  # (n_intervals, n_gen): δP_s / δθ, pu/rad
+    speed: slice  # the entries δω of the state
+    slack: Array  # (n_intervals, n_state): δP_s / δx
     omega: Array  # (n_points, n_gen): of the trajectory, rad/s
     p_slack: Array  # (n_points,): of the trajectory, pu
     p_gen: Array  # (n_knots, n_gen): of the trajectory, pu
@@ -86,7 +89,7 @@ class TrajectoryModel:
             u: δP at the knots, shape (n_knots, n_gen), pu.
 
         Returns:
-            Shape (n_knots, 2 n_gen): δθ in rad, δω in rad/s; zero at the first knot.
+            Shape (n_knots, n_state), zero at the first knot.
         """
         slope = np.diff(u, axis=0) / self.lengths[:, None]
         driven = (self.across.g @ u[:-1, :, None] + self.across.h @ slope[:, :, None])[..., 0]
@@ -103,11 +106,11 @@ class TrajectoryModel:
             x: deviations at the knots if they are known (see `states`).
         """
         x = self.states(u) if x is None else x
-        n_gen, length = u.shape[1], self.lengths
+        length = self.lengths
         slope = np.diff(u, axis=0) / length[:, None]
         state, force = x[:-1], (self.step.g @ u[:-1, :, None] + self.step.h @ slope[:, :, None])[..., 0]
         growth = (self.step.g @ slope[:, :, None])[..., 0]
-        deviation = np.zeros((len(self.omega), 2 * n_gen))
+        deviation = np.zeros((len(self.omega), x.shape[1]))
         deviation[self.points] = x
         interval = np.arange(len(length))
         for r in range(1, int(length.max())):
@@ -118,10 +121,28 @@ class TrajectoryModel:
             state = (f @ state[:, :, None])[..., 0] + force
             force = force + growth
             deviation[self.points[interval] + r] = state
-        owner = np.repeat(np.arange(len(length)), length)
-        slack = np.append(owner, len(length) - 1)
-        p_slack = np.einsum("ki,ki->k", self.slack[slack], deviation[:, :n_gen])
-        return self.omega + deviation[:, n_gen:], self.p_slack + p_slack
+        return self._outputs(deviation)
+
+    def rollout(self, p_gen: Array) -> tuple[Array, Array]:
+        """ω and P_s as `outputs` gives them, under powers given at all grid points, (n_points, n_gen), pu."""
+        knots = np.arange(len(self.omega))
+        reference = [np.interp(knots, self.points, p) for p in self.p_gen.T]
+        u = p_gen - np.stack(reference, axis=1)
+        change, deviation = np.diff(u, axis=0), np.zeros((len(u), self.step.f.shape[1]))
+        for k, j in enumerate(self._intervals[:-1]):
+            inputs = self.step.g[j] @ u[k] + self.step.h[j] @ change[k]
+            deviation[k + 1] = self.step.f[j] @ deviation[k] + inputs
+        return self._outputs(deviation)
+
+    @property
+    def _intervals(self) -> Indices:
+        """In which interval each grid point lies; the point at a knot belongs to the one after it."""
+        owner = np.repeat(np.arange(len(self.lengths)), self.lengths)
+        return np.append(owner, owner[-1])
+
+    def _outputs(self, deviation: Array) -> tuple[Array, Array]:
+        p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
+        return self.omega + deviation[:, self.speed], self.p_slack + p_slack
 
     def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
         """δω at single grid points, as rows in the variables of the intervals that they lie in.
@@ -132,11 +153,10 @@ class TrajectoryModel:
         """
         interval = np.searchsorted(self.points, points) - 1
         steps, slot = points - self.points[interval], _places(interval)
-        n_gen = self.slack.shape[1]
 
         def add(r: int, costate: Array) -> None:
             here = np.flatnonzero(steps == r)
-            costate[interval[here], slot[here], n_gen + generators[here]] += 1.0
+            costate[interval[here], slot[here], self.speed.start + generators[here]] += 1.0
 
         count = int(slot.max(initial=-1)) + 1
         rows = self._costates(count, add)
@@ -153,11 +173,11 @@ class TrajectoryModel:
         """
         interval = np.searchsorted(self.points[:-1], first, side="right") - 1
         ends, slot = np.append(first[1:], len(self.omega)), _places(interval)
-        begin, end, n_gen = first - self.points[interval], ends - self.points[interval], self.slack.shape[1]
+        begin, end = first - self.points[interval], ends - self.points[interval]
 
         def add(r: int, costate: Array) -> None:
             here = np.flatnonzero((begin <= r) & (r < end))
-            costate[interval[here], slot[here], :n_gen] += self.slack[interval[here]]
+            costate[interval[here], slot[here]] += self.slack[interval[here]]
 
         rows = self._costates(int(slot.max()) + 1, add)
         return LocalRows(
@@ -174,20 +194,20 @@ class TrajectoryModel:
         Returns:
             Shape (n_knots, n_gen).
         """
-        n_gen, length = self.slack.shape[1], self.lengths
+        n_gen, length = self.p_gen.shape[1], self.lengths
 
         def add(r: int, costate: Array) -> None:
             # The point at a knot belongs to the interval after it.
             here = np.flatnonzero((r < length) | ((r == length) & (self.points[1:] == self.points[-1])))
             at = self.points[here] + r
-            costate[here, 0, n_gen:] += on_omega[at]
-            costate[here, 0, :n_gen] += on_slack[at, None] * self.slack[here]
+            costate[here, 0, self.speed] += on_omega[at]
+            costate[here, 0] += on_slack[at, None] * self.slack[here]
 
         rows = self._costates(1, add)
         gradient = np.zeros((len(self.points), n_gen))
         gradient[:-1] += rows.start[:, 0]
         gradient[1:] += rows.end[:, 0]
-        costate = np.zeros(2 * n_gen)
+        costate = np.zeros(self.slack.shape[1])
         for j in range(len(length) - 1, -1, -1):
             through, slope = costate @ self.across.g[j], costate @ self.across.h[j] / length[j]
             gradient[j] += through - slope
@@ -201,11 +221,11 @@ class TrajectoryModel:
         Args:
             n_rows: sums per interval.
             add: called with a number of steps r from the intervals' starts, and the costates there, shape
-                (n_intervals, n_rows, 2 n_gen), to which it adds the weights of (δθ, δω) at that point.
+                (n_intervals, n_rows, n_state), to which it adds the weights of δx at that point.
         """
-        n, n_gen = self.slack.shape
+        (n, n_state), n_gen = self.slack.shape, self.p_gen.shape[1]
         f, g, h = self.step
-        costate = np.zeros((n, n_rows, 2 * n_gen))
+        costate = np.zeros((n, n_rows, n_state))
         on_start, on_slope = np.zeros((2, n, n_rows, n_gen))
         for r in range(int(self.lengths.max()), -1, -1):
             add(r, costate)
@@ -241,18 +261,19 @@ def linearise_along(case: Case, trajectory: Trajectory, points: Indices) -> Traj
     stiffness = np.stack([part.stiffness for part in linear])
     m, d = linear[0].m, linear[0].d
     dt_s = float(trajectory.t[1] - trajectory.t[0])
-    step = _one_step(stiffness / m[:, None], d / m, 1.0 / m, dt_s)
+    step, n_gen = _one_step(stiffness / m[:, None], d / m, 1.0 / m, dt_s), len(m)
     lengths = np.diff(points)
     across = Hold(*(np.empty_like(part) for part in step))
     for length in np.unique(lengths):
         chosen = np.flatnonzero(lengths == length)
-        for whole, part in zip(across, _repeated(step.take(chosen), int(length)), strict=True):
+        for whole, part in zip(across, repeated(step.take(chosen), int(length)), strict=True):
             whole[chosen] = part
     return TrajectoryModel(
         points=points,
         step=step,
         across=across,
-        slack=-stiffness.sum(axis=1),
+        speed=slice(n_gen, 2 * n_gen),
+        slack=np.concatenate([-stiffness.sum(axis=1), np.zeros((len(lengths), n_gen))], axis=1),
         omega=trajectory.omega,
         p_slack=trajectory.p_slack,
         p_gen=trajectory.p_gen[points],
@@ -293,7 +314,7 @@ def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hol
     return Hold(one, dt_s * first[:, :, n:] * gain, dt_s * total[:, :, n:] * gain)
 
 
-def _repeated(step: Hold, times: int) -> Hold:
+def repeated(step: Hold, times: int) -> Hold:
     """A map over several steps, from maps over 1, 2, 4, ... steps."""
     total: Hold | None = None
     done, length = 0, 1

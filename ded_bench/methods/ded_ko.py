@@ -1,4 +1,8 @@
-"""DED-KO: the paper's linear program over all points of the horizon, on a Koopman model."""
+"""DED-KO: the paper's linear program over all points of the horizon, on a surrogate.
+
+By default its arrays are made directly (see `knot_program`: every grid point is a knot) and PIQP solves it,
+on any surrogate. Other settings solve the paper's formulation on a lifted model, written in Pyomo.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,10 @@ import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
-from ded_bench.koopman.surrogates import find_model
+from ded_bench.koopman.surrogates import Surrogate, find_surrogate
 from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -24,9 +29,9 @@ from ded_bench.solvers.ipopt import LINEAR_OPTIONS
 from ded_bench.solvers.outcome import Compiled
 from ded_bench.truth.network import Network
 
-#: Solver and its options by settings slug; the default is the fastest of those tried.
+#: Solver of the Pyomo model and its options by settings slug.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {"solver": "piqp"},
+    "default": {},
     "ipopt": {"solver": "ipopt", "options": LINEAR_OPTIONS},
     "executable": {"solver": "ipopt-executable", "options": LINEAR_OPTIONS},
     "highs": {"solver": "highs"},
@@ -34,21 +39,40 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The Koopman model that `prepare` would use."""
+    """The surrogate that `prepare` would use."""
     return (model_artifact(case, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return a solver of single instances on the Koopman model that the settings name."""
-    return prepare_with(case, find_model(case, settings.model, settings.search), regime, settings)
+    """Return a solver of single instances on the surrogate that the settings name."""
+    return prepare_with(case, find_surrogate(case, settings.model, settings.search), regime, settings)
 
 
-def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:
-    """Return a solver of single instances; one compiled program per process serves them all."""
+def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
+    """Return a solver of single instances.
+
+    Raises:
+        InputError: the settings want a lifted model, and this surrogate is none.
+    """
     case.check_regimes([regime])
+    if SETTINGS[settings.name]:
+        if not isinstance(surrogate, Koopman):
+            problem = f"only its default settings solve `ded-ko` on {surrogate.kind}"
+            raise InputError("--settings", settings.name, problem)
+        return _pyomo_solver(case, surrogate, regime, settings)
 
     def solve(instance: Instance) -> Solution:
-        check_step(koopman, instance)
+        points = np.arange(instance.steps + 1)
+        return solve_on_surrogate(case, surrogate, instance, regime, points, settings.time_limit_s)
+
+    return solve
+
+
+def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:
+    """A solver through the Pyomo model; one compiled program per process serves all instances."""
+
+    def solve(instance: Instance) -> Solution:
+        koopman.check_step(instance)
         started = time.perf_counter()
         program = _Program(case, koopman.fingerprint, instance.steps, koopman)
         model = _built(program)
@@ -68,13 +92,6 @@ def prepare_with(case: Case, koopman: Koopman, regime: str, settings: Settings) 
         )
 
     return solve
-
-
-def check_step(koopman: Koopman, instance: Instance) -> None:
-    """Raise InputError unless the model's time step is the instance's."""
-    if abs(koopman.dt_s - instance.dt_s) > 1e-9 * instance.dt_s:
-        problem = f"is {instance.dt_s:g}, but the Koopman model was identified at {koopman.dt_s:g}"
-        raise InputError(f"instance {instance.id}", "dt_s", problem)
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ class SequentialDed:
                     break
                 answer = solve_form(self._program(instance, theta, along))
                 iterations, version, message = iterations + answer.iterations, answer.version, answer.message
-                if answer.x is None:
+                if answer.status != Status.OPTIMAL:
                     break
                 moved = np.vstack([initial, answer.x[self._theta]])
                 predicted = along.f + np.einsum("nij,nj->ni", along.slope, moved - theta)

@@ -15,9 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.koopman.trajectory import Indices, TrajectoryModel, linearise_along
+from ded_bench.koopman.trajectory import Indices, linearise_along
 from ded_bench.methods import ed
-from ded_bench.methods.knot_program import KnotProgram, Prediction, divided, power_limits
+from ded_bench.methods.knot_program import (
+    KnotProgram,
+    Limit,
+    is_reachable,
+    knot_points,
+    solve_with_rows_added,
+)
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -39,10 +45,8 @@ OPEN = ACCEPTED = 2 * np.pi * 5e-7
 REFINEMENT = 0.01
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
-#: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
-NEAR, PARTS = 0.9, 8
-#: Trajectories, programs around one of them, and halvings of a step that the system cannot follow.
-MAX_ROUNDS, MAX_PROGRAMS, MAX_HALVINGS = 15, 15, 6
+#: Trajectories, and halvings of a step that the system cannot follow.
+MAX_ROUNDS, MAX_HALVINGS = 15, 6
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
@@ -95,11 +99,11 @@ class SlpSolver:
         )
 
     def _knots(self, instance: Instance) -> Indices:
-        """Grid points of the knots: between grid points inputs are linear, so knots lie on them."""
+        """Grid points of the knots."""
         times = self.case.knot_times(instance.horizon_s)
         if self.knot_interval_s is not None:
             times = np.linspace(0.0, instance.horizon_s, round(instance.horizon_s / self.knot_interval_s) + 1)
-        return np.unique(np.rint(times / instance.dt_s).astype(int))
+        return knot_points(times, instance.dt_s)
 
 
 @dataclass
@@ -112,7 +116,7 @@ class _Sequence:
     points: Indices
     deadline: float  # on the clock of `time.perf_counter`
     soft: bool = False  # an infeasible instance has a schedule, too: that of least excess
-    limits: set[tuple[int, int]] = field(default_factory=set)  # (generator, grid point) with a row
+    limits: set[Limit] = field(default_factory=set)
     iterations: int = 0
     claimed: float = np.inf  # cost that the last program predicts
     version: str = ""
@@ -127,7 +131,7 @@ class _Sequence:
             start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
             is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
         """
-        if not self._reachable():
+        if not is_reachable(self.case, self.instance, self.points):
             return Status.INFEASIBLE, None
         p_gen = start.at(self.instance.grid[self.points])
         p_gen[0] = self.instance.p_initial(self.case)
@@ -145,13 +149,18 @@ class _Sequence:
             if excess <= ACCEPTED and self._confirmed(trajectory, schedule):
                 return Status.OPTIMAL, schedule
             model = linearise_along(self.case, trajectory, self.points)
+            program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
             if is_near:
-                self.limits |= self._near(trajectory.omega)
+                self.limits |= program.near(trajectory.omega)
             enough = np.inf if number == 0 and not is_near else max(OPEN, REFINEMENT * excess)
-            found, prediction = self._next(model, enough)
+            attempt = solve_with_rows_added(
+                program, self.limits, OPEN, enough, self.deadline, by_interval=self.soft
+            )
+            self.iterations += attempt.iterations
+            self.version, self.message, prediction = attempt.version, attempt.message, attempt.prediction
             if prediction is None:
-                return found, self._best
-            infeasible = infeasible + 1 if found == Status.INFEASIBLE else 0
+                return attempt.status, self._best
+            infeasible = infeasible + 1 if attempt.status == Status.INFEASIBLE else 0
             if infeasible == 2:
                 nearest = Schedule(t=schedule.t, p=prediction.p_gen)
                 return Status.INFEASIBLE, nearest if self.soft else None
@@ -164,13 +173,6 @@ class _Sequence:
         if status == Status.FAILED:
             return self.message
         return status.sentence if schedule is None or status == Status.INFEASIBLE else ""
-
-    def _reachable(self) -> bool:
-        """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides."""
-        p_min, p_max = power_limits(self.case, self.instance, np.diff(self.points))
-        reach = self.case.ramp * self.instance.grid[self.points[1]]
-        p_initial = self.instance.p_initial(self.case)
-        return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
 
     def _follow(self, p_before: Array, p_gen: Array) -> tuple[Array, Trajectory]:
         """Simulate, closer to the powers before if the system cannot follow.
@@ -194,65 +196,3 @@ class _Sequence:
         if cost < self._cheapest:
             self._cheapest, self._best = cost, schedule
         return abs(cost - self.claimed) <= COST_TOLERANCE * abs(cost)
-
-    def _next(self, model: TrajectoryModel, enough: float) -> tuple[Status, Prediction | None]:
-        """Solve the program around a trajectory, with rows added until all points are right.
-
-        Args:
-            model: the linear model along it.
-            enough: how far ω may exceed its limit between points that have rows, rad/s.
-
-        Returns:
-            `Optimal`, or `Infeasible` with the schedule of least excess; without a schedule, why not.
-        """
-        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
-        for _ in range(MAX_PROGRAMS):
-            rows = np.array(sorted(self.limits), dtype=int).reshape(-1, 2)
-            answer = program.solve(rows, self.deadline - time.perf_counter())
-            self._count(answer.iterations, answer.version, answer.message)
-            if answer.status == Status.FAILED:
-                return self._relaxed(program, rows)
-            if answer.status != Status.OPTIMAL:
-                return answer.status, None
-            prediction = program.predict(answer.x)
-            excess = float(np.abs(prediction.omega[1:]).max()) - (self.bound - MARGIN)
-            added = self._near(prediction.omega) - self.limits
-            self.limits |= added if excess > OPEN else set()
-            if excess <= enough or not added:
-                return Status.OPTIMAL, prediction
-        return Status.OPTIMAL, prediction
-
-    def _relaxed(self, program: KnotProgram, rows: Indices) -> tuple[Status, Prediction | None]:
-        """Widen the bound as little as possible where the program has no solution, or PIQP finds none."""
-        left = self.deadline - time.perf_counter()
-        answer, widening = program.solve_relaxed(rows, left, by_interval=self.soft)
-        self._count(answer.iterations, answer.version, answer.message)
-        if answer.status != Status.OPTIMAL:
-            return answer.status, None
-        prediction = program.predict(answer.x)
-        self.limits |= self._near(prediction.omega)
-        return (Status.INFEASIBLE if widening > OPEN else Status.OPTIMAL), prediction
-
-    def _count(self, iterations: int, version: str, message: str) -> None:
-        self.iterations += iterations
-        self.version, self.message = version, message
-
-    def _near(self, omega: Array) -> set[tuple[int, int]]:
-        """(generator, grid point) near the bound after t_0.
-
-        Args:
-            omega: shape (n_points, n_gen), rad/s.
-        """
-        size, bound = np.abs(omega.T), self.bound - MARGIN
-        size[:, 0] = 0.0  # x_0 is given, wherever it lies
-        chosen = np.zeros(size.shape, dtype=bool)
-        peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
-        chosen[:, 1:-1] = peak
-        # A peak that is cut off moves to the points beside it.
-        over = peak & (size[:, 1:-1] > bound)
-        chosen[:, :-2] |= over
-        chosen[:, 2:] |= over
-        chosen[:, divided(self.points, np.full(len(self.points) - 1, PARTS))] = True
-        chosen[:, self.points] = False
-        g, k = np.nonzero(chosen & (size > NEAR * bound))
-        return set(zip(g.tolist(), k.tolist(), strict=True))

@@ -1,16 +1,21 @@
-"""The linear program of `ded-slp`: schedules linear between knots, on a trajectory's linear model.
+"""The linear program over schedules linear between knots, on a linear model along a trajectory.
 
-Variables are input increments u = δP and deviations x = (δθ, δω) at the knots, and s_p >= |Σ P_s| over
+`ded-slp` solves it along one trajectory after another, `ded-ko` and `ded-ko-knots` once on a surrogate.
+
+Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over
 every piece p of a few grid points, so that every row is local to one interval between knots:
 
     min  Σ_j weight_j c · (P_j + u_j) + c_s Σ_p s_p
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
     limits on P, on its ramps, and on ω at the knots and at chosen points between them
+
+Few of the limits between knots bind: they get rows as solutions ask for them (`solve_with_rows_added`).
 """
 
 from __future__ import annotations
 
 import itertools
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,17 +25,27 @@ import scipy.sparse as sp
 from ded_bench.koopman.trajectory import Indices, LocalRows, TrajectoryModel
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.linear_program import FreeForm
-from ded_bench.solvers.staged_program import StagedAnswer, solve_staged
+from ded_bench.solvers.highs import solve_form as solve_by_highs
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.piqp import solve_form
+from ded_bench.solvers.status import Status
 
-#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same.
-PIECE = 10
+#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
+#: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
+PIECE = 20
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
 
 #: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
 WIDENING_PRICE = 100.0
 
+#: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
+NEAR, PARTS = 0.9, 8
+#: Programs on one linear model.
+MAX_PROGRAMS = 15
+
+#: (generator, grid point) of a limit of |ω| between knots.
+Limit = tuple[int, int]
 #: Row numbers, column numbers and values of dense blocks, stacked or single.
 Block = tuple[Indices, Indices, Array]
 
@@ -54,38 +69,42 @@ class KnotProgram:
         case: the grid.
         instance: costs and P_0.
         bound: limit of |ω|, rad/s.
-        model: the linear model along a trajectory that starts at P_0.
+        model: a linear model along a trajectory that starts at P_0.
     """
 
     def __init__(self, case: Case, instance: Instance, bound: float, model: TrajectoryModel) -> None:
-        self.model, self._bound = model, bound
+        self.model, self.bound = model, bound
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         self.pieces = piece_starts(model.points)
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
-        self._s = np.arange(len(self.pieces)) + 3 * self._n_gen * owner
-        power = (own + 3 * self._n_gen * np.arange(self._n))[:, None]
-        self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(2 * self._n_gen)
-        self._n_columns = len(self.pieces) + 3 * self._n_gen * self._n
+        n_state = model.slack.shape[1]
+        at_end = self._n_gen + n_state
+        self._s = np.arange(len(self.pieces)) + at_end * owner
+        power = (own + at_end * np.arange(self._n))[:, None]
+        self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
+        self._speed = self._x[:, model.speed]
+        self._n_columns = len(self.pieces) + at_end * self._n
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
+        self._durations = model.lengths * instance.dt_s
         self._price = instance.cost_slack(case)
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
-    def solve(self, limits: Indices, time_limit_s: float) -> StagedAnswer:
+    def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with |ω| limited at all knots and at the points chosen.
 
         Args:
             limits: (generator, grid point) of the limits between knots, shape (n_limits, 2).
-            time_limit_s: see `solve_staged`.
+            time_limit_s: see `piqp.solve_form`.
         """
-        return solve_staged(self._form(limits), time_limit_s)
+        return solve_form(self._form(limits), time_limit_s, staged=self._is_staged)
 
     def solve_relaxed(
         self, limits: Indices, time_limit_s: float, by_interval: bool = False
-    ) -> tuple[StagedAnswer, float]:
-        """Solve with the limits of |ω| widened as little as possible.
+    ) -> tuple[FormAnswer, float]:
+        """Solve with the limits of |ω| widened as little as possible; what PIQP does not solve HiGHS does.
 
         The cost counts, but so little that the widening is the least one but for round-off.
 
@@ -98,8 +117,51 @@ class KnotProgram:
         Returns:
             The answer, and the largest widening in rad/s.
         """
+        started = time.perf_counter()
+        form, order = self._relaxed_form(limits, by_interval)
+        answer = solve_form(form, time_limit_s, staged=self._is_staged)
+        if answer.status == Status.FAILED:
+            other = solve_by_highs(form, max(time_limit_s - (time.perf_counter() - started), 0.0))
+            version = f"{answer.version}, {other.version}"
+            answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
+        if answer.status != Status.OPTIMAL:
+            return answer, np.inf
+        x = np.empty(len(order))
+        x[order] = answer.x
+        return replace(answer, x=x[: self._n_columns]), float(x[self._n_columns :].max())
+
+    def near(self, omega: Array) -> set[Limit]:
+        """Points between knots at which |ω| comes near the bound.
+
+        Args:
+            omega: shape (n_points, n_gen), rad/s.
+        """
+        size, points = np.abs(omega.T), self.model.points
+        chosen = np.zeros(size.shape, dtype=bool)
+        peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+        chosen[:, 1:-1] = peak
+        # A peak that is cut off moves to the points beside it.
+        over = peak & (size[:, 1:-1] > self.bound)
+        chosen[:, :-2] |= over
+        chosen[:, 2:] |= over
+        chosen[:, divided(points, np.full(len(points) - 1, PARTS))] = True
+        chosen[:, points] = False
+        g, k = np.nonzero(chosen & (size > NEAR * self.bound))
+        return set(zip(g.tolist(), k.tolist(), strict=True))
+
+    def excess(self, omega: Array) -> float:
+        """Largest excess of |ω| over the bound after t_0: x_0 is given, wherever it lies; rad/s."""
+        return float(np.abs(omega[1:]).max()) - self.bound
+
+    @property
+    def _is_staged(self) -> bool:
+        """Whether intervals are stages worth dense blocks; with a knot at every point they are too small."""
+        return len(self.model.lengths) < len(self.model.omega) - 1
+
+    def _relaxed_form(self, limits: Indices, by_interval: bool) -> tuple[FreeForm, Indices]:
+        """The program with columns for widenings, and where its columns stand among the program's own."""
         form = self._form(limits)
-        n, speed = self._n_columns, self._x[:, self._n_gen :].ravel()
+        n, speed = self._n_columns, self._speed.ravel()
         one = np.ones(speed.size)
         at_knots = sp.csc_matrix((one, (np.arange(speed.size), speed)), (speed.size, n))
         kept = form.between.shape[0] - len(limits)
@@ -107,14 +169,12 @@ class KnotProgram:
         low, high = (
             np.append(a[speed], b[kept:]) for a, b in ((form.lower, form.low), (form.upper, form.high))
         )
-        owner = np.append(np.repeat(np.arange(self._n), self._n_gen), self._interval_of(limits))
-        stage = (
-            self._x[:, -1] if by_interval else np.array([n])
-        )  # of a widening: after the column of that number
-        widening = sp.csc_matrix(
-            (np.ones(len(owner)), (np.arange(len(owner)), owner if by_interval else 0 * owner)),
-            (len(owner), len(stage)),
-        )
+        between = np.searchsorted(self.model.points, limits[:, 1]) - 1
+        owner = np.append(np.repeat(np.arange(self._n), self._n_gen), between)
+        # A widening stands after the column of this number, in its own stage.
+        stage = self._x[:, -1] if by_interval else np.array([n])
+        place = np.arange(len(owner)), owner if by_interval else np.zeros_like(owner)
+        widening = sp.csc_matrix((np.ones(len(owner)), place), (len(owner), len(stage)))
         below, none = np.full(len(low), -np.inf), np.zeros(len(stage))
         lower, upper = np.append(form.lower, none), np.append(form.upper, none + np.inf)
         lower[speed], upper[speed] = -np.inf, np.inf
@@ -131,19 +191,11 @@ class KnotProgram:
             lower=lower[order],
             upper=upper[order],
         )
-        answer = solve_staged(relaxed, time_limit_s)
-        x = np.empty(len(order))
-        x[order] = answer.x
-        return replace(answer, x=x[:n]), float(x[n:].max())
-
-    def _interval_of(self, limits: Indices) -> Indices:
-        """Intervals of (generator, grid point) pairs, shape (n_limits,)."""
-        return np.searchsorted(self.model.points, limits[:, 1]) - 1
+        return relaxed, order
 
     def _form(self, limits: Indices) -> FreeForm:
         model = self.model
-        ramp = np.diff(model.p_gen, axis=0)
-        reach = self._case.ramp * self._instance.dt_s * model.lengths[:, None]
+        ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
         slack = np.add.reduceat(model.p_slack, self.pieces)
         omega = model.omega[limits[:, 1], limits[:, 0]]
         cost = np.zeros(self._n_columns)
@@ -156,9 +208,9 @@ class KnotProgram:
             right=np.zeros(self._x.size),
             between=sp.csc_matrix(sp.vstack(rows)),
             low=np.concatenate(
-                [(-reach - ramp).ravel(), np.full(2 * len(slack), -np.inf), -self._bound - omega]
+                [(-self._case.ramp - ramp).ravel(), np.full(2 * len(slack), -np.inf), -self.bound - omega]
             ),
-            high=np.concatenate([(reach - ramp).ravel(), -slack, slack, self._bound - omega]),
+            high=np.concatenate([(self._case.ramp - ramp).ravel(), -slack, slack, self.bound - omega]),
             lower=lower,
             upper=upper,
         )
@@ -180,8 +232,7 @@ class KnotProgram:
         lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
         lower[self._s] = 0.0
         lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
-        speed = self._x[:, self._n_gen :]
-        lower[speed], upper[speed] = -self._bound - omega, self._bound - omega
+        lower[self._speed], upper[self._speed] = -self.bound - omega, self.bound - omega
         return lower, upper
 
     def _dynamics_rows(self) -> sp.csc_matrix:
@@ -198,8 +249,9 @@ class KnotProgram:
         return self._matrix(row.size, blocks)
 
     def _ramp_rows(self) -> sp.csc_matrix:
+        """Ramps in pu/s: what the solver leaves open is as little in a short interval as in a long one."""
         row = np.arange(self._u.size).reshape(self._n, -1)
-        one = np.broadcast_to(np.eye(self._n_gen), (self._n, self._n_gen, self._n_gen))
+        one = np.eye(self._n_gen) / self._durations[:, None, None]
         return self._matrix(row.size, [(row, self._u, one), (row[1:], self._u[:-1], -one[1:])])
 
     def _slack_rows(self) -> sp.csc_matrix:
@@ -232,6 +284,82 @@ class KnotProgram:
         kept = np.abs(values) > ROUND_OFF
         place = np.concatenate(rows)[kept], np.concatenate(columns)[kept]
         return sp.csc_matrix((values[kept], place), (n_rows, self._n_columns))
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What solving a program with rows added came to.
+
+    Without a prediction the status says why. `Infeasible` comes with the schedule of least excess.
+    """
+
+    status: Status
+    prediction: Prediction | None
+    iterations: int
+    version: str
+    message: str
+
+
+def solve_with_rows_added(
+    program: KnotProgram,
+    limits: set[Limit],
+    tolerance: float,
+    enough: float,
+    deadline: float,
+    by_interval: bool = False,
+) -> Attempt:
+    """Solve, look at all grid points, limit |ω| where it comes near the bound, and again.
+
+    Args:
+        program: what to solve.
+        limits: limits between knots to begin with; those found to be needed are added to it.
+        tolerance: excess of |ω| that needs no row, or makes nothing infeasible, rad/s.
+        enough: excess of |ω| with which to stop, rad/s; no less than the tolerance.
+        deadline: on the clock of `time.perf_counter`.
+        by_interval: what least excess means, see `solve_relaxed`; then rows are added for it, too.
+    """
+    iterations, infeasible = 0, False
+    for _ in range(MAX_PROGRAMS):
+        rows, widening = np.array(sorted(limits), dtype=int).reshape(-1, 2), 0.0
+        if not infeasible:
+            answer = program.solve(rows, deadline - time.perf_counter())
+            iterations += answer.iterations
+        if infeasible or answer.status == Status.FAILED:  # there is no solution, or PIQP finds none
+            left = deadline - time.perf_counter()
+            answer, widening = program.solve_relaxed(rows, left, by_interval)
+            iterations += answer.iterations
+        if answer.status != Status.OPTIMAL:
+            return Attempt(answer.status, None, iterations, answer.version, answer.message)
+        prediction = program.predict(answer.x)
+        excess, added = program.excess(prediction.omega), program.near(prediction.omega) - limits
+        limits |= added if excess > tolerance else set()
+        infeasible = infeasible or widening > tolerance
+        is_done = not by_interval if infeasible else excess <= enough
+        if is_done or not added:
+            break
+    status = Status.INFEASIBLE if infeasible else Status.OPTIMAL
+    return Attempt(status, prediction, iterations, answer.version, answer.message)
+
+
+def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
+    """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides.
+
+    Args:
+        points: grid points of the knots.
+    """
+    p_min, p_max = power_limits(case, instance, np.diff(points))
+    reach, p_initial = case.ramp * instance.grid[points[1]], instance.p_initial(case)
+    return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
+
+
+def knot_points(times: Array, dt_s: float) -> Indices:
+    """Grid points of knots: inputs are linear between grid points, so knots lie on them.
+
+    Args:
+        times: shape (n_knots,), s.
+        dt_s: step of the grid, s.
+    """
+    return np.unique(np.rint(times / dt_s).astype(int))
 
 
 def knot_weights(lengths: Indices) -> Array:

@@ -1,4 +1,4 @@
-"""HiGHS: its dual simplex method on a Pyomo model, and on a small program to which rows are added."""
+"""HiGHS: its dual simplex method on a Pyomo model, and on a linear program given by its arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pyomo.environ as pyo
 import scipy.sparse as sp
 
 from ded_bench.problem.case import Array
-from ded_bench.solvers.linear_program import assign, read_linear
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, read_linear
 from ded_bench.solvers.outcome import Options, Outcome
 from ded_bench.solvers.status import Status
 
@@ -95,42 +95,16 @@ class Highs:
         )
 
 
-class GrowingProgram:
-    """A small linear program in HiGHS whose first rows stay and to which others are added.
-
-    Args:
-        a: the rows that stay, shape (n_rows, n).
-    """
-
-    def __init__(self, a: sp.csr_matrix) -> None:
-        self._n_rows, self._n = a.shape
-        # Presolve costs more than it saves on a program that is solved again with a few more rows.
-        self._highs = _highs(_HIGHS_OPTIONS | {"presolve": "off"})
-        self._highs.passModel(_highs_program(sp.csc_matrix(a), np.zeros(a.shape[0]), np.zeros(a.shape[0])))
-        self.version = f"highs {self._highs.version()}"
-
-    def restart(self, cost: Array, lower: Array, upper: Array, row_lower: Array, row_upper: Array) -> None:
-        """Set the numbers of columns and first rows; forget other rows and earlier solutions."""
-        highs = self._highs
-        columns, rows = (np.arange(n, dtype=np.int32) for n in (self._n, self._n_rows))
-        if extra := highs.getNumRow() - self._n_rows:
-            highs.deleteRows(extra, np.arange(self._n_rows, self._n_rows + extra, dtype=np.int32))
-        highs.changeColsBounds(self._n, columns, lower, upper)
-        highs.changeColsCost(self._n, columns, cost)
-        highs.changeRowsBounds(self._n_rows, rows, row_lower, row_upper)
-        highs.clearSolver()
-
-    def add(self, rows: Array, lower: Array, upper: Array) -> None:
-        """Add rows, shape (n_new, n), with lower <= rows @ x <= upper."""
-        row, column = np.nonzero(rows)
-        start = np.searchsorted(row, np.arange(len(rows)))
-        values = rows[row, column]
-        self._highs.addRows(len(rows), lower, upper, len(values), start, column, values)
-
-    def solve(self, time_limit_s: float) -> tuple[Status, Array, int]:
-        """Status, x and iterations, starting from the solution before the last rows were added."""
-        highs = self._highs
-        highs.setOptionValue("time_limit", highs.getRunTime() + time_limit_s)
-        highs.run()
-        status = _HIGHS_STATUS.get(highs.getModelStatus(), Status.FAILED)
-        return status, np.array(highs.getSolution().col_value), int(highs.getInfo().simplex_iteration_count)
+def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
+    """Solve a linear program given by its arrays."""
+    highs = _highs(_HIGHS_OPTIONS)
+    rows = sp.csc_matrix(sp.vstack([form.equal, form.between]))
+    highs.passModel(_highs_program(rows, np.append(form.right, form.low), np.append(form.right, form.high)))
+    every = np.arange(len(form.cost), dtype=np.int32)
+    highs.changeColsBounds(len(every), every, form.lower, form.upper)
+    highs.changeColsCost(len(every), every, form.cost)
+    highs.setOptionValue("time_limit", float(time_limit_s))
+    highs.run()
+    found, iterations = highs.getModelStatus(), int(highs.getInfo().simplex_iteration_count)
+    status, x = _HIGHS_STATUS.get(found, Status.FAILED), np.array(highs.getSolution().col_value)
+    return FormAnswer(status, x, iterations, f"highs {highs.version()}", highs.modelStatusToString(found))

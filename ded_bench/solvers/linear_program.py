@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pyomo.repn import generate_standard_repn
 
 from ded_bench.problem.case import Array
+from ded_bench.solvers.status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,17 @@ class FreeForm:
     high: Array
     lower: Array
     upper: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FormAnswer:
+    """What a solver says to one linear program; x has values of use only with status `Optimal`."""
+
+    status: Status
+    x: Array
+    iterations: int
+    version: str
+    message: str
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,9 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
+from ded_bench.methods.knot_program import knot_points
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -70,7 +72,7 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
     p_gen = solution.schedule.at(instance.grid)
     model = replay(case, koopman, instance, solution.schedule)
     assert model.objective == pytest.approx(solution.solver_objective, rel=1e-8)
-    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 1.1 * ded_ko_knots.OMEGA_TOLERANCE
+    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 1.1 * OMEGA_TOLERANCE
     assert (np.abs(np.diff(p_gen, axis=0)) <= case.ramp * instance.dt_s + 1e-9).all()
     assert (p_gen - case.p_max).max() <= 1e-8
     assert (case.p_min - p_gen).max() <= 1e-8
@@ -81,7 +83,7 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
 def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
     """The optimum on knots with every row there is, and a variable above |P_s| at every point."""
     n_gen, grid = len(case.generators), instance.grid
-    knots = case.knot_times(grid[-1])
+    knots = grid[knot_points(case.knot_times(grid[-1]), instance.dt_s)]
     condensed = CondensedRollout.make(case, koopman, grid, knots)
     free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
     n_x, n_s = len(knots) * n_gen, len(grid)
@@ -94,7 +96,7 @@ def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime
         rows += [np.hstack([sign * omega, none((len(omega), n_s))])]
         right += [bound - sign * free[:n_gen, 1:].ravel()]
         rows += [np.hstack([sign * ramps, none((len(ramps), n_s))])]
-        right += [np.tile(case.ramp * knots[1], len(knots) - 1)]
+        right += [np.outer(np.diff(knots), case.ramp).ravel()]
     weight = np.outer(condensed.hat_weights, instance.cost_gen(case)).ravel()
     p_initial = instance.p_initial(case)
     bounds = [(p, p) for p in p_initial] + (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True))
@@ -128,7 +130,7 @@ def test_program_variables_follow_the_rollout(case: Case, koopman: Koopman) -> N
     instance = short(case, 1)
     model = build_ded_ko(case, koopman, instance.steps)
     set_instance(model, case, koopman, instance, "NO")
-    assert compile_model(model, "piqp").solve().status == Status.OPTIMAL
+    assert compile_model(model, "highs").solve().status == Status.OPTIMAL
     schedule = ded_ko.schedule_of(model, case, instance)
     result = replay(case, koopman, instance, schedule)
     psi = np.array([[model.psi[i, k].value for i in model.observable] for k in model.point])
@@ -148,8 +150,9 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Ko
         again = solve(last)
         model = build_ded_ko(case, koopman, last.steps)
         set_instance(model, case, koopman, last, regime)
-        fresh = compile_model(model, **SETTINGS[slug]).solve()
-        assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
+        fresh = compile_model(model, **(SETTINGS[slug] or SETTINGS["highs"])).solve()
+        # PIQP leaves a relative gap of 1e-7.
+        assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9 if SETTINGS[slug] else 2e-7)
         assert again.build_s < 0.5  # built before
         assert again.setup_s < 0.5
 
@@ -163,7 +166,10 @@ def test_knots_reach_the_optimum_of_the_program_with_all_rows(
     solution = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
     check_limits(case, koopman, instance, solution, regime)
     every_row = knots_with_all_rows(case, koopman, instance, regime)
-    assert solution.solver_objective == pytest.approx(every_row, rel=1e-6)
+    # Where P_s has both signs within a piece, the program's cost is too low there and its answer a little
+    # dearer: by 3e-6 of the cost over a minute, by more in three seconds.
+    # What is left open of the bound is worth 2e-6.
+    assert every_row * (1 - 1e-5) <= solution.solver_objective <= every_row * (1 + 2e-4)
     assert solution.schedule.p.shape == (case.n_knots, len(case.generators))
 
 
@@ -180,13 +186,13 @@ def test_knots_answer_alike_whatever_was_solved_before(case: Case, koopman: Koop
 
 
 def least_excess(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
-    """The least sum, over pieces of the horizon, of the largest frequency excess in each; with every row."""
+    """The least sum, over knot intervals, of the largest frequency excess in each; with every row."""
     n_gen, grid = len(case.generators), instance.grid
-    knots = case.knot_times(grid[-1])
+    points = knot_points(case.knot_times(grid[-1]), instance.dt_s)
+    first, knots = points[:-1], grid[points]
     condensed = CondensedRollout.make(case, koopman, grid, knots)
     free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
-    first = np.unique(np.linspace(0, len(grid), ded_ko_knots.N_PIECES, endpoint=False).astype(int))
-    excess = np.eye(len(first))[np.searchsorted(first, np.arange(1, len(grid)), side="right") - 1]
+    excess = np.eye(len(first))[np.searchsorted(points, np.arange(1, len(grid))) - 1]
     excess = np.tile(excess, (n_gen, 1))
     omega = condensed.gamma[:n_gen, 1:].reshape(-1, len(knots) * n_gen)
     ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
@@ -196,7 +202,7 @@ def least_excess(case: Case, koopman: Koopman, instance: Instance, regime: str) 
             np.hstack([sign * omega, -excess]),
             np.hstack([sign * ramps, np.zeros((len(ramps), len(first)))]),
         ]
-        right += [bound - sign * free[:n_gen, 1:].ravel(), np.tile(case.ramp * knots[1], len(knots) - 1)]
+        right += [bound - sign * free[:n_gen, 1:].ravel(), np.outer(np.diff(knots), case.ramp).ravel()]
     bounds = [(p, p) for p in instance.p_initial(case)]
     bounds += (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True)) + len(first) * [(0, None)]
     cost = np.append(np.zeros(len(knots) * n_gen), np.ones(len(first)))
@@ -216,14 +222,12 @@ def test_in_operation_what_is_infeasible_is_exceeded_least(ninebus: Case) -> Non
     assert (refused.status, refused.schedule) == (Status.INFEASIBLE, None)
     solution = solver.solve(instance)
     assert (solution.status, solution.solver_objective) == (Status.INFEASIBLE, None)
-    grid = instance.grid
-    first = np.unique(np.linspace(0, len(grid), ded_ko_knots.N_PIECES, endpoint=False).astype(int))
+    first = knot_points(ninebus.knot_times(HORIZON), instance.dt_s)[:-1]
     over = np.abs(replay(ninebus, koopman, instance, solution.schedule).omega).max(axis=1) - bound
-    over[0] = 0.0
-    total = np.maximum(np.maximum.reduceat(over, first), 0.0).sum()
+    total = np.maximum(np.maximum.reduceat(over[1:], first), 0.0).sum()
     least = least_excess(ninebus, koopman, instance, "TO")
     assert least > 0.2 * bound
-    assert total == pytest.approx(least, rel=1e-4)
+    assert total == pytest.approx(least, rel=1e-3)
     feasible = short(ninebus, 1)
     np.testing.assert_array_equal(solver.solve(feasible).schedule.p, solver(feasible).schedule.p)
 
@@ -261,7 +265,7 @@ def test_a_looser_regime_is_never_dearer(case: Case, koopman: Koopman) -> None:
                 method.prepare_with(case, koopman, regime, Settings())(short(case, index)).solver_objective
                 for regime in ("NO", "TO")
             )
-            assert loose <= tight * (1 + ded_ko_knots.COST_TOLERANCE)
+            assert loose <= tight * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import textwrap
 from pathlib import Path
@@ -9,14 +10,16 @@ from pathlib import Path
 import numpy as np
 import pyomo.environ as pyo
 import pytest
+import scipy.sparse as sp
 from pyomo.opt import TerminationCondition
 
 from ded_bench.files.errors import InputError
+from ded_bench.solvers import highs, piqp
 from ded_bench.solvers.compile import SOLVERS, compile_model, fix
-from ded_bench.solvers.linear_program import read_linear
+from ded_bench.solvers.linear_program import FreeForm, read_linear
 from ded_bench.solvers.status import Status
 
-LINEAR = ("ipopt", "piqp", "highs")
+LINEAR = ("ipopt", "highs")
 
 
 def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.ConcreteModel:
@@ -32,6 +35,34 @@ def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.Con
         fix(m.price[i], prices[i])
     fix(m.need, need)
     return m
+
+
+#: Minimise 2 x + 3 y with x + 2 y = 4, 1 <= x - y and 0 <= x, y <= 3: x = 2, y = 1.
+FORM = FreeForm(
+    cost=np.array([2.0, 3.0]),
+    equal=sp.csc_matrix([[1.0, 2.0]]),
+    right=np.array([4.0]),
+    between=sp.csc_matrix([[1.0, -1.0]]),
+    low=np.array([1.0]),
+    high=np.array([np.inf]),
+    lower=np.zeros(2),
+    upper=np.full(2, 3.0),
+)
+
+
+@pytest.mark.parametrize(
+    "solve", [piqp.solve_form, lambda form: piqp.solve_form(form, staged=True), highs.solve_form]
+)
+def test_programs_given_by_arrays(solve) -> None:
+    """The known optimum; nothing is claimed of what has no solution."""
+    answer = solve(FORM)
+    assert answer.status == Status.OPTIMAL
+    assert answer.x == pytest.approx([2.0, 1.0], abs=1e-6)
+    assert answer.iterations >= 0
+    assert answer.version.split()[0] in ("piqp", "highs")
+    impossible = solve(dataclasses.replace(FORM, low=np.array([5.0])))
+    assert impossible.status in (Status.INFEASIBLE, Status.FAILED)
+    assert impossible.message
 
 
 def rosenbrock() -> pyo.ConcreteModel:
@@ -111,9 +142,8 @@ def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
     assert again.objective == pytest.approx(whole.objective, rel=1e-7)
 
 
-@pytest.mark.parametrize("solver", ["piqp", "highs"])
-def test_linear_solvers_refuse_what_is_not_linear(solver: str) -> None:
-    model = diet()
+def test_linear_solvers_refuse_what_is_not_linear() -> None:
+    solver, model = "highs", diet()
     model.curved = pyo.Constraint(expr=model.x**2 + model.y <= 9)
     with pytest.raises(ValueError, match="curved is not linear"):
         compile_model(model, solver)
@@ -177,7 +207,7 @@ def test_unknown_and_missing_solvers_are_named(monkeypatch: pytest.MonkeyPatch) 
         compile_model(diet(), "ipopt-executable")
     monkeypatch.setitem(sys.modules, "piqp", None)
     with pytest.raises(InputError, match="pip install piqp"):
-        compile_model(diet(), "piqp")
+        piqp.solve_form(FORM)
     assert set(LINEAR) | {"ipopt-executable"} == set(SOLVERS)
 
 

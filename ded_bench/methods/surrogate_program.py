@@ -1,0 +1,87 @@
+"""One instance's linear program on a surrogate, for any knots: what `ded-ko` and `ded-ko-knots` share.
+
+What it claims is what the surrogate says: no answer is simulated.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from ded_bench.koopman.instance_model import model_along
+from ded_bench.koopman.surrogates import Surrogate
+from ded_bench.koopman.trajectory import Indices
+from ded_bench.methods import ed
+from ded_bench.methods.knot_program import KnotProgram, is_reachable, solve_with_rows_added
+from ded_bench.methods.solution import Solution
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+from ded_bench.truth.simulate import SimulationError
+
+#: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
+OMEGA_TOLERANCE = 2 * np.pi * 5e-7
+
+
+def solve_on_surrogate(
+    case: Case,
+    surrogate: Surrogate,
+    instance: Instance,
+    regime: str,
+    points: Indices,
+    time_limit_s: float | None = None,
+    soft: bool = False,
+) -> Solution:
+    """Solve one instance on a surrogate: the best schedule that is linear between knots.
+
+    The surrogate's model is taken along the static dispatch of every second; rows of the frequency bound
+    are added to one program until all grid points keep it.
+
+    Args:
+        case: the grid.
+        surrogate: what stands for the swing equations.
+        instance: what to solve.
+        regime: gives the bound of |ω|.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        time_limit_s: s.
+        soft: `Infeasible` comes with the schedule of least frequency excess, summed over knot intervals.
+    """
+    started = time.perf_counter()
+    deadline = started + (np.inf if time_limit_s is None else time_limit_s)
+    if not is_reachable(case, instance, points):
+        return _without(Status.INFEASIBLE, Status.INFEASIBLE.sentence, started)
+    p_gen = ed.dispatch(case, instance, 1.0).at(instance.grid[points])
+    try:
+        model = model_along(case, surrogate, instance, p_gen, points)
+    except SimulationError as error:
+        return _without(Status.FAILED, str(error), started)
+    program = KnotProgram(case, instance, case.omega_bound(regime), model)
+    built = time.perf_counter()
+    attempt = solve_with_rows_added(
+        program, set(), OMEGA_TOLERANCE, OMEGA_TOLERANCE, deadline, by_interval=soft
+    )
+    schedule, objective, reason = None, None, ""
+    if attempt.prediction is not None and (soft or attempt.status == Status.OPTIMAL):
+        schedule = Schedule(instance.grid[points], attempt.prediction.p_gen)
+    if attempt.status == Status.OPTIMAL and attempt.prediction is not None:
+        objective = attempt.prediction.objective
+    else:
+        reason = attempt.message if attempt.status == Status.FAILED else attempt.status.sentence
+    return Solution(
+        status=attempt.status,
+        schedule=schedule,
+        iterations=attempt.iterations,
+        build_s=built - started,
+        setup_s=0.0,
+        solve_s=time.perf_counter() - built,
+        solver_objective=objective,
+        solver_version=attempt.version,
+        error=reason,
+    )
+
+
+def _without(status: Status, error: str, started: float) -> Solution:
+    """An answer found before there was a program."""
+    return Solution(status, build_s=time.perf_counter() - started, setup_s=0.0, solve_s=0.0, error=error)

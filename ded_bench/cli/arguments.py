@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import fnmatch
 from collections.abc import Generator, Iterable
+from pathlib import Path
 from typing import Any, NoReturn
 
+from ded_bench.files.errors import InputError
 from ded_bench.koopman.surrogates import MODELS
-from ded_bench.methods.registry import METHODS
+from ded_bench.methods.registry import METHODS, get_method
+from ded_bench.methods.solution import Settings
 from ded_bench.run.environment import version
 
 #: The shipped case that is meant where none is named.
@@ -69,6 +72,35 @@ def command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         name, help=text, description=f"{text[:1].upper()}{text[1:]}."
     )
     return made
+
+
+def add_methods(p: argparse.ArgumentParser) -> None:
+    """Declare which methods answer, in which regimes, and with what."""
+    p.add_argument(
+        "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
+    )
+    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
+    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
+    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
+
+
+def chosen_methods(
+    a: argparse.Namespace, search: tuple[Path, ...], time_limit_s: float | None = None
+) -> list[tuple[str, Settings]]:
+    """The methods that `add_methods` let the user choose, each with one of its settings.
+
+    Raises:
+        InputError: an unknown method, or none has settings of this name.
+    """
+    chosen = [
+        (method.name, Settings(slug, a.model, a.policy, time_limit_s, search))
+        for method in map(get_method, a.method)
+        for slug in matching(a.settings, method.settings)
+    ]
+    if not chosen:
+        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
+    return chosen
 
 
 def names(text: str) -> tuple[str, ...]:

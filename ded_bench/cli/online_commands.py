@@ -9,18 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
     DEFAULT_CASE,
-    KNOWN,
-    MODEL_HELP,
+    add_methods,
+    chosen_methods,
     command,
-    matching,
     names,
     positive,
     positive_number,
 )
-from ded_bench.files.errors import InputError
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import default_results
-from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
@@ -35,17 +32,11 @@ if TYPE_CHECKING:
 def add_commands(commands: Any) -> None:
     """Declare this command and its options."""
     p = command(commands, "online", "operate scenarios with a method's plans, one row each")
-    p.add_argument(
-        "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
-    )
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
+    add_methods(p)
     p.add_argument("--case", default=DEFAULT_CASE)
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--scenarios", type=positive, metavar="N", help="only the first N of the case")
     chosen.add_argument("--scenario", type=Path, nargs="+", metavar="FILE", help="instead of the case's")
-    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
-    p.add_argument("--model", default="koopman", help=MODEL_HELP)
-    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans (1 s)")
     p.add_argument(
         "--latency",
@@ -94,20 +85,13 @@ def _online(a: argparse.Namespace) -> int:
 
 def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
-    from ded_bench.methods.registry import get_method
     from ded_bench.online.loop import LoopOptions
     from ded_bench.online.operation import make_operations
     from ded_bench.online.planner import LIMIT_S
 
     search = search_folders(case, folder)
     files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
-    methods = [
-        (name, Settings(slug, a.model, a.policy, search=search))
-        for name in a.method
-        for slug in matching(a.settings, get_method(name).settings)
-    ]
-    if not methods:
-        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
+    methods = chosen_methods(a, search)
     scenarios, regimes = load_scenarios(files, case), a.regime or tuple(case.regimes)
     return [
         operation

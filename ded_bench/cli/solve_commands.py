@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
     DEFAULT_CASE,
-    KNOWN,
-    MODEL_HELP,
+    add_methods,
+    chosen_methods,
     command,
-    matching,
     names,
     positive,
     positive_number,
@@ -23,7 +22,6 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import default_results
-from ded_bench.methods.solution import Settings
 from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
 from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
 from ded_bench.problem.case import Case
@@ -43,18 +41,12 @@ def add_commands(commands: Any) -> None:
 
 def _add_solve(commands: Any) -> None:
     p = command(commands, "solve", "solve instances with methods, score, one row each")
-    p.add_argument(
-        "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
-    )
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
+    add_methods(p)
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
     p.add_argument("--case", help="name of a shipped case, or a folder")
-    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
-    p.add_argument("--model", default="koopman", help=MODEL_HELP)
-    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=positive, metavar="N", help="processes here (default: 1)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
@@ -87,28 +79,17 @@ def _add_score(commands: Any) -> None:
 
 
 def _solve(a: argparse.Namespace) -> int:
-    from ded_bench.methods.registry import get_method
     from ded_bench.run.results import Results
     from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
 
-    methods = [get_method(name) for name in a.method]
     chosen = _chosen(a)
     case = chosen.case
     results = Results(a.out or default_results(case))
     tasks = [
         task
-        for method in methods
-        for slug in matching(a.settings, method.settings)
-        for task in make_tasks(
-            case,
-            chosen.instances,
-            [method.name],
-            a.regime or tuple(case.regimes),
-            _settings(a, slug, case, results.folder),
-        )
+        for name, settings in chosen_methods(a, search_folders(case, results.folder), a.time_limit)
+        for task in make_tasks(case, chosen.instances, [name], a.regime or tuple(case.regimes), settings)
     ]
-    if not tasks:
-        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
     for line in fallbacks(tasks, results.folder):
         print(f"ded-bench: {line}", file=sys.stderr)
     todo, unscored = unfinished(tasks, results)
@@ -296,13 +277,3 @@ def _print_row(results: Results, row: Row) -> None:
     scheduled = path.is_file() and row.status != Status.FAILED
     fields = dataclasses.asdict(row) | {"schedule": str(path) if scheduled else None}
     print(json.dumps(fields), flush=True)
-
-
-def _settings(a: argparse.Namespace, slug: str, case: Case, out: Path) -> Settings:
-    return Settings(
-        name=slug,
-        model=a.model,
-        policy=a.policy,
-        time_limit_s=a.time_limit,
-        search=search_folders(case, out),
-    )

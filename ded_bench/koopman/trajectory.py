@@ -257,9 +257,24 @@ def linearise_along(case: Case, trajectory: Trajectory, points: Indices) -> Traj
     """
     network = Network(case)
     middle = trajectory.theta[(points[:-1] + points[1:]) // 2]
-    linear = [network.linearise(theta) for theta in middle]
-    stiffness = np.stack([part.stiffness for part in linear])
-    m, d = linear[0].m, linear[0].d
+    stiffness = np.stack([network.linearise(theta).stiffness for theta in middle])
+    return time_varying(trajectory, points, stiffness, -stiffness.sum(axis=1), network.m, network.d)
+
+
+def time_varying(
+    trajectory: Trajectory, points: Indices, stiffness: Array, slack: Array, m: Array, d: Array
+) -> TrajectoryModel:
+    """The linear model around a trajectory with one stiffness for each interval between knots.
+
+    Args:
+        trajectory: the reference.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        stiffness: change of the generators' electrical powers by their angles, shape
+            (n_intervals, n_gen, n_gen), pu/rad.
+        slack: of the slack's power likewise, shape (n_intervals, n_gen), pu/rad.
+        m: inertia, shape (n_gen,), s² pu/rad.
+        d: damping, shape (n_gen,), s pu/rad.
+    """
     dt_s = float(trajectory.t[1] - trajectory.t[0])
     step, n_gen = _one_step(stiffness / m[:, None], d / m, 1.0 / m, dt_s), len(m)
     lengths = np.diff(points)
@@ -273,7 +288,7 @@ def linearise_along(case: Case, trajectory: Trajectory, points: Indices) -> Traj
         step=step,
         across=across,
         speed=slice(n_gen, 2 * n_gen),
-        slack=np.concatenate([-stiffness.sum(axis=1), np.zeros((len(lengths), n_gen))], axis=1),
+        slack=np.concatenate([slack, np.zeros((len(lengths), n_gen))], axis=1),
         omega=trajectory.omega,
         p_slack=trajectory.p_slack,
         p_gen=trajectory.p_gen[points],

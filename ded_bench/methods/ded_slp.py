@@ -4,7 +4,7 @@ A schedule is simulated on the true DAE; the linear program around its trajector
 gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
 costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
 surrogate. It takes one to three programs, since the linear models differ only by the second order
-of what one schedule changes.
+of what one schedule changes. Settings `ac` do the same on the full AC network (see `ac_sequence`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from ded_bench.koopman.trajectory import Indices, linearise_along
 from ded_bench.methods import ed
+from ded_bench.methods.ac_sequence import AcSequence
 from ded_bench.methods.knot_program import (
     KnotProgram,
     Limit,
@@ -24,27 +25,18 @@ from ded_bench.methods.knot_program import (
     knot_points,
     solve_with_rows_added,
 )
+from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
-#: The case's own knots, or others this far apart.
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}}
+#: The case's own knots, or others this far apart; along simulations on the full AC network.
+SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}, "ac": {"ac": True}}
 
-#: Programs keep this much below the bound, and may leave half of it open between the points that have
-#: rows: the rest absorbs the model's error of the last program. A schedule is accepted if its simulation
-#: exceeds the bound by at most half of what strict feasibility allows (1e-6 Hz). Costs are 1e-6 higher.
-MARGIN = 2 * np.pi * 1e-6
-OPEN = ACCEPTED = 2 * np.pi * 5e-7
-#: Around a trajectory that exceeds the bound, rows are added until this part of its excess is left: the
-#: model's error is no smaller, and another trajectory is cheaper than another program. Around the first one
-#: a single program is solved, unless it comes from an earlier solution.
-REFINEMENT = 0.01
-#: Agreement of a simulated schedule's cost with its program's, as a fraction.
-COST_TOLERANCE = 1e-6
 #: Trajectories, and halvings of a step that the system cannot follow.
 MAX_ROUNDS, MAX_HALVINGS = 15, 6
 
@@ -52,7 +44,9 @@ MAX_ROUNDS, MAX_HALVINGS = 15, 6
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """Return a solver of single instances, which may start from an earlier solution."""
     case.check_regimes([regime])
-    return SlpSolver(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
+    options = SETTINGS[settings.name]
+    data = AcCase.of(case) if options.get("ac") else None
+    return SlpSolver(case, regime, settings.time_limit_s, options.get("knot_interval_s"), data)
 
 
 @dataclass(frozen=True)
@@ -63,6 +57,7 @@ class SlpSolver:
     regime: str
     time_limit_s: float | None = None
     knot_interval_s: float | None = None  # None: the case's knots
+    data: AcCase | None = None  # None: on the lossless network
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve from the static dispatch of every second."""
@@ -83,8 +78,9 @@ class SlpSolver:
         near = last.schedule if last is not None else None
         start = ed.dispatch(self.case, instance, 1.0) if near is None else near
         points = self._knots(instance)
-        bound = self.case.omega_bound(self.regime)
-        sequence = _Sequence(self.case, instance, bound, points, started + limit, soft)
+bound = self.case.omega_bound(self.regime)
+        problem = self.case, instance, bound, points, started + limit, soft
+        sequence = _Sequence(*problem) if self.data is None else AcSequence(*problem, data=self.data)
         status, schedule = sequence.run(start, is_near=near is not None)
         return Solution(
             status=status,
@@ -95,7 +91,7 @@ class SlpSolver:
             solve_s=time.perf_counter() - started,
             solver_objective=sequence.claimed if status == Status.OPTIMAL else None,
             solver_version=sequence.version,
-            error=sequence.error(status, schedule),
+            error=_reason(status, schedule, sequence.message),
         )
 
     def _knots(self, instance: Instance) -> Indices:
@@ -168,12 +164,6 @@ class _Sequence:
         self.message = self.message or f"no convergence in {MAX_ROUNDS} trajectories"
         return (Status.FAILED if self._best is None else Status.FEASIBLE), self._best
 
-    def error(self, status: Status, schedule: Schedule | None) -> str:
-        """Why there is no schedule that meets every limit; nothing if there is one."""
-        if status == Status.FAILED:
-            return self.message
-        return status.sentence if schedule is None or status == Status.INFEASIBLE else ""
-
     def _follow(self, p_before: Array, p_gen: Array) -> tuple[Array, Trajectory]:
         """Simulate, closer to the powers before if the system cannot follow.
 
@@ -196,3 +186,10 @@ class _Sequence:
         if cost < self._cheapest:
             self._cheapest, self._best = cost, schedule
         return abs(cost - self.claimed) <= COST_TOLERANCE * abs(cost)
+
+
+def _reason(status: Status, schedule: Schedule | None, message: str) -> str:
+    """Why there is no schedule that meets every limit; nothing if there is one."""
+    if status == Status.FAILED:
+        return message
+    return status.sentence if schedule is None or status == Status.INFEASIBLE else ""

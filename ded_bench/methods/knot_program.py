@@ -74,6 +74,8 @@ class KnotProgram:
 
     def __init__(self, case: Case, instance: Instance, bound: float, model: TrajectoryModel) -> None:
         self.model, self.bound = model, bound
+        #: How far powers may differ from the trajectory's, pu.
+        self.radius = np.inf
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         self.pieces = piece_starts(model.points)
@@ -231,7 +233,8 @@ class KnotProgram:
         omega = model.omega[model.points[1:]]
         lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
         lower[self._s] = 0.0
-        lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
+        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self.radius)
+        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self.radius)
         lower[self._speed], upper[self._speed] = -self.bound - omega, self.bound - omega
         return lower, upper
 

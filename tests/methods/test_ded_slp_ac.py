@@ -1,0 +1,85 @@
+"""`ded-slp` on the full AC network: its linear models are derivatives, and it claims what the scorer finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.ac_trajectory import linearise_along_ac
+from ded_bench.methods import ded_slp
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.ac_case import AcCase
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+from ded_bench.truth.ac_network import AcNetwork
+from ded_bench.truth.ac_simulate import score_ac, simulate_ac
+
+TWO_AREA = Case.load("two-area")
+DATA = AcCase.of(TWO_AREA)
+HORIZON = 8.0
+
+
+def short(index: int) -> Instance:
+    """A validation instance with an AC equilibrium, its loads moved to the start."""
+    instance = sample_instance(TWO_AREA, VALIDATION_SEED, index)
+    load = {bus: ramp.model_copy(update={"start": 1.0}) for bus, ramp in instance.load.items()}
+    return instance.model_copy(update={"horizon_s": HORIZON, "load": load})
+
+
+def test_linear_model_is_the_derivative():
+    """Half the input increment leaves a quarter of the error; slack power has its losses."""
+    instance, points = short(28), np.array([0, 50, 100, 160, 400, 800])
+    times = instance.grid[points]
+    p_gen = np.tile(instance.p_initial(TWO_AREA), (len(points), 1))
+    along = simulate_ac(TWO_AREA, DATA, instance, Schedule(times, p_gen))
+    model = linearise_along_ac(AcNetwork(TWO_AREA, DATA), along, points)
+    u = np.zeros(p_gen.shape)
+    u[1:] = 0.02 * np.random.default_rng(3).uniform(-1, 1, u[1:].shape)
+    errors, sizes = [], []
+    for part in (1.0, 0.5):
+        true = simulate_ac(TWO_AREA, DATA, instance, Schedule(times, p_gen + part * u))
+        omega, p_slack = model.outputs(part * u)
+        errors.append([np.abs(omega - true.omega).max(), np.abs(p_slack - true.p_slack).max()])
+        sizes.append([np.abs(true.omega - along.omega).max(), np.abs(true.p_slack - along.p_slack).max()])
+    # Between the middles of intervals the stiffness is that of the middle: a first-order part is left.
+    assert (np.array(errors) < 0.02 * np.array(sizes)).all()
+    rough = simulate_ac(TWO_AREA, DATA, instance, Schedule(times, p_gen + u))
+    lossless = -(rough.p_gen - along.p_gen).sum(axis=1)
+    assert np.abs(rough.p_slack - along.p_slack - lossless).max() > 10 * errors[0][1]
+
+
+@pytest.mark.parametrize("index", [28, 21])
+def test_claims_what_the_scorer_finds(index):
+    instance = short(index)
+    solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(instance)
+    assert solution.status == Status.OPTIMAL and solution.schedule is not None
+    found = score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO")
+    assert found.feasible_strict
+    assert found.objective == pytest.approx(solution.solver_objective, rel=1e-6)
+    lossless = ded_slp.prepare(TWO_AREA, "TO", Settings())(instance)
+    assert lossless.schedule is not None
+    assert not score_ac(TWO_AREA, DATA, instance, lossless.schedule, "TO").feasible
+
+
+def test_shorter_steps_where_the_network_carries_little_more():
+    """The static dispatch has no solution on this instance, and full steps lead to where there is none."""
+    instance = short(16)
+    solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(instance)
+    assert solution.status in (Status.OPTIMAL, Status.FEASIBLE) and solution.schedule is not None
+    assert score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO").feasible_strict
+
+
+def test_instances_beyond_the_network_fail_honestly():
+    """A draw without an equilibrium at t = 0."""
+    solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(short(0))
+    assert solution.status == Status.FAILED and solution.schedule is None
+    assert "AC network" in solution.error
+
+
+def test_cases_without_ac_data():
+    with pytest.raises(InputError, match="no AC data"):
+        ded_slp.prepare(Case.load("9bus"), "TO", Settings("ac"))

@@ -36,6 +36,9 @@ def model_along(
         surrogate.check_step(instance)
         return _lifted_along(case, surrogate, instance, p_gen, points)
     schedule = Schedule(t=instance.grid[points], p=p_gen)
+    if surrogate.data is not None:
+        trajectory = simulate_ac(case, surrogate.data, instance, schedule)
+        return linearise_along_ac(AcNetwork(case, surrogate.data), trajectory, points)
     return linearise_along(case, simulate(case, instance, schedule), points)
 
 

@@ -11,14 +11,15 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.koopman.linear import nominal_model, single_sample
 from ded_bench.koopman.model import Koopman
+from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import REPOSITORY, Case
 
 #: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")
-#: The linearisation along a simulated trajectory.
-TRAJECTORY = "trajectory"
+#: The linearisation along a simulated trajectory, on the lossless network and on the full AC network.
+TRAJECTORY, TRAJECTORY_AC = "trajectory", "trajectory-ac"
 #: All models by name; those not trained follow from the case, from `koopman`, or from each instance.
-MODELS = (*TRAINED, "koopman-single", "linear", TRAJECTORY)
+MODELS = (*TRAINED, "koopman-single", "linear", TRAJECTORY, TRAJECTORY_AC)
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,19 @@ class AlongTrajectory:
     """The surrogate that is made anew for each instance: nothing of it is trained (see `instance_model`)."""
 
     case: Case
-    kind: str = TRAJECTORY
+    data: AcCase | None = None  # simulate on the AC network
+
+    @property
+    def kind(self) -> str:
+        """Its name among the models."""
+        return TRAJECTORY if self.data is None else TRAJECTORY_AC
 
     @property
     def fingerprint(self) -> str:
-        """Twelve hex digits that change with the case."""
-        return hashlib.sha256(f"{self.kind}|{self.case.fingerprint}".encode()).hexdigest()[:12]
+        """Twelve hex digits that change with the case and its AC data."""
+        text = f"{self.kind}|{self.case.fingerprint}"
+        text += "" if self.data is None else f"|{self.data.fingerprint}"
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 #: A lifted model has one K for all instances and times; the other kind is made for each instance.
@@ -59,7 +67,9 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
     Raises:
         InputError: there is no such model yet (names the command that makes it), or its file is wrong.
     """
-    return AlongTrajectory(case) if name == TRAJECTORY else find_model(case, name, search)
+    if name in (TRAJECTORY, TRAJECTORY_AC):
+        return AlongTrajectory(case, AcCase.of(case) if name == TRAJECTORY_AC else None)
+    return find_model(case, name, search)
 
 
 def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
@@ -69,7 +79,7 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
         InputError: there is no such model yet (names the command that makes it), its file is wrong, or the
             surrogate of this name is made for each instance.
     """
-    if name == TRAJECTORY:
+    if name in (TRAJECTORY, TRAJECTORY_AC):
         raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
     path = find_model_file(case, name, search)
     if path is None:
@@ -84,7 +94,7 @@ def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | Non
     Raises:
         InputError: there is no such model yet (names the command that makes it).
     """
-    if name in ("linear", TRAJECTORY):
+    if name in ("linear", TRAJECTORY, TRAJECTORY_AC):
         return None
     kind = "koopman" if name == "koopman-single" else name
     if kind in TRAINED:

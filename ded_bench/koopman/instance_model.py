@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ded_bench.koopman.ac_trajectory import linearise_along_ac
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import Surrogate
 from ded_bench.koopman.trajectory import Hold, Indices, TrajectoryModel, linearise_along, repeated
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.ac_network import AcNetwork
+from ded_bench.truth.ac_simulate import simulate_ac
 from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import simulate
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ded_bench.koopman.ac_trajectory import linearise_along_ac
 from ded_bench.koopman.trajectory import Indices
-from ded_bench.methods import ed
+from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, is_reachable, solve_with_rows_added
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.problem.ac_case import AcCase
@@ -126,22 +126,13 @@ class AcSequence:
 
     def _first(self, start: Schedule) -> _Iterate | None:
         """The first of some schedules that the network can carry."""
-        times = self.instance.grid[self.points]
-        wanted, p_initial = start.at(times), self.instance.p_initial(self.case)
-        wanted[0] = p_initial
-        shared, constant = self._shared_load().at(times), np.broadcast_to(p_initial, wanted.shape)
-        for p_gen in (wanted, shared, constant, (wanted + shared) / 2, (constant + shared) / 2):
+        wanted = start.at(self.instance.grid[self.points])
+        wanted[0] = self.instance.p_initial(self.case)
+        for p_gen in first_schedules(self.case, self.instance, wanted, self.points):
             found = self._simulated(p_gen)
             if found is not None:
                 return found
         return None
-
-    def _shared_load(self) -> Schedule:
-        """Every second each generator goes towards its share, by nominal powers, of the load."""
-        case, instance = self.case, self.instance
-        load = instance.p_load(case)[:: round(1.0 / instance.dt_s)].sum(axis=1)
-        target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
-        return ed.follow(case, instance, np.clip(target, case.p_min, case.p_max)[1:], 1.0)
 
     def _program(self, around: _Iterate) -> KnotProgram:
         model = linearise_along_ac(_network(self.case, self.data), around.trajectory, self.points)

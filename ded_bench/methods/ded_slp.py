@@ -78,7 +78,7 @@ class SlpSolver:
         near = last.schedule if last is not None else None
         start = ed.dispatch(self.case, instance, 1.0) if near is None else near
         points = self._knots(instance)
-bound = self.case.omega_bound(self.regime)
+        bound = self.case.omega_bound(self.regime)
         problem = self.case, instance, bound, points, started + limit, soft
         sequence = _Sequence(*problem) if self.data is None else AcSequence(*problem, data=self.data)
         status, schedule = sequence.run(start, is_near=near is not None)

@@ -13,6 +13,7 @@ from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.surrogates import Surrogate
 from ded_bench.koopman.trajectory import Indices
 from ded_bench.methods import ed
+from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, is_reachable, solve_with_rows_added
 from ded_bench.methods.solution import Solution
 from ded_bench.problem.case import Case
@@ -36,7 +37,8 @@ def solve_on_surrogate(
 ) -> Solution:
     """Solve one instance on a surrogate: the best schedule that is linear between knots.
 
-    The surrogate's model is taken along the static dispatch of every second; rows of the frequency bound
+    The surrogate's model is taken along the static dispatch of every second, or along what the network can
+    carry instead; rows of the frequency bound
     are added to one program until all grid points keep it.
 
     Args:
@@ -52,11 +54,15 @@ def solve_on_surrogate(
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
     if not is_reachable(case, instance, points):
         return _without(Status.INFEASIBLE, Status.INFEASIBLE.sentence, started)
-    p_gen = ed.dispatch(case, instance, 1.0).at(instance.grid[points])
-    try:
-        model = model_along(case, surrogate, instance, p_gen, points)
-    except SimulationError as error:
-        return _without(Status.FAILED, str(error), started)
+    dispatched, model = ed.dispatch(case, instance, 1.0).at(instance.grid[points]), None
+    for p_gen in first_schedules(case, instance, dispatched, points):
+        try:
+            model = model_along(case, surrogate, instance, p_gen, points)
+            break
+        except SimulationError as error:
+            reason = str(error)
+    if model is None:
+        return _without(Status.FAILED, reason, started)
     program = KnotProgram(case, instance, case.omega_bound(regime), model)
     built = time.perf_counter()
     attempt = solve_with_rows_added(

@@ -1,4 +1,4 @@
-"""`ded-slp` on the full AC network: its linear models are derivatives, and it claims what the scorer finds."""
+"""`ded-slp` on the full AC network: its linear models are derivatives, its claims what the scorer finds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.ac_trajectory import linearise_along_ac
-from ded_bench.methods import ded_slp
+from ded_bench.methods import ded_ko_knots, ded_slp
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
@@ -56,7 +56,8 @@ def test_linear_model_is_the_derivative():
 def test_claims_what_the_scorer_finds(index):
     instance = short(index)
     solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(instance)
-    assert solution.status == Status.OPTIMAL and solution.schedule is not None
+    assert solution.status == Status.OPTIMAL
+    assert solution.schedule is not None
     found = score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO")
     assert found.feasible_strict
     assert found.objective == pytest.approx(solution.solver_objective, rel=1e-6)
@@ -69,15 +70,28 @@ def test_shorter_steps_where_the_network_carries_little_more():
     """The static dispatch has no solution on this instance, and full steps lead to where there is none."""
     instance = short(16)
     solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(instance)
-    assert solution.status in (Status.OPTIMAL, Status.FEASIBLE) and solution.schedule is not None
+    assert solution.status in (Status.OPTIMAL, Status.FEASIBLE)
+    assert solution.schedule is not None
     assert score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO").feasible_strict
 
 
 def test_instances_beyond_the_network_fail_honestly():
     """A draw without an equilibrium at t = 0."""
     solution = ded_slp.prepare(TWO_AREA, "TO", Settings("ac"))(short(0))
-    assert solution.status == Status.FAILED and solution.schedule is None
+    assert solution.status == Status.FAILED
+    assert solution.schedule is None
     assert "AC network" in solution.error
+
+
+def test_surrogate_along_an_ac_simulation():
+    """One linear program along the AC simulation of a schedule comes nearer than along the lossless one."""
+    instance, excess = short(28), {}
+    for model in ("trajectory", "trajectory-ac"):
+        solution = ded_ko_knots.prepare(TWO_AREA, "TO", Settings(model=model))(instance)
+        assert solution.status == Status.OPTIMAL
+        assert solution.schedule is not None
+        excess[model] = score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO").freq_violation_hz
+    assert excess["trajectory-ac"] < 0.5 * excess["trajectory"]
 
 
 def test_cases_without_ac_data():

@@ -94,7 +94,13 @@ def write_report(case: Case, folder: Path, problems: Path, pool: Workers | None 
     frames = _frames(sources, lines)
     gallery = draw(sources, pool, [section.draw for section in SECTIONS])
     captions = _captions(sources)
-    files = _write_tables(sources.results.folder / "tables", frames, captions)
+    own = {name: table for section in SECTIONS for name, table in section.tables(gallery).items()}
+    files = _write_tables(
+        sources.results.folder / "tables",
+        frames | {name: table.frame for name, table in own.items()},
+        PRINTED | {name: table.columns for name, table in own.items()},
+        captions,
+    )
     notes = [
         *data_notes(sources, frames["summary"]),
         *provenance_notes(sources.judged, sources.timing),
@@ -145,11 +151,16 @@ def rows_caption(frame: pd.DataFrame, everything: pd.DataFrame) -> str:
     return f"all {instances} instances, none of them of the test split"
 
 
-def _write_tables(tables: Path, frames: dict[str, pd.DataFrame], captions: dict[str, str]) -> list[Path]:
+def _write_tables(
+    tables: Path,
+    frames: dict[str, pd.DataFrame],
+    printed: dict[str, Sequence[Column]],
+    captions: dict[str, str],
+) -> list[Path]:
     """CSV with every digit of all frames; Markdown of the same; LaTeX of the paper's two tables."""
     files = []
     for name, frame in frames.items():
-        columns = PRINTED.get(name) or [Column(c, c) for c in frame.columns]
+        columns = printed.get(name) or [Column(c, c) for c in frame.columns]
         outputs = {f"{name}.csv": frame.to_csv(index=False), f"{name}.md": to_markdown(frame, columns)}
         if name in captions:
             caption = captions[name].split(": ", 1)[1].replace("`", "")

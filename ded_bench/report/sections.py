@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from ded_bench.report.gallery import Gallery
-from ded_bench.report.page import Block
+from ded_bench.report.online_section import draw_online, online_blocks, online_tables
+from ded_bench.report.page import Block, Table
 from ded_bench.run.pool import Call
 
 
@@ -16,12 +17,14 @@ class Section:
 
     Attributes:
         draw: yields the calls that make its figures (see `Gallery.add`), none if there is nothing to draw.
+        tables: those that stand in files of their own, too, by the name of the file.
         blocks: its heading, text, tables and pictures (see `Gallery.of`); none if it has nothing to say.
     """
 
     draw: Callable[[Gallery], Iterator[Call]]
+    tables: Callable[[Gallery], Mapping[str, Table]]
     blocks: Callable[[Gallery], list[Block]]
 
 
 #: All of them.
-SECTIONS: tuple[Section, ...] = ()
+SECTIONS: tuple[Section, ...] = (Section(draw_online, online_tables, online_blocks),)

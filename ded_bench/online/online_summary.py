@@ -1,0 +1,101 @@
+"""What online.csv says: every method at its own latency, and sweeps over latency, forecast and state."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from ded_bench.online.online_results import ONLINE, OnlineResults
+from ded_bench.problem.forecast import QUALITIES
+
+#: What rows of one line of a table share, besides the scenario.
+LOOP = ["regime", "method", "settings", "period_s", "latency_s", "forecast", "predicted", "warm"]
+RUN = ["regime", "method", "settings"]
+#: A method with so many latencies at one forecast was swept.
+SWEPT = 3
+#: Forecasts of a sweep, and plans from the present state under announcements.
+KINDS = (*QUALITIES, "present")
+
+
+def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
+    """Rows of a case in the order of the table; `kind` is the forecast, or `present`.
+
+    `over_known_percent` is the cost over the same method's on the scenario with a perfect forecast and no
+    latency, %.
+    """
+    frame = ONLINE.frame(row for row in results.table.rows.values() if row.case == case)
+    announced = frame["forecast"] == QUALITIES[0]
+    frame["kind"] = frame["forecast"].where(frame["predicted"].astype(bool), "present")
+    frame = frame[frame["predicted"].astype(bool) | announced].reset_index(drop=True)
+    known = frame[(frame["kind"] == "perfect") & (frame["latency_s"] == 0) & frame["warm"].astype(bool)]
+    best = known.set_index([*RUN, "scenario"])["objective"]
+    best = best[~best.index.duplicated()]
+    same = best.reindex(pd.MultiIndex.from_frame(frame[[*RUN, "scenario"]])).to_numpy()
+    frame["over_known_percent"] = 100 * (frame["objective"].to_numpy() / same - 1)
+    return frame
+
+
+def line(rows: pd.DataFrame) -> dict[str, object]:
+    """One line of a table from the rows of several scenarios.
+
+    Means and maxima over the scenarios that were operated to their end; plans are counted over all.
+    """
+    done = rows.dropna(subset=["objective"])
+    plans = max(int(rows["plans"].sum()), 1)
+    return {
+        "n": len(done),
+        "failures": len(rows) - len(done),
+        "increase_percent_mean": done["increase_percent"].mean(),
+        "increase_percent_max": done["increase_percent"].max(),
+        "over_known_percent_mean": done["over_known_percent"].mean(),
+        "max_excess_mhz_mean": 1e3 * done["max_excess_hz"].mean(),
+        "max_excess_mhz_max": 1e3 * done["max_excess_hz"].max(),
+        "mean_excess_mhz": 1e3 * done["mean_excess_hz"].mean(),
+        "share_outside": done["share_outside"].mean(),
+        "slack_travel_pu": done["slack_travel_pu"].mean(),
+        "ramp_violation_max": done["ramp_violation"].max(),
+        "bound_violation_max": done["bound_violation"].max(),
+        **{name: float(rows[name].sum()) / plans for name in ("late", "failed", "infeasible")},
+    }
+
+
+def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
+    """One line per regime, method and period, at the latency of `timing.csv`, forecasts as announced."""
+    own = frame[(frame["latency_source"] == "timing") & (frame["kind"] == QUALITIES[0])]
+    return _lines(own, LOOP)
+
+
+def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
+    """One line per regime, method, latency and kind, of methods swept over latencies.
+
+    Only scenarios count that were operated at every latency of the kind's own sweep under announcements,
+    so that lines of one method are about the same scenarios.
+    """
+    given = frame[(frame["latency_source"] != "timing") & frame["warm"].astype(bool)]
+    parts = []
+    for _, rows in given.groupby(RUN, sort=False):
+        announced = rows[rows["kind"] == QUALITIES[0]]
+        if announced["latency_s"].nunique() < SWEPT:
+            continue
+        counts = announced.groupby("scenario")["latency_s"].nunique()
+        complete = counts.index[counts == announced["latency_s"].nunique()]
+        parts.append(rows[rows["scenario"].isin(complete)])
+    swept = pd.concat(parts) if parts else given.iloc[:0]
+    return _lines(swept, [*LOOP, "kind"])
+
+
+def crossed(lines: pd.DataFrame) -> pd.DataFrame:
+    """Sweeps with a column of cost and of excess for each kind; one line per regime, method and latency."""
+    if not len(lines):
+        return lines
+    index = [*RUN, "latency_s"]
+    wide = lines.pivot_table(
+        index=index, columns="kind", values=["increase_percent_mean", "max_excess_mhz_mean"], sort=False
+    )
+    wide.columns = pd.Index(["_".join(pair) for pair in wide.columns])
+    counts = lines[lines["kind"] == QUALITIES[0]].set_index(index)["n"]
+    return wide.assign(n=counts).reset_index().sort_values(index, kind="stable", ignore_index=True)
+
+
+def _lines(frame: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    made = [dict(zip(by, key, strict=True)) | line(rows) for key, rows in frame.groupby(by, sort=False)]
+    return pd.DataFrame(made, columns=None if made else [*by, *line(frame)])

@@ -1,0 +1,64 @@
+"""The report's part on the closed loop: its tables and figures from a short operation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ded_bench.methods.solution import Settings
+from ded_bench.online.loop import LoopOptions
+from ded_bench.online.online_results import OnlineResults
+from ded_bench.online.online_summary import online_rows, own_latency, sweeps
+from ded_bench.online.operation import make_operations, operate
+from ded_bench.problem.scenario_sampling import sample_scenario
+from ded_bench.report.figures.online import forecast_figure, latency_figure
+from ded_bench.report.report import write_report
+
+
+@pytest.fixture(scope="module")
+def folder(threebus, tmp_path_factory):
+    """One scenario of the chain under static dispatch at three latencies, one of them its own."""
+    place = tmp_path_factory.mktemp("online")
+    scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
+    for latency in ("0", "0.5", "2"):
+        chosen = [("ed", Settings("1s"))]
+        rows = make_operations(threebus, [scenario], chosen, ["TO"], LoopOptions(), latency, [])
+        operate(threebus, rows, OnlineResults(place))
+    results = OnlineResults(place)
+    (first, *_) = results.table.rows.values()
+    results.table.add([first.__class__(**vars(first) | {"latency_source": "timing"})])
+    return place
+
+
+@pytest.mark.usefixtures("sketched")
+def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
+    """Tables in files, too; nothing about the loop without its rows."""
+    write_report(threebus, folder, tmp_path / "no-problems")
+    text = (folder / "report.md").read_text()
+    assert "## The closed loop" in text
+    own = pd.read_csv(folder / "tables" / "online_methods.csv")
+    (row,) = (r for r in OnlineResults(folder).table.rows.values() if r.latency_source == "timing")
+    assert own["increase_percent_mean"].tolist() == pytest.approx([row.increase_percent])
+    assert own["title"].tolist() == ["ED [1s]"]
+    assert (folder / "figures" / "online_scenario.png").is_file()
+    write_report(threebus, tmp_path / "empty", tmp_path / "no-problems")
+    assert "closed loop" not in (tmp_path / "empty" / "report.md").read_text()
+
+
+def test_figures_show_the_numbers(threebus, folder):
+    """A method's marker lies at its latency; a forecast starts at what is measured."""
+    frame = online_rows(OnlineResults(folder), "threebus")
+    given = frame.assign(latency_source="given")
+    figure = latency_figure(sweeps(given), own_latency(frame), "")
+    cost = figure.axes[0]
+    swept, own = cost.get_lines()[0], cost.get_lines()[1]
+    assert list(swept.get_xdata()) == [0.0, 0.5, 2.0]
+    assert own.get_xdata()[0] == 0.0
+    assert own.get_ydata()[0] == swept.get_ydata()[0]
+    scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
+    (ax,) = forecast_figure(threebus, scenario, "").axes
+    truth, *seen = (line for line in ax.get_lines() if len(line.get_xdata()) > 1)
+    for line in seen:
+        came = np.interp(line.get_xdata()[0], truth.get_xdata(), truth.get_ydata())
+        assert line.get_ydata()[0] == pytest.approx(came, abs=1e-12)

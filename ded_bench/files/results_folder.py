@@ -13,6 +13,12 @@ class ResultsFolder:
     path: Path
 
     @property
+    def contents(self) -> tuple[Path, ...]:
+        """What makes a folder one of results: at least one of these is there."""
+        names = ("results.csv", "timing.csv", "online.csv", "certificate.json", "koopman", "policies")
+        return tuple(self.path / name for name in names)
+
+    @property
     def results(self) -> Path:
         """Rows of instance × regime × method × settings."""
         return self.path / "results.csv"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pandas as pd
 
@@ -119,12 +119,37 @@ TABLE_VI = (
     _verdict("frequency", "freq_violation_hz"),
     _verdict("ramp", "ramp_violation"),
 )
+#: Shorter headings for the first screen.
+_SHORT = {
+    "increase_percent": "% over DED",
+    "solve_s": "time",
+    "freq_violation_hz": "frequency",
+    "ramp_violation": "ramp",
+    "failures": "failed",
+} | dict.fromkeys(
+    ("paper_increase_percent", "paper_solve_s", "paper_freq_violation_hz", "paper_ramp_violation"), "paper's"
+)
+#: Columns of both tables on the first screen.
+FRONT_V, FRONT_VI = (
+    tuple(replace(c, text=_SHORT.get(c.name, c.text)) for c in table if not c.name.startswith("against_"))
+    for table in (TABLE_V, TABLE_VI)
+)
+
+
+def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ...]:
+    """Columns of Table V or VI where there is no paper to stand beside; `reference` is what gaps are to."""
+    kept = [column for column in columns if "paper" not in column.name]
+    return tuple(
+        replace(c, text=c.text.replace("DED", reference)) if c.name == "increase_percent" else c for c in kept
+    )
+
+
 GAPS = (
     *_HEAD,
     Column("rows", "rows"),
     Column("n", "n"),
     Column("failures", "failures"),
-    Column("unpaired", "without DED"),
+    Column("unpaired", "without reference"),
     *(Column(f"gap_percent_{part}", heading) for part, heading in _SPREAD),
     Column("cost_ratio", "ratio of summed costs", form=".6f"),
 )
@@ -186,6 +211,7 @@ TIMING = (
     Column("first_build_s", "first build"),
     Column("first_setup_s", "first set-up"),
     Column("failures", "failures"),
+    Column("peak_memory_mib", "peak memory", "MiB"),
     Column("load_average", "load"),
     Column("date", "date"),
     Column("error", "error"),
@@ -206,6 +232,7 @@ WORST = (
     Column("ramp_violation", "ramp", "pu"),
     Column("bound_violation", "bounds", "pu"),
     Column("initial_violation", "initial", "pu"),
+    Column("broken", "limit broken"),
     Column("excess", "× tolerance"),
 )
 STARTS = (

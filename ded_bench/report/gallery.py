@@ -26,13 +26,16 @@ from ded_bench.evaluate.summary import (
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.figures import summaries
 from ded_bench.report.figures.frequencies import frequency_figure, koopman_figure
+from ded_bench.report.figures.histories import history_figure
 from ded_bench.report.figures.plan import Plan, plan
 from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
-from ded_bench.report.figures.style import DPI, Shown, plain, save_figure
+from ded_bench.report.figures.style import DPI, FEW, Shown, plain, save_figure
+from ded_bench.report.figures.tradeoff import profile_figure, tradeoff_figure
 from ded_bench.report.page import Block, Picture, Text
 from ded_bench.report.sources import Sources
 from ded_bench.run.pool import Call, Workers
@@ -40,6 +43,8 @@ from ded_bench.run.results import Key
 from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
+#: Static dispatch is looked at this often, s.
+MOVEMENT_S = 1.0
 #: Worst instances are drawn for the page only, at a coarser resolution.
 WORST_DPI = 110
 
@@ -74,10 +79,13 @@ class Gallery:
         known = key.instance in self.sources.instances
         return known and self.sources.results.schedule_path(key).is_file()
 
-    def load_change(self, name: str) -> float:
-        """How much the loads of an instance move in all, pu."""
-        instance = self.sources.instances[name]
-        return float(np.abs(np.diff(instance.p_load(self.sources.case), axis=0)).sum())
+    def movement(self, name: str) -> float:
+        """How far the static dispatch of an instance moves its generators: mean share of their ranges."""
+        case, instance = self.sources.case, self.sources.instances[name]
+        load = instance.p_load(case, np.arange(0.0, instance.horizon_s, MOVEMENT_S))
+        optimum = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), load)
+        powers = np.vstack([instance.p_initial(case), optimum])
+        return float(np.mean(np.ptp(powers, axis=0) / (case.p_max - case.p_min)))
 
 
 def paint(
@@ -100,7 +108,7 @@ def draw(
     """
     gallery = Gallery(sources)
     frame = sources.judged[sources.judged["regime"].isin(list(sources.case.regimes))]
-    chosen = plan(frame, sources.reference.run, gallery.has, gallery.load_change)
+    chosen = plan(frame, sources.reference.run, gallery.has, gallery.movement)
     before = (
         _simulations(gallery, chosen),
         _draw_training(gallery),
@@ -167,6 +175,15 @@ def _shown(gallery: Gallery, keys: Iterable[Key]) -> list[Shown]:
     ]
 
 
+def _few(case: Case) -> str:
+    """What figures of many generators leave out."""
+    if len(case.generators) <= FEW:
+        return ""
+    return (
+        f" Of {len(case.generators)} generators and {len(case.loads)} loads, those that move most are shown."
+    )
+
+
 def _names(shown: list[Shown]) -> str:
     return " and ".join(title(s.method, s.settings) for s in reversed(shown))
 
@@ -177,7 +194,8 @@ def _draw_schedules(gallery: Gallery, chosen: Plan) -> Iterator[Call]:
             caption = (
                 f"{_names(shown)} on {keys[0].instance}, regime {regime}: generator powers with bounds, "
                 "loads, slack power. Of the instances whose schedules are kept, the third with gaps nearest "
-                "to the median was taken, and from it the one whose loads change most."
+                "to the median was taken; of these, the one whose static dispatch moves the generators most."
+                f"{_few(gallery.sources.case)}"
             )
             heading = f"{keys[0].instance}, {regime}"
             yield gallery.add(
@@ -230,7 +248,7 @@ def rollout(case: Case, model: Koopman, instances: list[Instance], runs: list[Tr
 
 
 def _draw_eigenvalues(gallery: Gallery) -> Iterator[Call]:
-    caption = "Eigenvalues of K against the physical modes at the nominal point (crosses)."
+    caption = "Eigenvalues of K as rates, against the physical modes at the nominal point (crosses)."
     drawn = (summaries.eigenvalue_figure, gallery.sources.case, gallery.sources.models)
     yield gallery.add("koopman", "koopman_eigenvalues", caption, *drawn)
 
@@ -282,13 +300,15 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame) -> Iterator[Call]:
     frame = main_rows(frame)
     points = tradeoff(frame, gallery.sources.timing)
     reference = gallery.sources.reference.title
+    papers = _papers_points(gallery.sources)
     if points["gap_percent"].notna().any():
         caption = (
             f"Mean gap to {reference} against time per schedule; words name settings other than the "
             "default. Hollow: some schedules are infeasible; * timed under parallel load, not by "
             "`ded-bench bench`. The vertical scale is linear within ±0.01 %."
         )
-        yield gallery.add("tradeoff", "tradeoff", caption, summaries.tradeoff_figure, points, reference)
+        caption += " Grey: the paper's numbers, from its machine and its instances." * bool(len(papers))
+        yield gallery.add("tradeoff", "tradeoff", caption, tradeoff_figure, points, reference, papers)
     usual = frame[frame["settings"] == "default"]
     times = performance_profile(timed_rows(usual, gallery.sources.calls), "solve_s")
     objectives = performance_profile(usual, "objective")
@@ -300,7 +320,17 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame) -> Iterator[Call]:
             "schedules count"
         )
         caption += without_curve(usual, objectives)
-        yield gallery.add("profile", "profile", caption, summaries.profile_figure, times, objectives)
+        yield gallery.add("profile", "profile", caption, profile_figure, times, objectives)
+
+
+def _papers_points(sources: Sources) -> pd.DataFrame:
+    """The paper's gaps and times; that of its reference is zero."""
+    rows = []
+    if paper := sources.paper:
+        for regime, methods in paper.regimes.items():
+            for name, row in methods.items():
+                rows.append((regime, paper.methods[name][0], name, row.increase_percent or 0.0, row.solve_s))
+    return pd.DataFrame(rows, columns=["regime", "method", "name", "gap_percent", "seconds"])
 
 
 def without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
@@ -324,10 +354,10 @@ def _draw_training(gallery: Gallery) -> Iterator[Call]:
         trained = title(method) if method else "unknown methods"
         caption = (
             f"Loss of each policy of {trained} over its training time; "
-            "right: what else its history holds, such as the terms of the loss."
+            "right: the terms of the loss, without those that hardly change."
         )
         name = f"training_{method or 'other'}"
-        yield gallery.add("training", name, caption, summaries.history_figure, tables)
+        yield gallery.add("training", name, caption, history_figure, tables)
 
 
 def _draw_problem(gallery: Gallery) -> Iterator[Call]:
@@ -337,5 +367,5 @@ def _draw_problem(gallery: Gallery) -> Iterator[Call]:
     ranges = "the ranges of the sampler (dotted; the paper's Table III)"
     caption = f"Sampled parameters of the {len(instances)} instances against {ranges}."
     yield gallery.add("problem", "parameters", caption, summaries.parameters_figure, case, instances)
-    caption = "Load forecasts of a sample of test instances."
+    caption = f"Load forecasts of a sample of test instances.{_few(case)}"
     yield gallery.add("problem", "forecasts", caption, summaries.forecasts_figure, case, instances)

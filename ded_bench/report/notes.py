@@ -15,7 +15,7 @@ BUSY = 1.5
 #: How the tables are to be read.
 EXPLANATION = (
     "**Objective and violations are re-simulated**: every schedule is integrated on the true swing "
-    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_DED − 1) over "
+    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_ref − 1) over "
     "the `n` instances where both have a score; violations are means of each instance's maximum over time "
     "and generators.",
     "**Failures** are rows without a schedule or a score. They enter no mean, and a method with failures is "
@@ -27,7 +27,7 @@ EXPLANATION = (
     "**Success** is what a method claims, **feasible** what the scorer found: frequency within "
     f"{FEASIBLE_HZ:g} Hz, power limits within {FEASIBLE_PU:g} pu (strictly: {STRICT_HZ:g} Hz and "
     f"{STRICT_PU:g} pu).",
-    "**The ratio of summed costs** is ΣJ / ΣJ_DED over the same `n` instances: costly instances weigh more "
+    "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly instances weigh more "
     "in it than in the mean of the gaps.",
     "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
     "taken while several workers shared the machine and stand in the details only.",
@@ -43,11 +43,6 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
     case, everything, frame, timing = sources.case, sources.rows, sources.judged, sources.timing
     notes = []
     versions = sorted(set(everything["problems_version"]))
-    if not len(everything):
-        notes.append(
-            f"No rows yet: `ded-bench solve --case {case.id} --method {sources.reference.method} "
-            f"--regime {','.join(case.regimes)}` makes some."
-        )
     if len(versions) > 1:
         notes.append(
             f"Rows of different problem versions are not comparable: {', '.join(map(named, versions))}."
@@ -67,6 +62,7 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
     ]
     if len(unscored):
         notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
+    notes += _reference(sources)
     notes += _missing(sources, overview)
     if not len(timing):
         notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
@@ -78,6 +74,42 @@ def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
     if stale:
         notes.append(f"Times were taken on problem version {', '.join(map(named, stale))}.")
     return notes
+
+
+def alarms(sources: Sources) -> list[str]:
+    """Why a report has nothing to compare; empty if it has."""
+    case, judged, reference = sources.case, sources.judged, sources.reference
+    solve = f"ded-bench solve --case {case.id} --method {reference.method} --regime {','.join(case.regimes)}"
+    if not len(sources.rows):
+        return [f"No rows yet: `{solve}` makes some."]
+    if not judged["objective"].notna().any():
+        return ["No row has a score: every method failed, or nothing was scored yet (see the column error)."]
+    if judged["gap_percent"].notna().any():
+        return []
+    version = ", ".join(map(named, sorted(set(judged["problems_version"]))))
+    return [
+        f"No gap can be given: gaps are to {reference.title}, which has no scored row in this folder, and "
+        "the reference run that ships holds no objective for these instances of problem version "
+        f"{version}. `{solve}` makes rows to compare with."
+    ]
+
+
+def _reference(sources: Sources) -> Iterator[str]:
+    """What gaps rest on, where it is not simply rows of the reference."""
+    reference, judged = sources.reference, sources.judged
+    if reference.shipped:
+        yield (
+            f"{reference.shipped} objectives of {reference.title} are those of the reference run that ships "
+            "with the case, since it was not run on these instances here."
+        )
+    scored = judged[judged["objective"].notna()]
+    known = scored.loc[scored["gap_percent"].notna(), ["instance", "regime"]].drop_duplicates()
+    wanted = scored[["instance", "regime"]].drop_duplicates()
+    if len(known) and len(known) < len(wanted):
+        yield (
+            f"{reference.title}, which gaps are to, has a score on {len(known)} of {len(wanted)} pairs of "
+            "instance and regime: gaps are means over these only (column n)."
+        )
 
 
 def named(version: str) -> str:

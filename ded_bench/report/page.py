@@ -13,6 +13,7 @@ import pandas as pd
 
 from ded_bench.report.columns import Column
 from ded_bench.report.render import to_html, to_markdown
+from ded_bench.report.stylesheet import STYLE
 
 
 @dataclass(frozen=True)
@@ -66,15 +67,46 @@ class Picture:
     caption: str
 
 
-Block = Heading | Text | Items | Warnings | Table | Picture
+@dataclass(frozen=True)
+class Details:
+    """Blocks that are folded away under a line that says what they are."""
+
+    summary: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Two columns where the screen is wide enough, else one after the other."""
+
+    left: tuple[Block, ...]
+    right: tuple[Block, ...]
+
+
+Block = Heading | Text | Items | Warnings | Table | Picture | Details | SideBySide
+
+
+def folded(summary: str, *blocks: Block) -> list[Block]:
+    """The blocks under one line; nothing if there are none."""
+    return [Details(summary, blocks)] if blocks else []
 
 
 def render_markdown(blocks: Sequence[Block]) -> str:
-    """The report as Markdown; pictures are links to the files, and nothing in it is taken for HTML."""
-    return "\n".join(_markdown(block) for block in blocks).replace("<", "&lt;")
+    """The report as Markdown; pictures are links to the files, and no text in it is taken for HTML."""
+    return "\n".join(_markdown(block) for block in blocks)
 
 
 def _markdown(block: Block) -> str:
+    match block:
+        case Details(summary, blocks):
+            inside = render_markdown(blocks)
+            return f"<details><summary>{html.escape(summary)}</summary>\n\n{inside}\n</details>\n"
+        case SideBySide(left, right):
+            return render_markdown((*left, *right))
+    return _plain_markdown(block).replace("<", "&lt;")
+
+
+def _plain_markdown(block: Block) -> str:
     match block:
         case Heading(text, level):
             return f"{'#' * level} {text}\n"
@@ -88,6 +120,7 @@ def _markdown(block: Block) -> str:
             return (f"**{caption}**\n\n" if caption else "") + to_markdown(frame, columns)
         case Picture(path, caption):
             return f"![{_plain(caption)}]({path})\n\n*{caption}*\n"
+    raise TypeError(block)
 
 
 def render_html(blocks: Sequence[Block], folder: Path) -> str:
@@ -98,11 +131,9 @@ def render_html(blocks: Sequence[Block], folder: Path) -> str:
         for block in blocks
         if isinstance(block, Heading) and block.level == 2
     )
-    body = []
-    for block in blocks:
-        body.append(_html(block, folder))
-        if isinstance(block, Heading) and block.level == 1:
-            body.append(f'<nav aria-label="Contents"><ul>{links}</ul></nav>')
+    contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
+    body = [_html(block, folder) for block in blocks]
+    body.insert(1, contents)  # under the page's own title
     content = "\n".join(body)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -133,6 +164,12 @@ def _html(block: Block, folder: Path) -> str:
             image = f'<img alt="{html.escape(_plain(caption))}" src="data:image/png;base64,{data}">'
             words = f"<figcaption>{_inline(caption)}</figcaption>"
             return f'<figure><div class="scroll">{image}</div>{words}</figure>'
+        case Details(summary, blocks):
+            inside = "\n".join(_html(inner, folder) for inner in blocks)
+            return f"<details><summary>{_inline(summary)}</summary>\n{inside}\n</details>"
+        case SideBySide(left, right):
+            parts = ("\n".join(_html(inner, folder) for inner in part) for part in (left, right))
+            return f'<div class="side">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
 
 
 def _inline(text: str) -> str:
@@ -143,48 +180,3 @@ def _inline(text: str) -> str:
 
 def _plain(text: str) -> str:
     return re.sub(r"[`*\[\]]", "", text)
-
-
-STYLE = """
-:root { color-scheme: light; --ink: #1b1f24; --soft: #57606a; --line: #d0d7de; --link: #0b5cad; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink);
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 78rem; margin: 0 auto; padding: 1.5rem 1.25rem 4rem; }
-h1 { font-size: 1.9rem; line-height: 1.2; margin: 0.5rem 0 1rem; }
-h2 { font-size: 1.4rem; margin: 3rem 0 0.75rem; padding-top: 1rem; border-top: 1px solid var(--line); }
-h3 { font-size: 1.1rem; margin: 2rem 0 0.5rem; }
-p, ul { max-width: 46rem; }
-a { color: var(--link); }
-nav ul { display: flex; flex-wrap: wrap; gap: 0.3rem 1.2rem; list-style: none; padding: 0; margin: 0 0 1rem;
-  max-width: none; }
-code { font: 0.9em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; background: #f2f4f6;
-  padding: 0.1em 0.3em; border-radius: 3px; overflow-wrap: anywhere; }
-figure { margin: 1.5rem 0; }
-figcaption { color: var(--soft); font-size: 0.9rem; max-width: 46rem; margin: 0.5rem 0; }
-.table figcaption { color: var(--ink); font-weight: 600; }
-.scroll { overflow-x: auto; }
-img { display: block; max-width: 100%; min-width: min(100%, 34rem); height: auto; }
-table { border-collapse: collapse; font-size: 0.875rem; line-height: 1.35; font-variant-numeric: tabular-nums;
-  border-top: 2px solid var(--ink); border-bottom: 2px solid var(--ink); }
-th { text-align: left; vertical-align: bottom; border-bottom: 1px solid var(--ink); }
-th, td { padding: 0.3rem 0.7rem 0.3rem 0; }
-th + th, td + td { padding-left: 0.7rem; }
-td { vertical-align: top; white-space: nowrap; }
-.words { white-space: normal; min-width: 14rem; }
-.number { text-align: right; }
-tr.first td { border-top: 1px solid var(--line); }
-tbody tr:hover { background: #f6f8fa; }
-.warnings { background: #fff8e5; border-left: 4px solid #bf8700; padding: 0.25rem 1rem; margin: 1rem 0; }
-.warnings p { margin: 0.5rem 0; max-width: none; }
-@media (max-width: 40rem) {
-  body { font-size: 15px; }
-  main { padding: 0.75rem 0.9rem 3rem; }
-  h1 { font-size: 1.5rem; }
-  h2 { font-size: 1.25rem; margin-top: 2rem; }
-  img { max-width: none; width: 40rem; min-width: 100%; }
-  table { font-size: 0.8rem; }
-  .label { position: sticky; left: 0; background: #fff; white-space: normal; max-width: 8.5rem; }
-}
-@media print { main { max-width: none; } .scroll { overflow: visible; } figure { break-inside: avoid; } }
-"""

@@ -87,11 +87,18 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         problems: folder of the case's instances, split, manifest and the paper's numbers.
 
     Raises:
-        InputError: a table or a record is there, but wrong.
+        InputError: there is no such folder, nothing in it, only rows of other cases, or something wrong.
     """
     paths = ResultsFolder(folder)
+    if not any(path.exists() for path in paths.contents):
+        raise InputError(folder, "", "holds no results" if folder.is_dir() else "is no folder")
     results = Results(folder)
     rows = results.frame()
+    others = sorted(set(rows["case"]) - {case.id, ""})
+    if others and len(rows[rows["case"].isin([case.id, ""])]) == 0:
+        raise InputError(
+            paths.results, "case", f"holds rows of {', '.join(others)}, not of {case.id}; give --case"
+        )
     rows = rows[rows["case"].isin([case.id, ""])].reset_index(drop=True)
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
     rows = gaps(rows, reference.objectives)

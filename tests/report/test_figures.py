@@ -10,25 +10,43 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from ded_bench.evaluate.summary import GROUP, in_own_table, title
 from ded_bench.files.strict import parse_record
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.registry import METHODS
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.figures import summaries
 from ded_bench.report.figures.frequencies import frequency_figure, koopman_figure
+from ded_bench.report.figures.histories import history_figure, moving_terms
+from ded_bench.report.figures.labels import Label, place_labels
 from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
-from ded_bench.report.figures.style import RAD_TO_HZ, Shown, colour, dashes, marker, save_figure, thin
+from ded_bench.report.figures.style import (
+    RAD_TO_HZ,
+    Shown,
+    busiest,
+    colour,
+    dashes,
+    envelope,
+    marker,
+    new_figure,
+    save_figure,
+    thin,
+)
+from ded_bench.report.figures.tradeoff import profile_figure, tradeoff_figure
 from ded_bench.report.gallery import rollout
-from ded_bench.truth.simulate import simulate
+from ded_bench.truth.simulate import Trajectory, simulate
 
 HORIZON = 2.0
+PAPERS = pd.DataFrame(
+    [("TO", "ded-ko", "DED-KO", 0.3, 18.8)], columns=["regime", "method", "name", "gap_percent", "seconds"]
+)
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +188,8 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
         ],
         columns=[*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"],
     )
-    figure = summaries.tradeoff_figure(points)
-    left, right = figure.axes
+    figure = tradeoff_figure(points, "DED", PAPERS[:0])
+    left, right = figure.axes  # one below the other
     markers = {float(line.get_xdata()[0]): line for line in left.get_lines() if line.get_marker() != "None"}
     assert set(markers) == {5.0, 1e-3}
     assert markers[1e-3].get_markerfacecolor() == "white"
@@ -181,6 +199,37 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
     assert labels == ["DED", "ED *", "mine", "hollow: some infeasible"]
     assert [text.get_text() for text in left.texts] == ["1s *"]
     check_layout(figure, tmp_path)
+
+
+def test_the_papers_points_stand_in_the_tradeoff(tmp_path) -> None:
+    points = pd.DataFrame(
+        [("TO", "ded", "default", "DED", 100, 1.0, 0.0, 5.0, True)],
+        columns=[*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"],
+    )
+    figure = tradeoff_figure(points, "DED", PAPERS)
+    (ax,) = figure.axes
+    places = [line.get_xydata()[0].tolist() for line in ax.get_lines() if line.get_marker() != "None"]
+    assert [18.8, 0.3] in places
+    assert [text.get_text() for text in ax.texts] == ["paper's DED-KO"]
+    assert "grey: the paper's" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_labels_cover_neither_each_other_nor_points(tmp_path) -> None:
+    """Ten words at points close to each other."""
+    with new_figure(4.0, 3.0) as figure:
+        ax = figure.subplots()
+        points = [(float(x), 0.5 + 0.1 * np.sin(40 * x)) for x in np.linspace(0.4, 0.6, 10)]
+        ax.plot(*np.transpose(points), "o", markersize=4)
+        ax.set_xlim(0, 1)
+        ax.set_ylim(0, 1)
+        place_labels(figure, ax, [Label(f"word{i}", *point, "k") for i, point in enumerate(points)])
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    boxes = [Text.get_window_extent(note, renderer) for note in ax.texts]
+    assert len(boxes) == 10
+    common = [Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i]]
+    assert sum(box.width * box.height for box in common if box) == 0
+    dots = ax.transData.transform(ax.get_lines()[0].get_xydata())
+    assert not any(box.contains(*dot) for box in boxes for dot in dots)
 
 
 def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
@@ -195,12 +244,12 @@ def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
         ],
         columns=[*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"],
     )
-    figure = summaries.tradeoff_figure(points)
+    figure = tradeoff_figure(points, "DED", PAPERS[:0])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [title(name) for name in METHODS]
     assert len(figure.axes[0].texts) == len([key for key in keys if key[1] != "default"])
     check_layout(figure, tmp_path)
     profile = points.assign(ratio=1.0 + points["seconds"], fraction=1.0)
-    figure = summaries.profile_figure(profile, profile)
+    figure = profile_figure(profile, profile)
     assert len(figure.legends[0].get_texts()) == len(keys)
     styles = {(line.get_color(), str(line._dash_pattern)) for line in figure.axes[0].get_lines()}  # type: ignore[attr-defined]
     assert len(styles) == len(keys)
@@ -222,7 +271,7 @@ def test_profiles_end_at_the_share_of_instances_solved(tmp_path) -> None:
     rows = [("TO", "ded", "default", "DED", 1.0, 0.5), ("TO", "ded", "default", "DED", 4.0, 1.0)]
     rows += [("TO", "ed", "1s", "ED", 1.0, 0.25)]
     profile = pd.DataFrame(rows, columns=columns)
-    figure = summaries.profile_figure(profile, profile)
+    figure = profile_figure(profile, profile)
     times, objectives = figure.axes
     for ax, xs in ((times, [1.0, 1.0, 4.0, 8.0]), (objectives, [1e-4, 1e-4, 300.0, 600.0])):
         line = ax.get_lines()[0]
@@ -230,7 +279,7 @@ def test_profiles_end_at_the_share_of_instances_solved(tmp_path) -> None:
         assert list(line.get_ydata()) == [0.0, 0.5, 1.0, 1.0]
         assert ax.get_lines()[1].get_ydata()[-1] == 0.25
     check_layout(figure, tmp_path)
-    check_layout(summaries.profile_figure(profile, profile[:0]), tmp_path)
+    check_layout(profile_figure(profile, profile[:0]), tmp_path)
 
 
 def test_training_history(tmp_path) -> None:
@@ -241,15 +290,17 @@ def test_training_history(tmp_path) -> None:
     gaps = pd.DataFrame(
         {"seconds": [1.0, 2.0, 3.0], "training": [9.0, np.nan, 7.0], "held out": [np.nan] * 3}
     )  # taken now and then, and not at all
-    figure = summaries.history_figure({"one": history, "two": history.drop(columns="training")})
+    figure = history_figure({"one": history, "two": history.drop(columns="training")})
     left, right = figure.axes[:2]
     assert drawn(left)[1].tolist() == [7.0, 6.0]
     assert left.get_lines()[0].get_xdata().tolist() == [1.0, 2.0]  # minutes
     assert drawn(right)[0].tolist() == [5.0, 4.0]
     assert [line.tolist() for line in drawn(figure.axes[2])] == [[7.0, 6.0]]
-    (few,) = drawn(summaries.history_figure({"few": gaps}).axes[0])
+    assert moving_terms(history) == ["objective"]
+    loss = history.assign(cost=history["held out"], still=[9.0, 8.0])
+    assert moving_terms(loss) == ["objective"]  # neither the loss again nor a straight line
+    (few,) = drawn(history_figure({"few": gaps}).axes[0])
     assert few.tolist() == [9.0, 7.0]
-    assert np.isnan(drawn(right)[1][0])  # a term of zero has no place on a logarithmic scale
     check_layout(figure, tmp_path)
 
 
@@ -314,10 +365,52 @@ def test_eigenvalues_of_the_linearisation_are_the_physical_modes(case: Case, tmp
     figure = summaries.eigenvalue_figure(case, [linear_model(case)])
     modes, rates = (
         np.sort_complex(np.round(np.array(line.get_xdata()) + 1j * np.array(line.get_ydata()), 6))
-        for line in figure.axes[1].get_lines()[:2]
+        for line in figure.axes[0].get_lines()[:2]
     )
     assert rates == pytest.approx(modes, abs=1e-5)
     check_layout(figure, tmp_path)
+
+
+def test_the_curves_that_move_most_are_shown_in_their_order() -> None:
+    t = np.linspace(0, 1, 11)
+    curves = np.outer(t, [0.0, 3.0, 1.0, 2.0])
+    assert busiest(curves, count=2) == [1, 3]
+    assert busiest(curves, curves * [9.0, 1.0, 1.0, 1.0] + np.outer(t, [9.0, 0, 0, 0]), count=2) == [0, 1]
+    assert busiest(curves) == [0, 1, 2, 3]
+    times, least, largest = envelope(t, curves)
+    assert (times, least, largest) == (pytest.approx(t), pytest.approx(0 * t), pytest.approx(3 * t))
+
+
+@pytest.mark.parametrize("n_gen", [9, 47])
+def test_many_generators_fit_a_page(n_gen: int, tmp_path) -> None:
+    """Six powers, four frequencies under the span of all, and no figure higher than a page."""
+    name = {9: "39bus", 47: "140bus"}[n_gen]
+    case = Case.load(SHIPPED_CASES / name)
+    t = np.linspace(0, 2, 21)
+    waves = np.sin(np.outer(t, np.arange(1, n_gen + 1)) / 9)
+    loads = np.outer(1 + t, np.linspace(-1, -2, len(case.loads)))
+    run = Trajectory(t, waves, 1e-3 * waves, waves, loads, waves[:, 0], case)
+    shown = [Shown("ded-radau", "default", run), Shown("ded-slp", "default", run)]
+    outputs = np.column_stack([run.omega * 1.1, run.p_slack])
+    figures = {
+        "schedules": schedule_figure(case, "heading", shown),
+        "frequencies": frequency_figure(case, "TO", "heading", shown),
+        "koopman": koopman_figure(case, "TO", "heading", run, outputs, "linear"),
+        "worst": worst_figure(case, "TO", "heading", [Worst("first", shown[1], shown[0])]),
+        "forecasts": summaries.forecasts_figure(case, [sample_instance(case, 5, i) for i in range(2)]),
+    }
+    for figure in figures.values():
+        assert figure.get_size_inches()[1] <= 10
+        check_layout(figure, tmp_path)
+    chosen = busiest(waves)
+    axes = figures["schedules"].axes
+    for ax, j in zip(axes, chosen, strict=False):
+        assert shows(ax, waves[:, j])
+        assert case.generators[j] in ax.get_ylabel()
+    assert len(axes[len(chosen)].get_lines()) == len(case.loads)  # all of them, most in grey
+    first = figures["frequencies"].axes[0]
+    assert len(first.collections) == 2
+    assert len(figures["frequencies"].axes) == 1 + 4
 
 
 def test_thin_keeps_the_ends_of_short_curves() -> None:

@@ -9,7 +9,18 @@ import numpy as np
 import pandas as pd
 
 from ded_bench.report.columns import Column
-from ded_bench.report.page import Heading, Items, Picture, Table, Text, Warnings, render_html, render_markdown
+from ded_bench.report.page import (
+    Details,
+    Heading,
+    Items,
+    Picture,
+    SideBySide,
+    Table,
+    Text,
+    Warnings,
+    render_html,
+    render_markdown,
+)
 from ded_bench.report.render import to_html, to_latex, to_markdown
 from tests.reading import Page
 
@@ -53,7 +64,8 @@ def test_both_renderings_of_every_block(tmp_path: Path) -> None:
         Text("some **bold** & `code`"),
         Items(("first", "second")),
         Table(FRAME, COLUMNS, "caption"),
-        Picture("p.png", "a `picture`"),
+        SideBySide((Text("on the left"),), (Picture("p.png", "a `picture`"),)),
+        Details("more & <more>", (Heading("Folded", 3), Text("a <b> c"))),
     ]
     markdown = render_markdown(blocks)
     for part in (
@@ -63,6 +75,9 @@ def test_both_renderings_of_every_block(tmp_path: Path) -> None:
         "- second",
         "**caption**",
         "](p.png)",
+        "on the left",
+        "<details><summary>more &amp; &lt;more&gt;</summary>\n\n### Folded\n",
+        "a &lt;b> c\n\n</details>",
     ):
         assert part in markdown
     text = render_html(blocks, tmp_path)
@@ -73,6 +88,9 @@ def test_both_renderings_of_every_block(tmp_path: Path) -> None:
         "<li>second</li>",
         'href="#part-one"',
         'id="part-one"',
+        '<div class="side"><div><p>on the left</p></div><div><figure>',
+        '<details><summary>more &amp; &lt;more&gt;</summary>\n<h3 id="folded">',
+        '</h1>\n<nav aria-label="Contents">',
     ):
         assert part in text
     assert "A <title>" in page.text

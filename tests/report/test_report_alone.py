@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pandas as pd
@@ -16,6 +17,7 @@ from ded_bench.run.results import Results, Row
 
 @pytest.mark.usefixtures("sketched")
 def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty" / "policies").mkdir(parents=True)
     files = write_report(ninebus, tmp_path / "empty", problems)
     text = (tmp_path / "empty" / "report.md").read_text()
     assert "No rows yet" in text
@@ -29,17 +31,50 @@ def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-def test_another_case_has_no_paper_columns_filled(threebus: Case, tmp_path: Path) -> None:
-    """And rows of other cases in the folder are not its own."""
-    folder = tmp_path / "other"
-    Results(folder).add(
-        [Row("x", "test", "TO", "ded", "default", "Optimal", objective=1.0, case="elsewhere")]
-    )
-    write_report(threebus, folder, tmp_path / "no-problems")
-    text = (folder / "report.md").read_text()
-    assert "No rows yet" in text
+def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path: Path) -> None:
+    """Gaps are to the accurate method; rows of other cases in the folder are not its own."""
+    facts = {"objective": 100.0, "feasible": True, "feasible_strict": True, "case": threebus.id}
+    rows = [Row("x", "test", "TO", name, "default", "Optimal", **facts) for name in ("ded-slp", "ed")]
+    rows[1] = dataclasses.replace(rows[1], objective=103.0)
+    Results(tmp_path).add([*rows, dataclasses.replace(rows[0], instance="y", case="elsewhere")])
+    write_report(threebus, tmp_path, tmp_path / "no-problems")
+    text = (tmp_path / "report.md").read_text()
     assert "The problem files cannot be read" in text
-    assert len(pd.read_csv(folder / "tables" / "table_v.csv")) == 0
+    assert "gaps are to DED (SLP)" in text
+    made = pd.read_csv(tmp_path / "tables" / "table_v.csv")
+    assert not [name for name in made.columns if "paper" in name]
+    assert made.set_index("method").loc["ed", "increase_percent"] == pytest.approx(3.0)
+    assert "% increase in obj. over DED (SLP)" in (tmp_path / "tables" / "table_v.md").read_text()
+    assert "paper's" not in (tmp_path / "tables" / "table_vi.md").read_text()
+
+
+@pytest.mark.usefixtures("sketched")
+def test_why_there_is_no_gap(threebus: Case, tmp_path: Path) -> None:
+    facts = {"case": threebus.id, "problems_version": "1-x"}
+    row = Row("x", "test", "TO", "ed", "default", "Optimal", objective=1.0, **facts)
+    Results(tmp_path).add([row])
+    write_report(threebus, tmp_path, tmp_path / "no-problems")
+    text = (tmp_path / "report.md").read_text()
+    assert "> **Note:** No gap can be given: gaps are to DED (Radau), which has no scored row" in text
+    assert "problem version 1-x" in text
+    Results(tmp_path).add([dataclasses.replace(row, objective=None, status="Failed")])
+    write_report(threebus, tmp_path, tmp_path / "no-problems")
+    assert "> **Note:** No row has a score" in (tmp_path / "report.md").read_text()
+
+
+def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_path: Path) -> None:
+    """And nothing is written into it."""
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no results"):
+        write_report(threebus, tmp_path / "empty", tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        write_report(threebus, tmp_path / "typo", tmp_path)
+    assert not (tmp_path / "typo").exists()
+    assert not list((tmp_path / "empty").iterdir())
+    other = Row("x", "test", "TO", "ed", "default", "Optimal", objective=1.0, case="elsewhere")
+    Results(tmp_path / "other").add([other])
+    with pytest.raises(InputError, match="holds rows of elsewhere, not of"):
+        write_report(threebus, tmp_path / "other", tmp_path)
 
 
 @pytest.mark.usefixtures("sketched")

@@ -14,7 +14,10 @@ from ded_bench.report.figures.style import (
     VERMILION,
     Shown,
     bounds,
+    busiest,
+    colour,
     draw_line,
+    envelope,
     legend_below,
     new_figure,
     thin,
@@ -22,18 +25,33 @@ from ded_bench.report.figures.style import (
 )
 from ded_bench.truth.simulate import Trajectory
 
+#: Generators whose frequencies have a panel of their own, if there are more.
+SHOWN = 4
+
 
 def frequency_figure(case: Case, regime: str, heading: str, shown: Sequence[Shown]) -> Figure:
-    """Frequency deviation at every generator with the regime's bounds (paper, Fig. freq_cmp)."""
-    with new_figure(7.2, 0.8 + 1.9 * len(case.generators)) as figure:
-        axes = figure.subplots(len(case.generators), 1, sharex=True, squeeze=False).ravel()
+    """Frequency deviation at every generator with the regime's bounds (paper, Fig. freq_cmp).
+
+    Of many generators, those that move most are shown, under the span of all.
+    """
+    chosen = busiest(*(s.trajectory.omega for s in shown), count=SHOWN)
+    spans = len(chosen) < len(case.generators)
+    rows = len(chosen) + spans
+    with new_figure(7.2, 0.8 + 1.7 * rows) as figure:
+        axes = figure.subplots(rows, 1, sharex=True, squeeze=False).ravel()
         handles = []
         limit = case.regimes[regime].omega_hz
-        for j, bus in enumerate(case.generators):
+        for ax, j in zip(axes[spans:], chosen, strict=True):
             for s in shown:
-                handles.append(draw_line(axes[j], s, s.trajectory.t, s.trajectory.omega[:, j] * RAD_TO_HZ))
-            handles.append(bounds(axes[j], limit, -limit))
-            axes[j].set_ylabel(f"$\\omega_{{{bus}}}$ (Hz)")
+                handles.append(draw_line(ax, s, s.trajectory.t, s.trajectory.omega[:, j] * RAD_TO_HZ))
+            ax.set_ylabel(f"$\\omega_{{{case.generators[j]}}}$ (Hz)")
+        if spans:
+            axes[0].set_ylabel(f"all {len(case.generators)} (Hz)")
+            for s in shown:
+                t, least, largest = envelope(s.trajectory.t, s.trajectory.omega * RAD_TO_HZ)
+                axes[0].fill_between(t, least, largest, color=colour(s.method), alpha=0.3, linewidth=0.6)
+        for ax in axes:
+            handles.append(bounds(ax, limit, -limit))
         time_axis(list(axes), 1, shown[0].trajectory.t)
         legend_below(figure, handles)
         figure.suptitle(heading)
@@ -45,6 +63,8 @@ def koopman_figure(
 ) -> Figure:
     """Koopman rollout against the swing equations under one schedule (paper, Fig. KOswng_cmp).
 
+    Of many generators, those on which the model errs most are shown.
+
     Args:
         outputs: the model's (ω, P_s) at the grid points, shape (n, n_gen + 1), rad/s and pu.
         name: the model's kind.
@@ -53,11 +73,12 @@ def koopman_figure(
     truth = np.column_stack([trajectory.omega * RAD_TO_HZ, trajectory.p_slack])
     model = outputs * np.array([*[RAD_TO_HZ] * n_gen, 1.0])
     labels = [*(f"$\\omega_{{{bus}}}$ (Hz)" for bus in case.generators), f"slack $P_{{{case.slack}}}$ (pu)"]
+    chosen = [*busiest((model - truth)[:, :n_gen], count=SHOWN), n_gen]
     limit = case.regimes[regime].omega_hz
-    with new_figure(7.2, 0.8 + 1.8 * (n_gen + 1)) as figure:
-        axes = figure.subplots(n_gen + 1, 2, sharex=True, width_ratios=(3, 2))
+    with new_figure(7.2, 0.8 + 1.8 * len(chosen)) as figure:
+        axes = figure.subplots(len(chosen), 2, sharex=True, width_ratios=(3, 2))
         handles = []
-        for j, (left, right) in enumerate(axes):
+        for j, (left, right) in zip(chosen, axes, strict=True):
             handles += left.plot(*thin(trajectory.t, truth[:, j]), color=BLACK, label="swing equations")
             handles += left.plot(
                 *thin(trajectory.t, model[:, j]),

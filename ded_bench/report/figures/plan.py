@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,7 +44,7 @@ def plan(
     frame: pd.DataFrame,
     reference: tuple[str, str],
     available: Callable[[Key], bool],
-    load_change: Callable[[str], float],
+    movement: Callable[[str], float],
 ) -> Plan:
     """Choose the runs to show from the rows of a results table with their gaps.
 
@@ -51,7 +52,7 @@ def plan(
 
     Args:
         available: whether the schedule of a run can be drawn.
-        load_change: how much an instance's loads move in all, pu.
+        movement: how far the static dispatch of an instance moves its generators.
     """
     scored = frame.dropna(subset=["objective"])
     keys = scored[list(Key._fields)].itertuples(index=False)
@@ -59,23 +60,32 @@ def plan(
     chosen = Plan(reference)
     for regime in sorted(set(scored["regime"])):
         chosen.representative[regime] = _representative(
-            scored[scored["regime"] == regime], regime, reference, available, load_change
+            scored[scored["regime"] == regime], regime, reference, available, movement
         )
     for regime, method, settings, group in groups(worst(first_settings(drawable), WORST)):
         ranked = []
         by_gap = group[group["worst_by"] == "gap"]
         by_violation = group[group["worst_by"] == "violation"]
         for row in (by_gap if len(by_gap) else by_violation).to_dict("records"):
-            gap = f"{row['gap_percent']:+.3g} %" if len(by_gap) else f"{row['excess']:.2g} × tolerance"
+            gap = (
+                f"{row['gap_percent']:+.3g} %"
+                if len(by_gap)
+                else f"{row['broken']}: {row['excess']:.2g} × tolerance"
+            )
             ranked.append((str(row["instance"]), f"{row['instance']}\n{gap}"))
         for row in by_violation[by_violation["excess"] > 1].head(1 if len(by_gap) else 0).to_dict("records"):
             if row["instance"] not in [name for name, _ in ranked]:
-                reason = f"{row['instance']}\nworst violation, {row['excess']:.2g} × tolerance"
+                reason = f"{row['instance']}\n{_broken(row)}"
                 ranked.append((str(row["instance"]), reason))
         chosen.worst[regime, method, settings] = [
             (Key(name, regime, method, settings), reason) for name, reason in ranked
         ]
     return chosen
+
+
+def _broken(row: Mapping[Any, Any]) -> str:
+    """The limit that a run breaks most, and by how much."""
+    return f"{row['broken']}: {row['excess']:.2g} × tolerance"
 
 
 def first_settings(rows: pd.DataFrame) -> pd.DataFrame:
@@ -108,12 +118,12 @@ def _representative(
     regime: str,
     reference: tuple[str, str],
     available: Callable[[Key], bool],
-    load_change: Callable[[str], float],
+    movement: Callable[[str], float],
 ) -> list[Key]:
-    """The reference's and a challenger's run on one instance: usual by its gap, and one where loads move.
+    """The reference's and a challenger's run on one instance: usual by its gap, and one where much moves.
 
     Of the instances that can be drawn, the third whose gaps are nearest to the challenger's median takes
-    part; the one whose loads change most is chosen.
+    part; the one whose static dispatch moves the generators most is chosen.
     """
     for method in (*challengers(rows, reference[0]), reference[0]):
         mine = rows[(rows["method"] == method) & (rows["settings"] == "default")].dropna(
@@ -130,5 +140,5 @@ def _representative(
         drawable = [keys for keys in pairs if all(available(key) for key in keys)]
         if drawable:
             usual = drawable[: -(-len(drawable) // 3)]
-            return max(usual, key=lambda keys: (load_change(keys[0].instance), keys[0].instance))
+            return max(usual, key=lambda keys: (movement(keys[0].instance), keys[0].instance))
     return []

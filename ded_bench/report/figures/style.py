@@ -41,6 +41,8 @@ DASHES: tuple[tuple[float, ...], ...] = (
 #: Methods that may be a case's reference.
 SOLID = ("ded", *ACCURATE)
 MARKERS = "osD^vP*Xph<>"
+#: How many generators or loads a figure shows one by one.
+FEW = 6
 RAD_TO_HZ = 1 / (2 * np.pi)
 DPI = 160
 STYLE: dict[Any, Any] = {
@@ -117,6 +119,22 @@ def dashes(method: str, variant: int = 0) -> tuple[float, ...]:
     if variant == 0 and method in SOLID:
         return ()
     return DASHES[1 + (_place(method) + variant) % (len(DASHES) - 1)]
+
+
+def busiest(*curves: Array, count: int = FEW) -> list[int]:
+    """The columns to show of many: those that move most, in their order; all if there are few.
+
+    Args:
+        curves: of shapes (n_points, n), such as one method's each; what counts is the largest range of any.
+    """
+    ranges = np.max([np.ptp(values, axis=0) for values in curves], axis=0)
+    return sorted(np.argsort(-ranges, kind="stable")[:count].tolist())
+
+
+def envelope(t: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Times with the least and the largest of all columns, thinned as curves are (see `thin`)."""
+    times, least = thin(t, values.min(axis=1))
+    return times, least, thin(t, values.max(axis=1))[1]
 
 
 def thin(t: Array, values: Array) -> tuple[Array, Array]:

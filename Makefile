@@ -10,6 +10,7 @@ SPLIT   ?= test
 LIMIT   ?=
 WORKERS ?= $(shell nproc 2>/dev/null || echo 2)
 REGIME  ?=
+KOOPMAN ?=
 TRAIN   ?=
 BENCH   ?=
 BIN     := .venv/bin
@@ -43,6 +44,9 @@ MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,tra
 POLICIES  := $(if $(filter 9bus,$(CASE)),ded-dpc-paper) ded-dpc
 TRAINED   := $(or $(filter 9bus,$(CASE)),$(TRAIN))
 ANSWERING := $(or $(TRAINED),$(wildcard results/$(CASE)-reference/policies))
+
+# What `make quick` times: all but full DED, which takes a minute to set up
+QUICK_BENCH := ed,ded-slp,ded-ko,ded-ko-knots,ded-dpc-paper,ded-dpc,ded-dpc-refined
 
 define NEWLINE
 
@@ -81,7 +85,7 @@ instances: $(STAMP)  ## draw the instances and their split (the same files every
 	$(DED) instances --case $(CASE)
 
 train-ko: $(STAMP)  ## identify the Koopman model from simulated trajectories
-	$(DED) train-ko --case $(CASE) --results $(RESULTS)
+	$(DED) train-ko --case $(CASE) --results $(RESULTS) $(KOOPMAN)
 
 solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in all regimes (SPLIT=all: all instances)
 	$(call SOLVE,ed, --settings '*')
@@ -138,8 +142,9 @@ suite:  ## the reports of all cases, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done
 	$(DED) overview --results $(CASES:%=results/%)
 
-quick:  ## the same road with 4 instances and little training, in some minutes
-	$(MAKE) report RESULTS=results/quick LIMIT=4 TRAIN="--seconds 20 --limit 40" BENCH="--instances 1 --repeats 1"
+quick:  ## the same road with 4 instances (2 for full DED) and little training, about four minutes
+	$(MAKE) report RESULTS=results/quick LIMIT=4 LIMIT_ded_9bus=2 KOOPMAN="--count 24" \
+	  TRAIN="--seconds 8 --limit 40" BENCH="--instances 1 --repeats 1 --method $(QUICK_BENCH)"
 
 test: $(STAMP)  ## lint, type check and tests
 	$(BIN)/ruff check ded_bench tests

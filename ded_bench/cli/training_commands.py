@@ -37,6 +37,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--kind", choices=TRAINED, default=TRAINED[0], help="ours, or the paper's recipe")
     p.add_argument("--case", default=DEFAULT_CASE)
     p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
@@ -79,11 +80,11 @@ def _train_ko(a: argparse.Namespace) -> int:
         return 0
     _check_writable(out)
     if a.kind == "koopman":
-        model = identify(case, a.seed)
+        model = identify(case, a.seed, a.count)
     else:
         with _needing_torch():
             from ded_bench.koopman.identify_paper import identify_paper
-        model = identify_paper(case, a.seed)
+        model = identify_paper(case, a.seed, a.count)
     model.save(out)
     table = rollout_table(case, [nominal_model(case), model], held_out(case, a.seed))
     write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))

@@ -81,11 +81,14 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
         limit: only the first so many.
 
     Raises:
-        InputError: there is no such case or split, or a file is missing or wrong.
+        InputError: there is no such case or split, the limit is negative, or a file is missing or wrong.
     """
+    from ded_bench.files.errors import InputError
     from ded_bench.problem.benchmark import select_split
     from ded_bench.truth.servable import servable
 
+    if limit is not None and limit < 0:
+        raise InputError("limit", "", f"must be at least 0, or None for all, not {limit}")
     return [instance for instance, _ in select_split(case, split, limit, servable).instances]
 
 
@@ -127,13 +130,16 @@ def solve(
 
 
 def simulate(
-    instance: Instance, schedule: Schedule, case: Case | None = None, truth: str | AcCase = "paper"
+    instance: Instance,
+    schedule: Schedule | pd.DataFrame,
+    case: Case | None = None,
+    truth: str | AcCase = "paper",
 ) -> Trajectory:
     """Simulate a schedule on a true DAE; see `truth.simulate.simulate` and `truth.ac_simulate.simulate_ac`.
 
     Args:
         instance: its loads and its initial state.
-        schedule: generator powers.
+        schedule: generator powers; arrays or nested lists, or a data frame with columns `t` and `P_<bus>`.
         case: needed if the instance's case is not a shipped one.
         truth: `paper`: the lossless network; `ac`: the full AC network, by the data of the shipped case;
             or AC data of another one.
@@ -142,19 +148,22 @@ def simulate(
         InputError: the schedule does not span the horizon, the case or truth is unknown, or has no AC data.
         SimulationError: the system loses synchronism under this schedule.
     """
+    from ded_bench.problem.schedule_input import as_schedule
+
     own = _case_of(instance, case)
+    given = as_schedule(schedule, own)
     if (data := _ac_data(own, truth)) is not None:
         from ded_bench.truth.ac_simulate import simulate_ac
 
-        return simulate_ac(own, data, instance, schedule)
+        return simulate_ac(own, data, instance, given)
     from ded_bench.truth import simulate
 
-    return simulate.simulate(own, instance, schedule)
+    return simulate.simulate(own, instance, given)
 
 
 def score(
     instance: Instance,
-    schedule: Schedule,
+    schedule: Schedule | pd.DataFrame,
     regime: str,
     case: Case | None = None,
     truth: str | AcCase = "paper",
@@ -163,7 +172,7 @@ def score(
 
     Args:
         instance: its loads and its initial state.
-        schedule: generator powers.
+        schedule: as for `simulate`.
         regime: one of the case's.
         case: needed if the instance's case is not a shipped one.
         truth: as for `simulate`.
@@ -172,14 +181,17 @@ def score(
         InputError: unknown regime, or as for `simulate`.
         SimulationError: the system loses synchronism under this schedule.
     """
+    from ded_bench.problem.schedule_input import as_schedule
+
     own = _case_of(instance, case)
+    given = as_schedule(schedule, own)
     if (data := _ac_data(own, truth)) is not None:
         from ded_bench.truth.ac_simulate import score_ac
 
-        return score_ac(own, data, instance, schedule, regime)
+        return score_ac(own, data, instance, given, regime)
     from ded_bench.truth import score
 
-    return score.score(own, instance, schedule, regime)
+    return score.score(own, instance, given, regime)
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 import ded_bench
 from ded_bench.cli import main
 from ded_bench.cli.arguments import ORDER, matching
+from ded_bench.cli.outputs import sweep
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -163,6 +165,62 @@ def test_bad_instances(command, change, named, instance_file, schedule_file, tmp
     assert "bad.json" in line or named == "atlantis"
 
 
+def test_an_edited_copy_and_wrong_units(problem: Path, instance_file: Path, tmp_path: Path, capsys) -> None:
+    """Refused before anything is solved, also in a benchmark of one's own."""
+    out, text = tmp_path / "out", instance_file.read_text()
+    path = tmp_path / "copy.json"
+    case = ("--case", problem)
+    path.write_text(json.dumps(json.loads(text) | {"cost": {"s": 9.0, "plant": 1.0}}))
+    line = refused(capsys, *SOLVE, *case, "--instance", path, "--out", out)
+    assert "id: threebus-0000 is the name of" in line
+    own = tmp_path / "own"
+    shutil.copytree(problem, own)
+    for change, named in (
+        ({"initial": {"power": {"plant": 0.6}, "omega": {"plant": 59.9}}}, "initial.omega.plant: 59.9 rad/s"),
+        ({"initial": {"power": {"plant": 60.0}, "omega": {"plant": 0.0}}}, "the power flow has no"),
+    ):
+        changed = own / "instances" / instance_file.name
+        changed.write_text(json.dumps(json.loads(text) | change))
+        line = refused(capsys, *SOLVE, "--case", own, "--split", "all", "--out", out)
+        assert named in line
+        assert "instance threebus-0000" in line
+    assert not out.exists()
+
+
+def test_a_versioned_case_is_not_changed_by_chance(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "threebus"
+    shutil.copytree(CASE_FILES["threebus"].parent, folder)
+    for command, wanted in (("instances", 4), ("scenarios", 2)):
+        draw = [command, "--case", str(folder)]
+        place = folder if command == "instances" else folder / "scenarios"
+        assert main([*draw, "--count", str(wanted)]) == 0  # it has no version yet
+        before = {path: path.read_bytes() for path in place.rglob("*.json")}
+        capsys.readouterr()
+        line = refused(capsys, *draw, "--count", "3", "--seed", "7")
+        assert "--out" in line
+        assert "--force" in line
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
+        lost = sorted(place.rglob("*0001.json"))[0]
+        lost.unlink()
+        assert main([*draw, "--count", str(wanted)]) == 0  # the same again: made whole
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
+        assert main([*draw, "--count", "3", "--seed", "7", "--out", str(tmp_path / command)]) == 0
+        assert main([*draw, "--count", "3", "--seed", "7", "--force"]) == 0
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} != before
+
+
+def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["solve", "--method", "ed", "--regime", "NO", "--case", str(problem), "--out", str(out)]) == 0
+    results = Results(out)
+    rows = list(results.rows.values())
+    results.add([dataclasses.replace(row, objective=None, feasible=None, error="stopped") for row in rows])
+    capsys.readouterr()
+    assert main(["report", "--case", str(problem), "--results", str(out), "--workers", "1"]) == 0
+    assert f"ded-bench: {len(rows)} rows were solved but not scored; scored now" in capsys.readouterr().err
+    assert [row.objective for row in Results(out).rows.values()] == [row.objective for row in rows]
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
@@ -264,8 +322,22 @@ def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    line = refused(capsys, *SOLVE, "--instance", instance_file, "--out", tmp_path / "out")
-    assert line == "ded-bench: No space left on device\n"
+    assert main([*SOLVE, "--instance", str(instance_file), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["ded-bench: 1 rows to solve", "ded-bench: No space left on device"]
+
+
+def test_half_written_files_do_not_stay(tmp_path: Path) -> None:
+    """Those that a killed process left, not those that another one is writing now, nor anything else."""
+    kept = [tmp_path / ".lock", tmp_path / "results.csv", tmp_path / "schedules" / ".x.csv.gz.abcd1234"]
+    left = [tmp_path / ".results.csv.a_b1c2d3", tmp_path / "schedules" / "ded" / ".a.csv.gz.12345678"]
+    for path in (*kept, *left):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    for path in (*kept[:2], *left):
+        os.utime(path, (0, 0))
+    sweep(tmp_path)
+    assert [path.exists() for path in (*kept, *left)] == [True, True, True, False, False]
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ import os
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
     DEFAULT_CASE,
@@ -28,6 +28,9 @@ from ded_bench.problem.benchmark import problem_folder, select_split, validation
 from ded_bench.problem.case import Case
 from ded_bench.run.pool import Workers
 from ded_bench.solvers.status import Status
+
+if TYPE_CHECKING:
+    from ded_bench.run.results import Results
 
 
 def add_commands(commands: Any) -> None:
@@ -147,6 +150,21 @@ def _compare(a: argparse.Namespace) -> int:
     return 0 if found.same else 1
 
 
+def _score_waiting(place: str, results: Results, workers: int) -> None:
+    """Score what an interrupted run has solved but not scored, and say so; else it would count as failed."""
+    from ded_bench.run.scoring import score_unscored
+
+    waiting = [row for row in results.rows.values() if not row.scored]
+    splits = {row.split for row in waiting if results.schedule_path(row.key).is_file()}
+    for split in sorted({"validation" if split == "validation" else "all" for split in splits}):
+        chosen = select_split(place, split)
+        instances = {instance.id: instance for instance, _ in chosen.instances}
+        with Workers(workers) as pool:
+            rows = score_unscored(chosen.case, instances, results, pool)
+        if rows:
+            print(f"ded-bench: {len(rows)} rows were solved but not scored; scored now", file=sys.stderr)
+
+
 def _report(a: argparse.Namespace) -> int:
     with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
         from ded_bench.report.report import write_report
@@ -155,6 +173,7 @@ def _report(a: argparse.Namespace) -> int:
 
         case = Case.load(a.case)
         folder = a.results or default_results(case)
+        _score_waiting(a.case, Results(folder), a.workers)
         written = write_report(case, folder, problem_folder(a.case, case), pool)
         OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import DEFAULT_CASE, command, natural, positive
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.sampling import Split, load_manifest, load_split, write_benchmark
+from ded_bench.problem.sampling import Manifest, Split, load_manifest, load_split, write_benchmark
 from ded_bench.problem.scenario_sampling import SCENARIOS, scenario_folder, write_scenarios
 
 if TYPE_CHECKING:
@@ -33,6 +38,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--test", type=positive, help=f"how many are for testing ({same} a fifth)")
     p.add_argument("--seed", type=natural, help=f"master seed ({same} {SEED})")
     p.add_argument("--out", type=Path, help="default: the case's own folder")
+    p.add_argument("--force", action="store_true", help="replace other instances of a versioned case")
     p.set_defaults(run=_instances)
 
     p = command(commands, "scenarios", "draw minutes of operation for the closed loop")
@@ -40,6 +46,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--seed", type=natural, default=0)
     p.add_argument("--case", default=DEFAULT_CASE, help="name of a shipped case, or a folder")
     p.add_argument("--out", type=Path, help="default: scenarios in the case's own folder")
+    p.add_argument("--force", action="store_true", help="replace other scenarios of a versioned case")
     p.set_defaults(run=_scenarios)
 
 
@@ -54,11 +61,42 @@ def _instances(a: argparse.Namespace) -> int:
     test = a.test or (len(split.test) if count == there else None)
     seed = split.seed if a.seed is None else a.seed
     folder = a.out or home
-    manifest = write_benchmark(case, count, seed, folder, test, servable)
+
+    def draw(folder: Path) -> Manifest:
+        return write_benchmark(case, count, seed, folder, test, servable)
+
+    manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
     print(f"{count} instances of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
     if manifest.redraws:
         print(f"{manifest.redraws} loads or instances were drawn again: their sign changed, or no power flow")
     return 0
+
+
+def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
+    """Draw into a folder that has no version yet; one that has is made whole again, but not changed.
+
+    Raises:
+        InputError: what is drawn is not what the folder's version stands for.
+    """
+    present = load_manifest(folder)
+    if present is None:
+        return draw(folder)
+    with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
+        place = Path(name)
+        if (folder / "case.json").is_file():
+            shutil.copy(folder / "case.json", place)  # its bytes are part of the version
+        drawn = draw(place)
+        if drawn.version != present.version:
+            problem = (
+                f"holds version {present.version}, and this is {drawn.version}: name another folder by "
+                "--out, or replace what is there by --force"
+            )
+            raise InputError(folder, "", problem)
+        for file in drawn.files:
+            content = (place / file).read_bytes()
+            if not (folder / file).is_file() or (folder / file).read_bytes() != content:
+                write_atomically(folder / file, content)
+    return drawn
 
 
 def _cases(a: argparse.Namespace) -> int:
@@ -126,6 +164,10 @@ def _scenarios(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or scenario_folder(problem_folder(a.case, case))
-    manifest = write_scenarios(case, a.count, a.seed, folder, servable)
+
+    def draw(folder: Path) -> Manifest:
+        return write_scenarios(case, a.count, a.seed, folder, servable)
+
+    manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
     print(f"{a.count} scenarios of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}")
     return 0

@@ -19,13 +19,15 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import default_results
 from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
 from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.plausibility import check_own_name, check_plausible
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
@@ -104,6 +106,11 @@ def _solve(a: argparse.Namespace) -> int:
     finished = [task.key for task in tasks if task.key not in waiting]
     for key in finished:
         print_row(results.rows[key])
+    if todo or unscored:
+        check_writable(results.path)
+        sweep(results.folder)
+    there = f", {len(finished)} are there already" if finished else ""
+    print(f"ded-bench: {len(todo)} rows to solve{there}", file=sys.stderr, flush=True)
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
     bad = [row for row in rows if row.status == Status.FAILED or row.objective is None]
     print(
@@ -259,15 +266,23 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 
 def _chosen(a: argparse.Namespace) -> Selection:
-    """The instances of `--instance`, checked against the physics, or of `--split`."""
+    """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
     from ded_bench.truth.network import check_servable
     from ded_bench.truth.servable import servable
 
     if not a.instance:
-        return select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
-    chosen = select_files(a.instance, Case.load(a.case) if a.case else None)
-    for path, (instance, _) in zip(a.instance, chosen.instances, strict=True):
-        check_servable(chosen.case, instance, str(path))
+        chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
+    else:
+        chosen = select_files(a.instance, Case.load(a.case) if a.case else None)
+    problems = problem_folder(a.case or chosen.case.id, chosen.case)
+    if not a.instance and SHIPPED_CASES in problems.parents:
+        return chosen  # the tests check those that are shipped
+    places = a.instance or [f"instance {instance.id}" for instance, _ in chosen.instances]
+    for place, (instance, _) in zip(places, chosen.instances, strict=True):
+        check_plausible(chosen.case, instance, place)
+        check_servable(chosen.case, instance, str(place))
+        if a.instance:
+            check_own_name(instance, place, problems, chosen.case)
     return chosen
 
 

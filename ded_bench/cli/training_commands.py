@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
-import os
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +19,7 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.reference_run import search_folders
@@ -78,7 +76,7 @@ def _train_ko(a: argparse.Namespace) -> int:
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0
-    _check_writable(out)
+    check_writable(out)
     if a.kind == "koopman":
         model = identify(case, a.seed, a.count)
     else:
@@ -144,22 +142,11 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
         train = method.train
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
-    _check_writable(out)
+    check_writable(out)
     options = TrainingOptions(a.seed, a.seconds, a.device, a.resume)
     facts = train(case, regime, instances, model, out, options, **setting).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
-
-
-def _check_writable(out: Path) -> None:
-    """Raise InputError unless a file can be made where the training will write; it may take hours."""
-    try:
-        if out.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        out.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out.parent).close()
-    except OSError as error:
-        raise InputError(out, "", f"cannot be written ({error.strerror})") from None
 
 
 @contextlib.contextmanager

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+#: How the error of a row begins whose schedule the scorer cannot simulate.
+SCORING_FAILED = "scoring failed: "
+
+
 class Key(NamedTuple):
     """What makes a row unique."""
 
@@ -80,7 +84,7 @@ class Row:
     @property
     def scored(self) -> bool:
         """The scorer has spoken, or has failed and said why."""
-        return self.objective is not None or bool(self.error)
+        return self.objective is not None or self.error.startswith(SCORING_FAILED)
 
 
 ROWS = Table(Row)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import get_method
@@ -21,9 +20,8 @@ from ded_bench.problem.instance import Instance
 from ded_bench.run.cluster import open_workers
 from ded_bench.run.code import code_of_method, named
 from ded_bench.run.environment import host, now, version
-from ded_bench.run.pool import Workers
 from ded_bench.run.results import Results, Row
-from ded_bench.run.scoring import score_schedules, scored_row
+from ded_bench.run.scoring import save_scores
 from ded_bench.run.shipping import pack
 from ded_bench.run.tasks import Task, failed, solve_task
 
@@ -131,7 +129,7 @@ def run(
                     on_row(row)
                 bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
                 bar.update()
-        _score(case, unscored, results, pool, on_row)
+        save_scores(case, unscored, results, pool, on_row)
     return [results.rows[task.key] for task in tasks]
 
 
@@ -148,19 +146,6 @@ def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
     files = functools.cache(pack)
     for task in tasks:
         yield dataclasses.replace(task, files=files(task.settings, task.artifacts))
-
-
-def _score(
-    case: Case, tasks: Sequence[Task], results: Results, pool: Workers, on_row: Callable[[Row], None]
-) -> None:
-    for batch, verdicts in score_schedules(case, tasks, results, pool):
-        for verdict in verdicts:
-            if isinstance(verdict, InputError):  # a kept schedule that is damaged is the user's to remove
-                raise verdict
-        rows = [scored_row(results.rows[t.key], v) for t, v in zip(batch, verdicts, strict=True)]
-        results.add(rows)
-        for row in rows:
-            on_row(row)
 
 
 def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:

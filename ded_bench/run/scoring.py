@@ -18,7 +18,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import Results, Row
+from ded_bench.run.results import SCORING_FAILED, Results, Row
 from ded_bench.run.tasks import Scorer, Task, reason_of, score_tasks
 from ded_bench.truth import score as score_module
 from ded_bench.truth.score import Score, score
@@ -27,8 +27,6 @@ from ded_bench.truth.score import Score, score
 SCORE_BATCH = 50
 #: What a kept schedule, scored again, may differ by from its row.
 OBJECTIVE_RELATIVE, VIOLATION_HZ, VIOLATION_PU = 1e-9, 1e-9, 1e-9
-#: How the error of a row begins whose schedule cannot be simulated.
-FAILED = "scoring failed: "
 _POWER_LIMITS = ("ramp_violation", "bound_violation", "initial_violation")
 
 
@@ -91,10 +89,10 @@ def score_cells(verdict: object, code: str) -> dict[str, Any]:
         code: of the scorer.
     """
     if not isinstance(verdict, Score):
-        return {"error": f"{FAILED}{reason_of(verdict)}"}
+        return {"error": f"{SCORING_FAILED}{reason_of(verdict)}"}
     numbers = dataclasses.asdict(verdict)
     if not all(abs(value) <= LARGEST for value in numbers.values()):
-        return {"error": f"{FAILED}cost or violations are above {LARGEST:g}"}
+        return {"error": f"{SCORING_FAILED}cost or violations are above {LARGEST:g}"}
     feasible = {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
     return numbers | feasible | {"score_code": code}
 
@@ -103,8 +101,47 @@ def without_score(row: Row) -> Row:
     """A row as it was before it was scored."""
     names = (field.name for field in dataclasses.fields(Score))
     empty = dict.fromkeys((*names, "feasible", "feasible_strict"))
-    error = "" if row.error.startswith(FAILED) else row.error
+    error = "" if row.error.startswith(SCORING_FAILED) else row.error
     return dataclasses.replace(row, error=error, score_code="", **empty)  # type: ignore[arg-type]
+
+
+def save_scores(
+    case: Case,
+    tasks: Sequence[Task],
+    results: Results,
+    pool: Workers,
+    on_row: Callable[[Row], None] = lambda row: None,
+) -> None:
+    """Score the kept schedules of tasks and fill in their rows.
+
+    Raises:
+        InputError: a kept schedule is damaged, which is the user's to remove.
+    """
+    for batch, verdicts in score_schedules(case, tasks, results, pool):
+        for verdict in verdicts:
+            if isinstance(verdict, InputError):
+                raise verdict
+        rows = [scored_row(results.rows[t.key], v) for t, v in zip(batch, verdicts, strict=True)]
+        results.add(rows)
+        for row in rows:
+            on_row(row)
+
+
+def score_unscored(
+    case: Case, instances: Mapping[str, Instance], results: Results, pool: Workers
+) -> tuple[Row, ...]:
+    """Score the kept schedules that have no score yet, as after an interruption; returns their rows.
+
+    Args:
+        instances: by id; rows of others stay as they are.
+
+    Raises:
+        InputError: a kept schedule is damaged.
+    """
+    waiting = [row for row in results.rows.values() if not row.scored and row.instance in instances]
+    waiting = [row for row in waiting if results.schedule_path(row.key).is_file()]
+    save_scores(case, tasks_of(waiting, instances), results, pool)
+    return tuple(results.rows[row.key] for row in waiting)
 
 
 def rescore(

@@ -122,13 +122,16 @@ def test_a_run_leaves_one_line_per_row_even_if_interrupted(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(runner, "_score", interrupt)
+    monkeypatch.setattr(runner, "save_scores", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run(threebus, make("calm-1"), results)
     monkeypatch.undo()
     monkeypatch.setitem(METHODS, "ded", STRANGE)
     todo, unscored = unfinished(make("calm-1"), Results(tmp_path / "out"))
     assert (todo, unscored) == ([], make("calm-1"))
+    told = [dataclasses.replace(row, error="stopped early") for row in results.rows.values()]
+    results.add(told)  # what a solver says beside its schedule is no verdict
+    assert unfinished(make("calm-1"), results) == ([], make("calm-1"))
     run(threebus, make("calm-1"), results)
     assert len(results.path.read_text().splitlines()) == 3
     assert all(row.scored for row in ROWS.read(results.path))

@@ -14,8 +14,9 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
+from ded_bench.run.pool import Workers
 from ded_bench.run.results import Results, Row
-from ded_bench.run.scoring import rescore, scored_row
+from ded_bench.run.scoring import rescore, score_unscored, scored_row
 from ded_bench.truth.score import score
 
 
@@ -110,3 +111,17 @@ def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Res
 def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> None:
     with pytest.raises(InputError, match=r"schedules: holds no schedule of these rows"):
         rescore(threebus, {"d": instances["d"]}, results)
+
+
+def test_what_an_interruption_left_is_scored_later(threebus: Case, instances, results) -> None:
+    """Also where the solver has something to say; rows without a schedule stay as they are."""
+    before = row_of(results, "a"), row_of(results, "d")
+    empty = dict(objective=None, feasible=None, feasible_strict=None, score_code="", error="stopped early")
+    results.add([dataclasses.replace(row, status="Feasible", **empty) for row in before])
+    with Workers() as pool:
+        rows = score_unscored(threebus, instances, results, pool)
+        assert score_unscored(threebus, instances, results, pool) == ()
+    assert [row.instance for row in rows] == ["a"]
+    assert rows[0].objective == before[0].objective
+    assert rows[0].error == "stopped early"
+    assert row_of(results, "d").objective is None

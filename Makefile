@@ -28,6 +28,11 @@ LIMIT_ded-radau_68bus  ?= 10
 LIMIT_ded-radau_140bus ?= 5
 LIMIT_ded-ko_68bus     ?= 10
 LIMIT_ded-ko_140bus    ?= 5
+# How many instances are timed.
+TIMED_39bus            ?= 5
+TIMED_68bus            ?= 3
+TIMED_140bus           ?= 2
+TIMED                  ?= $(or $(TIMED_$(CASE)),10)
 
 # How many scenarios of the closed loop slow methods operate; the sweeps over latency and forecast take fewer.
 SCENARIOS              ?= 20
@@ -74,6 +79,7 @@ help:  ## show this list
 	@echo "  Settings: CASE=$(CASE) RESULTS=$(RESULTS) SPLIT=test|train|all REGIME=r LIMIT=n WORKERS=$(WORKERS)"
 	@echo "  CASE: a shipped case ($(CASES)) or a folder"
 	@echo "  Fewer instances for slow methods: $(foreach v,$(sort $(filter LIMIT_%,$(.VARIABLES))),$v=$($v))"
+	@echo "  Instances that are timed: TIMED=$(TIMED)"
 
 venv: $(STAMP)  ## make .venv with the pinned versions
 $(STAMP): constraints.txt setup.cfg pyproject.toml
@@ -124,7 +130,7 @@ certify: train-dpc  ## certify DED-DPC on 10,000 fresh instances per regime
 	$(DED) certify --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
 
 bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),,models)  ## time each method alone on the machine
-	$(DED) bench --case $(CASE) --results $(RESULTS) $(BENCH)
+	$(DED) bench --case $(CASE) --results $(RESULTS) --instances $(TIMED) $(BENCH)
 
 report: bench  ## everything that is missing, then the tables and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
@@ -144,7 +150,7 @@ suite:  ## the reports of all cases, then one page over them
 
 quick:  ## the same road with 4 instances (2 for full DED) and little training, about four minutes
 	$(MAKE) report RESULTS=results/quick LIMIT=4 LIMIT_ded_9bus=2 KOOPMAN="--count 24" \
-	  TRAIN="--seconds 8 --limit 40" BENCH="--instances 1 --repeats 1 --method $(QUICK_BENCH)"
+	  TRAIN="--seconds 8 --limit 40" TIMED=1 BENCH="--repeats 1 --method $(QUICK_BENCH)"
 
 test: $(STAMP)  ## lint, type check and tests
 	$(BIN)/ruff check ded_bench tests

@@ -78,3 +78,11 @@ def test_every_command_is_understood() -> None:
     for target in ("report", "models", "ablation", "certify", "radau", "starts", "quick"):
         for command in commands(target):
             parser().parse_args(command)
+
+
+def test_fewer_instances_are_timed_on_large_grids() -> None:
+    timed = {}
+    for case in ("9bus", "140bus"):
+        (command,) = (c for c in commands("report", f"CASE={case}") if c[0] == "bench")
+        timed[case] = parser().parse_args(command).instances
+    assert 0 < timed["140bus"] < timed["9bus"] == 10

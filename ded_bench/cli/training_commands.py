@@ -60,14 +60,18 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
     p.set_defaults(run=_train_dpc)
 
-    p = command(commands, "rollouts", "errors of the Koopman models under full DED's schedules")
+    p = command(commands, "rollouts", "errors of the surrogates under several kinds of schedules")
     p.add_argument("--case", default=DEFAULT_CASE)
-    p.add_argument("--results", type=Path, help="results folder")
+    p.add_argument("--results", type=Path, help="results folder: gives models and optimal schedules")
+    p.add_argument("--limit", type=positive, default=10, help="how many test instances' optimal schedules")
+    p.add_argument("--draws", type=positive, default=30, metavar="N", help="drawn schedules, of all kinds")
+    p.add_argument("--exchange", type=positive, metavar="N", help="bound of all lifted models, on N pairs")
     p.set_defaults(run=_rollouts)
 
 
 def _train_ko(a: argparse.Namespace) -> int:
-    from ded_bench.koopman.identify import held_out, identify, rollout_table
+    from ded_bench.evaluate.rollouts import rollout_table
+    from ded_bench.koopman.identify import held_out, identify
     from ded_bench.koopman.linear import nominal_model
     from ded_bench.koopman.surrogates import model_file
 
@@ -161,24 +165,30 @@ def _needing_torch() -> Iterator[None]:
 
 
 def _rollouts(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.ablation import rollout_errors
+    from ded_bench.evaluate.lifted_bound import EXCHANGED, exchange_table
     from ded_bench.evaluate.paper_numbers import read_paper
     from ded_bench.evaluate.reference import choose_reference
-    from ded_bench.koopman.surrogates import MODELS, find_model
+    from ded_bench.evaluate.rollouts import all_rollouts
+    from ded_bench.koopman.surrogates import MODELS, TRAJECTORY_AC, find_surrogate
     from ded_bench.run.results import Results
 
-    chosen = select_split(a.case)
+    chosen = select_split(a.case, limit=a.limit)
     case = chosen.case
-    folder = a.results or default_results(case)
-    models = []
+    results = Results(a.results or default_results(case))
+    surrogates = []
     for name in MODELS:
-        try:
-            models.append(find_model(case, name, search_folders(case, folder)))
-        except InputError as error:
-            print(f"ded-bench: left out: {error}", file=sys.stderr)
-    instances = [instance for instance, _ in chosen.instances]
-    results = Results(folder)
+        if name != TRAJECTORY_AC:  # it stands for another network than the one simulated here
+            try:
+                surrogates.append(find_surrogate(case, name, search_folders(case, results.folder)))
+            except InputError as error:
+                print(f"ded-bench: left out: {error}", file=sys.stderr)
     reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
-    table = rollout_errors(case, results, instances, models, reference)
+    optimal = dict.fromkeys((reference.method, "ded-slp"))
+    instances = [instance for instance, _ in chosen.instances]
+    table = all_rollouts(case, results, instances, surrogates, tuple(optimal), a.draws)
+    if a.exchange:
+        exchanged = exchange_table(case, surrogates, a.exchange)
+        write_atomically(results.paths.model_errors(EXCHANGED), exchanged.to_csv(index=False))
+        print(exchanged.to_string(index=False, float_format="{:.3g}".format), end="\n\n")
     print(table.to_string(index=False, float_format="{:.3g}".format))
     return 0

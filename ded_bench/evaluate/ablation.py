@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.reference import Reference
 from ded_bench.evaluate.summary import (
     GROUP,
     START,
@@ -22,17 +21,10 @@ from ded_bench.evaluate.summary import (
 )
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
-from ded_bench.koopman.data import trajectories
-from ded_bench.koopman.identify import rollout_table
-from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import MODELS
 from ded_bench.methods.dpc.variants import SETTINGS
 from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.solution import DEFAULT_MODEL
-from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
-from ded_bench.run.results import Key, Results
 
 #: Full DED from its cold start, which other starting points are compared with.
 STARTED = ("ded", "default")
@@ -130,40 +122,6 @@ SHOWN = (
     *(f"freq_violation_hz_{part}" for part in ("mean", "max")),
 )
 FACTS = ("seconds", "epochs", "steps", "instances", "parameters")
-
-
-def rollout_errors(
-    case: Case,
-    results: Results,
-    instances: Sequence[Instance],
-    models: Sequence[Koopman],
-    reference: Reference,
-) -> pd.DataFrame:
-    """Errors of models over the whole horizon under the reference's schedules (see `identify.rollout_table`).
-
-    The table is written beside the models, under the reference's name.
-
-    Args:
-        instances: those whose reference schedules in the results folder are used.
-
-    Raises:
-        InputError: there is no schedule of the reference, or one cannot be read.
-    """
-    parts = []
-    for regime in case.regimes:
-        keys = {i.id: Key(i.id, regime, *reference.run) for i in instances}
-        there = [i for i in instances if results.schedule_path(keys[i.id]).is_file()]
-        if there:
-            schedules = [results.schedule(keys[i.id], case, i) for i in there]
-            data = trajectories(case, there, schedules, [f"{reference.title}, {regime}"] * len(there))
-            parts.append(rollout_table(case, models, data))
-    if not parts:
-        raise InputError(
-            results.folder, "schedules", f"holds none of {reference.title}; run `ded-bench solve` first"
-        )
-    table = pd.concat(parts, ignore_index=True)
-    write_atomically(results.paths.model_errors(reference.method), table.to_csv(index=False))
-    return table
 
 
 def training_table(folder: Path, columns: Sequence[str]) -> pd.DataFrame:

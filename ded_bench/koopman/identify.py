@@ -8,12 +8,10 @@ equilibria hold for every parameter value of either.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.optimize import least_squares
 
 from ded_bench.koopman.data import Trajectories, sample_trajectories
@@ -32,8 +30,6 @@ ENERGY_FORM_PARAMETERS = 60
 LINE_FORM_TRAIN = 40
 #: Kinds of schedules to train on; the held-out ones have all kinds, two of which were never seen.
 TRAIN_MIX = ("tracking", "tracking", "hurried", "random knots")
-#: Trajectories whose rollouts are judged together: all would fill the memory on large grids.
-AT_A_TIME = 10
 #: Residuals are taken every so many steps and in these units: rad/s and pu.
 STRIDE, OMEGA_UNIT, SLACK_UNIT = 20, 2 * np.pi * 5e-6, 1e-4
 #: Gauss-Newton evaluations; the cost changes in its fourth digit after about eight.
@@ -130,33 +126,6 @@ def predict(model: Koopman, network: Network, data: Trajectories) -> Array:
     n_gen = len(network.generators)
     psi = model.observables(network, data.theta_initial, data.omega[0], data.inputs[0, :, n_gen:])
     return model.rollout(psi, data.inputs)[..., : n_gen + 1]
-
-
-def rollout_table(case: Case, models: Sequence[Koopman], data: Trajectories) -> pd.DataFrame:
-    """Rollout errors by model and kind of schedule: |Δω| in Hz, ΔP_s in pu."""
-    network = Network(case)
-    n_gen = len(case.generators)
-    rows = []
-    for model in models:
-        worst, rms = np.empty(len(data.kinds)), np.empty(len(data.kinds))
-        for first in range(0, len(data.kinds), AT_A_TIME):
-            part = slice(first, first + AT_A_TIME)
-            error = predict(model, network, data.take(part)) - data.outputs[:, part]
-            worst[part] = np.abs(error[..., :n_gen]).max(axis=(0, 2)) / (2 * np.pi)
-            rms[part] = np.sqrt(np.square(error[..., n_gen]).mean(axis=0))
-        for kind in dict.fromkeys(data.kinds):
-            chosen = np.array([k == kind for k in data.kinds])
-            rows.append(
-                {
-                    "model": model.kind,
-                    "schedules": kind,
-                    "n": int(chosen.sum()),
-                    "mean max |Δω| (Hz)": worst[chosen].mean(),
-                    "max |Δω| (Hz)": worst[chosen].max(),
-                    "mean RMS ΔP_s (pu)": rms[chosen].mean(),
-                }
-            )
-    return pd.DataFrame(rows)
 
 
 def _residuals(model: Koopman, network: Network, data: Trajectories) -> Array:

@@ -8,9 +8,10 @@ import pandas as pd
 
 from ded_bench.evaluate.ablation import SAME, STARTED
 from ded_bench.evaluate.certificate import Certificate
+from ded_bench.evaluate.lifted_bound import ANY, EXCHANGED
 from ded_bench.evaluate.reference import DEFAULT
+from ded_bench.evaluate.rollouts import ROLLOUTS
 from ded_bench.evaluate.summary import SMALLEST_GAP, TIME_SHIFT_S, groups, title
-from ded_bench.methods.registry import METHODS
 from ded_bench.report.columns import (
     ABLATION,
     CERTIFICATE,
@@ -147,19 +148,24 @@ def _certificates(certificates: Sequence[Certificate]) -> list[Block]:
     return [Table(pd.DataFrame(rows), CERTIFICATE)]
 
 
+#: What a table of rollout errors is about, by its name; the others have a model's.
+ERRORS_WHERE = {
+    ROLLOUTS: "under drawn schedules, the static dispatch and optimal schedules of test instances",
+    EXCHANGED: f"where two instances exchange their input increments; `{ANY}` is a lower bound",
+}
+
+
 def _rollout_errors(rollouts: Mapping[str, pd.DataFrame]) -> list[Block]:
-    """The tables of the Koopman models' errors."""
+    """The tables of the surrogates' errors."""
     blocks: list[Block] = []
     for name, errors in rollouts.items():
         columns = tuple(Column(str(name), str(name)) for name in errors.columns)
-        where = (
-            f"under the schedules of {title(name)}, test instances"
-            if name in METHODS
-            else f"on simulated trajectories held out from the identification of `{name}`"
+        where = ERRORS_WHERE.get(
+            name, f"on simulated trajectories held out from the identification of `{name}`"
         )
         caption = f"Errors of rollouts over the whole horizon {where}"
         table = Table(errors, columns, caption)
-        blocks += [table] if name in METHODS else folded(caption, table)
+        blocks += [table] if name in ERRORS_WHERE else folded(caption, table)
     return blocks
 
 

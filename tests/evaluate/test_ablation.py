@@ -12,20 +12,13 @@ from ded_bench.evaluate.ablation import (
     ablation_table,
     main_rows,
     model_table,
-    rollout_errors,
     split_slug,
     starts_table,
     training_table,
 )
-from ded_bench.evaluate.reference import choose_reference
 from ded_bench.evaluate.summary import judged_rows, summary
 from ded_bench.files.arrays import write_arrays
-from ded_bench.files.errors import InputError
-from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.policy_file import policy_file
-from ded_bench.problem.case import Case
-from ded_bench.problem.schedule import Schedule
-from ded_bench.run.results import Key, Results
 from tests.evaluate.test_summary import frame_of, row, with_gaps
 
 
@@ -128,22 +121,3 @@ def test_training_table_names_files_that_cannot_be_read(tmp_path: Path) -> None:
     rows = training_table(tmp_path, ["seconds"]).set_index("policy")
     assert rows.loc["ded-dpc-TO", "seconds"] == 3.0
     assert "broken.safetensors" in rows.loc["broken", "problem"]
-
-
-def test_rollout_errors_of_the_references_schedules(threebus: Case, quiet_instance, tmp_path: Path) -> None:
-    """A quiet instance held at its equilibrium: the linear model at the nominal point is nearly exact."""
-    results = Results(tmp_path)
-    instance = quiet_instance(threebus, horizon_s=1.0)
-    reference = choose_reference(results.frame(), None)
-    with pytest.raises(InputError, match="ded-bench solve"):
-        rollout_errors(threebus, results, [instance], [linear_model(threebus)], reference)
-    regime = next(iter(threebus.regimes))
-    power = instance.p_initial(threebus)
-    schedule = Schedule(np.array([0.0, 1.0]), np.array([power, power]))
-    schedule.write(results.schedule_path(Key(instance.id, regime, *reference.run)), threebus.generators)
-    table = rollout_errors(threebus, results, [instance], [linear_model(threebus)], reference)
-    assert table["schedules"].to_list() == [f"{reference.title}, {regime}"]
-    assert table["n"].to_list() == [1]
-    assert table["max |Δω| (Hz)"].iloc[0] < 1e-3
-    written = pd.read_csv(tmp_path / "koopman" / "ded-radau.errors.csv")
-    pd.testing.assert_frame_equal(written, table, check_exact=True)

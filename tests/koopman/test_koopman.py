@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ded_bench.evaluate.rollouts import rollout_table
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.data import KINDS, load_ramps, random_knots, sample_trajectories, trajectories
 from ded_bench.koopman.energy_form import EPSILON, energy_form, injection_lift, steady_state
@@ -18,7 +19,6 @@ from ded_bench.koopman.identify import (
     make_model,
     n_parameters,
     predict,
-    rollout_table,
     unpack,
 )
 from ded_bench.koopman.linear import linear_model, nominal_model, single_sample

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ded_bench.evaluate.rollouts import rollout_table
 from ded_bench.koopman.energy_form import injection_lift, steady_state
 from ded_bench.koopman.identify import (
     ENERGY_FORM_PARAMETERS,
@@ -12,7 +13,6 @@ from ded_bench.koopman.identify import (
     identify,
     n_parameters,
     n_training,
-    rollout_table,
 )
 from ded_bench.koopman.line_fit import fit_lines, sensitivities
 from ded_bench.koopman.line_form import Dynamics, LineForm, Step, discretise

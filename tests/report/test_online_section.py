@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.methods.solution import Settings
-from ded_bench.online.loop import LoopOptions
-from ded_bench.online.online_results import OnlineResults
+from ded_bench.methods import ed
+from ded_bench.online.judgement import judge_operation
+from ded_bench.online.loop import LoopOptions, run_loop
+from ded_bench.online.online_results import OnlineResults, OnlineRow, keep_trajectory
 from ded_bench.online.online_summary import online_rows, own_latency, sweeps
-from ded_bench.online.operation import make_operations, operate
+from ded_bench.online.planner import Plan
 from ded_bench.problem.scenario_sampling import sample_scenario
 from ded_bench.report.figures.online import forecast_figure, latency_figure
 from ded_bench.report.report import write_report
+from ded_bench.run.results import Results, Row
 
 
 @pytest.fixture(scope="module")
 def folder(threebus, tmp_path_factory):
     """One scenario of the chain under static dispatch at three latencies, one of them its own."""
-    place = tmp_path_factory.mktemp("online")
+    results = OnlineResults(tmp_path_factory.mktemp("online"))
     scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
-    for latency in ("0", "0.5", "2"):
-        chosen = [("ed", Settings("1s"))]
-        rows = make_operations(threebus, [scenario], chosen, ["TO"], LoopOptions(), latency, [])
-        operate(threebus, rows, OnlineResults(place))
-    results = OnlineResults(place)
-    (first, *_) = results.table.rows.values()
-    results.table.add([first.__class__(**vars(first) | {"latency_source": "timing"})])
-    return place
+    for latency in (0.0, 0.5, 2.0):
+        options = LoopOptions(latency_s=latency)
+        trajectory = run_loop(
+            threebus, scenario, lambda i, _: Plan(ed.dispatch(threebus, i, 1.0)), options
+        ).trajectory
+        row = OnlineRow(
+            *(scenario.id, "TO", "ed", "1s", 1.0, latency, "announced", True, True),
+            **dataclasses.asdict(judge_operation(threebus, scenario, trajectory, "TO")),
+            increase_percent=1.0 + latency,
+            plans=6,
+            latency_source="given" if latency else "timing",
+            case=threebus.id,
+        )
+        keep_trajectory(results.files.trajectory(row.key), trajectory)
+        results.table.add([row])
+    return results.files.folder
 
 
 @pytest.mark.usefixtures("sketched")
@@ -42,8 +54,9 @@ def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     assert own["increase_percent_mean"].tolist() == pytest.approx([row.increase_percent])
     assert own["title"].tolist() == ["ED [1s]"]
     assert (folder / "figures" / "online_scenario.png").is_file()
-    write_report(threebus, tmp_path / "empty", tmp_path / "no-problems")
-    assert "closed loop" not in (tmp_path / "empty" / "report.md").read_text()
+    Results(tmp_path / "other").add([Row("x", "test", "TO", "ed", "1s", "Feasible", objective=1.0)])
+    write_report(threebus, tmp_path / "other", tmp_path / "no-problems")
+    assert "The closed loop" not in (tmp_path / "other" / "report.md").read_text()
 
 
 def test_figures_show_the_numbers(threebus, folder):

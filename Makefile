@@ -24,6 +24,7 @@ LIMIT_ded_9bus         ?= all
 LIMIT_ded_two-area     ?= 10
 LIMIT_ded_39bus        ?= 10
 LIMIT_ded-radau_9bus   ?= 0
+LIMIT_ded-radau_39bus  ?= 20
 LIMIT_ded-radau_68bus  ?= 10
 LIMIT_ded-radau_140bus ?= 5
 LIMIT_ded-ko_68bus     ?= 10

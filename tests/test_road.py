@@ -48,7 +48,8 @@ def test_a_physical_grid_is_solved_on_every_model_and_by_euler_on_a_few_instance
     knots = {model for name, _, model in methods if name == "ded-ko-knots"}
     assert knots == {"koopman", "linear", "koopman-paper", "trajectory"}
     assert methods["ded", "default", "koopman"] == 10
-    assert methods["ded-radau", "default", "koopman"] is None
+    assert methods["ded-radau", "default", "koopman"] == 20
+    assert methods["ded-slp", "default", "koopman"] is None
     assert [c[c.index("--case") + 1] for c in road] == ["39bus"] * len(road)
     assert "train-dpc" not in {command[0] for command in road}
 

@@ -177,7 +177,9 @@ def certify(
     Rows are saved chunk by chunk; those of another policy, model or case are made anew.
 
     Args:
-        rows_path: CSV with one row per instance (COLUMNS).
+        rows_path: CSV with one row per instance (see CertificateRow).
+        criteria: what counts as a success, against which method, and how sure the bound is.
+        count: how many instances.
         seed: the instances are those of master seed CERTIFICATE_SEED + seed.
 
     Raises:

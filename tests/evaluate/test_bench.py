@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from ded_bench.cli import main
 from ded_bench.evaluate import bench as bench_module
 from ded_bench.evaluate.bench import (
     ROUNDS,
@@ -36,8 +37,9 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.pool import WorkerDiedError
-from ded_bench.run.results import Key, Results
+from ded_bench.run.results import Key, Results, Row
 from ded_bench.solvers.status import Status
+from ded_bench.truth import servable
 
 ROW = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", build_s=0.5, solve_s=3.5, host="here")
 TO = Job("fake", "TO", Settings())
@@ -121,6 +123,22 @@ def test_every_turn_begins_with_another_instance(fake, run, instances) -> None:
     assert (summary["solve_s"], summary["first_solve_s"]) == (3.5, 100.0)
     with pytest.raises(InputError, match="warms up"):
         run([TO], warm_up=instances[0])
+
+
+def test_the_command_warms_up_on_what_the_power_flow_can_serve(tmp_path: Path, monkeypatch) -> None:
+    """The first draw is redrawn if it cannot be served."""
+    drawn, warmed = [], []
+
+    def refuse_the_first(case: Case, instances: list[Instance]) -> np.ndarray:
+        drawn.extend(instances)
+        return np.array([instance is not drawn[0] for instance in instances])
+
+    monkeypatch.setattr(servable, "servable", refuse_the_first)
+    monkeypatch.setattr(bench_module, "bench", lambda *_, warm_up, **__: warmed.append(warm_up) or [])
+    row = Row("9bus-0001", "test", "TO", "ed", "default", "Feasible", objective=1.0, case="9bus")
+    Results(tmp_path).add([row])
+    assert main(["bench", "--results", str(tmp_path)]) == 0
+    assert warmed[0].p_initial(Case.load("9bus")).tolist() != drawn[0].p_initial(Case.load("9bus")).tolist()
 
 
 def test_methods_take_turns_in_an_order_that_rotates(fake, run, instances) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
+from ded_bench.report.ac_section import ac_blocks, ac_tables, draw_ac
 from ded_bench.report.gallery import Gallery
 from ded_bench.report.online_section import draw_online, online_blocks, online_tables
 from ded_bench.report.page import Block, Table
@@ -27,4 +28,7 @@ class Section:
 
 
 #: All of them.
-SECTIONS: tuple[Section, ...] = (Section(draw_online, online_tables, online_blocks),)
+SECTIONS: tuple[Section, ...] = (
+    Section(draw_ac, ac_tables, ac_blocks),
+    Section(draw_online, online_tables, online_blocks),
+)

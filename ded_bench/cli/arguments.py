@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Generator, Iterable
+import textwrap
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.surrogates import MODELS
-from ded_bench.methods.registry import METHODS, get_method
+from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
 from ded_bench.run.environment import version
 
 #: The shipped case that is meant where none is named.
 DEFAULT_CASE = "9bus"
-KNOWN = ", ".join(METHODS)
+RESULTS_HELP = "results folder; default: results/<case>"
+CASE_HELP = "name of a shipped case, or a folder"
 MODEL_HELP = f"{', '.join(MODELS)}, or a file"
-
 
 #: The order of the list of commands: those of the road, then what judges results, then the closed loop.
 ORDER = (
@@ -33,11 +34,38 @@ ROAD = (
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one-line errors."""
+    """argparse with one-line errors, and help that may end with what takes a moment to find out."""
+
+    ending: Callable[[], str] | None = None
+
+    def format_help(self) -> str:
+        """Options, then the ending."""
+        if self.ending is not None:
+            self.epilog = self.ending()
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with code 2."""
         self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists what there is)\n")
+
+
+class WithDefaults(argparse.RawDescriptionHelpFormatter):
+    """Help of one command: every default is told once."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=79)
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        default = action.default
+        if (
+            default is None
+            or default is False
+            or default == argparse.SUPPRESS
+            or "default:" in str(action.help)
+        ):
+            return action.help
+        value = ",".join(default) if isinstance(default, tuple) else default
+        return f"{action.help} (default: {value})"
 
 
 class OneLinePerCommand(argparse.HelpFormatter):
@@ -66,18 +94,33 @@ class ShowVersion(argparse.Action):
         parser.exit()
 
 
-def command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+def command(commands: Any, name: str, text: str) -> Parser:
     """Add a command; `text` is its line in the list of commands."""
-    made: argparse.ArgumentParser = commands.add_parser(
-        name, help=text, description=f"{text[:1].upper()}{text[1:]}."
+    made: Parser = commands.add_parser(
+        name, help=text, description=f"{text[:1].upper()}{text[1:]}.", formatter_class=WithDefaults
     )
+    made.set_defaults(task=text)
     return made
 
 
-def add_methods(p: argparse.ArgumentParser) -> None:
+def methods_text() -> str:
+    """Every method that has a name, of this package or another one, with its settings."""
+    lines = ["methods and their settings:"]
+    for method in registered().values():
+        try:
+            known = ", ".join(method.settings)
+        except InputError as error:
+            known = f"cannot be used: {error}"
+        text = f"  {method.name:<16} {known}"
+        lines += textwrap.wrap(text, 79, subsequent_indent=" " * 19, break_on_hyphens=False)
+    return "\n".join(lines)
+
+
+def add_methods(p: Parser) -> None:
     """Declare which methods answer, in which regimes, and with what."""
+    p.ending = methods_text
     p.add_argument(
-        "--method", type=names, required=True, metavar="M[,M]", help=f"{KNOWN}, or module:function"
+        "--method", type=names, required=True, metavar="M[,M]", help="as listed below, or module:function"
     )
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Sequence
 
@@ -35,7 +36,12 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a locale may lack arrows and Greek letters
+            stream.reconfigure(errors="replace")
     arguments = parser().parse_args(argv)
+    if sys.stderr.isatty():  # the first imports take a second, and some commands work for minutes
+        print(f"ded-bench: {arguments.task} ...", file=sys.stderr, flush=True)
     try:
         code: int = arguments.run(arguments)
         return code

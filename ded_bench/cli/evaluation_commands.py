@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
+    CASE_HELP,
     DEFAULT_CASE,
     MODEL_HELP,
+    RESULTS_HELP,
     command,
+    methods_text,
     names,
     natural,
     not_negative,
@@ -36,34 +39,35 @@ if TYPE_CHECKING:
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "bench", "time methods in turns, alone on the machine, one thread")
-    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
     p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
     p.add_argument("--repeats", type=positive, help="rounds; default: by the method's speed")
     p.add_argument("--force", action="store_true", help="time again what the table holds")
-    p.add_argument("--results", type=Path, help="results folder")
+    p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.add_argument("--out", type=Path, help="table of the run; default: timing.csv in the results folder")
+    p.ending = methods_text
     p.set_defaults(run=_bench)
 
     p = command(commands, "certify", "certify a policy on fresh instances")
-    p.add_argument("--method", default="ded-dpc")
+    p.add_argument("--method", default="ded-dpc", help="a policy")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--case", default=DEFAULT_CASE)
-    p.add_argument("--settings", default="default")
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    p.add_argument("--settings", default="default", help="of the policy")
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
     p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     p.add_argument("--count", type=positive, default=10_000, metavar="M", help="how many fresh instances")
-    p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--gap", type=positive_number, default=1.0, metavar="PERCENT", help="over ded-ko-knots")
     p.add_argument("--tolerance", type=positive_number, default=1e-6, metavar="HZ", help="of the frequency")
     p.add_argument("--delta", type=positive_number, default=0.01, help="1 - confidence")
-    p.add_argument("--workers", type=positive, default=1)
-    p.add_argument("--results", type=Path, help="results folder")
+    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
+    p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_certify)
 
     p = command(commands, "compare", "what changed between two results folders")
     p.add_argument("a", type=Path, metavar="A", help="the results folder that sets the standard")
-    p.add_argument("b", type=Path, metavar="B")
+    p.add_argument("b", type=Path, metavar="B", help="another one")
     p.add_argument("--tolerance", type=not_negative, default=1e-6, metavar="X", help="objective, relative")
     p.add_argument("--tolerance-hz", type=not_negative, default=1e-6, metavar="HZ", help="violations")
     p.add_argument("--tolerance-pu", type=not_negative, default=1e-8, metavar="PU", help="violations")
@@ -72,9 +76,9 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_compare)
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
-    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that draw figures")
-    p.add_argument("--results", type=Path, help="results folder")
+    p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_report)
 
 

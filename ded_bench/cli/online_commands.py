@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
+    CASE_HELP,
     DEFAULT_CASE,
+    RESULTS_HELP,
     add_methods,
     chosen_methods,
     command,
@@ -33,24 +35,24 @@ def add_commands(commands: Any) -> None:
     """Declare this command and its options."""
     p = command(commands, "online", "operate scenarios with a method's plans, one row each")
     add_methods(p)
-    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--scenarios", type=positive, metavar="N", help="only the first N of the case")
     chosen.add_argument("--scenario", type=Path, nargs="+", metavar="FILE", help="instead of the case's")
-    p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans (1 s)")
+    p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans")
     p.add_argument(
         "--latency",
         type=names,
         default=("timing",),
         metavar="L[,L]",
-        help="timing (default), zero, or seconds",
+        help="timing, zero, or seconds",
     )
     p.add_argument(
         "--forecast",
         type=_qualities,
         default=QUALITIES[:1],
         metavar="F[,F]",
-        help=f"{', '.join(QUALITIES)} (default: {QUALITIES[0]})",
+        help=", ".join(QUALITIES),
     )
     p.add_argument(
         "--state",
@@ -60,8 +62,8 @@ def add_commands(commands: Any) -> None:
     )
     p.add_argument("--cold", action="store_true", help="never start a method from its last plan")
     p.add_argument("--time-limit", type=positive_number, metavar="S", help="per plan, of the clock (60 s)")
-    p.add_argument("--workers", type=positive, default=1)
-    p.add_argument("--out", type=Path, help="results folder")
+    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
+    p.add_argument("--out", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_online)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ded_bench.cli.arguments import DEFAULT_CASE, command, natural, positive
+from ded_bench.cli.arguments import CASE_HELP, DEFAULT_CASE, command, natural, positive
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import problem_folder
@@ -28,12 +28,12 @@ def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "cases", "list the shipped cases, or check a case of your own")
     p.add_argument("case", nargs="?", help="a case to check: folder, case.json, or name of a shipped one")
-    p.add_argument("--count", type=positive, default=50, help="instances to draw and simulate (50)")
+    p.add_argument("--count", type=positive, default=50, help="instances to draw and simulate")
     p.set_defaults(run=_cases)
 
     p = command(commands, "instances", "draw the benchmark's instances (paper, Table III)")
     same = "default: as in the split that the case has, else"
-    p.add_argument("--case", default=DEFAULT_CASE, help="name of a shipped case, or a folder")
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--count", type=positive, help=f"how many to draw ({same} {COUNT})")
     p.add_argument("--test", type=positive, help=f"how many are for testing ({same} a fifth)")
     p.add_argument("--seed", type=natural, help=f"master seed ({same} {SEED})")
@@ -42,9 +42,9 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_instances)
 
     p = command(commands, "scenarios", "draw minutes of operation for the closed loop")
-    p.add_argument("--count", type=positive, default=SCENARIOS)
-    p.add_argument("--seed", type=natural, default=0)
-    p.add_argument("--case", default=DEFAULT_CASE, help="name of a shipped case, or a folder")
+    p.add_argument("--count", type=positive, default=SCENARIOS, help="how many to draw")
+    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--out", type=Path, help="default: scenarios in the case's own folder")
     p.add_argument("--force", action="store_true", help="replace other scenarios of a versioned case")
     p.set_defaults(run=_scenarios)

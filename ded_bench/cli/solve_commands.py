@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
+    CASE_HELP,
     DEFAULT_CASE,
+    RESULTS_HELP,
     add_methods,
     chosen_methods,
     command,
@@ -45,17 +47,17 @@ def _add_solve(commands: Any) -> None:
     p = command(commands, "solve", "solve instances with methods, score, one row each")
     add_methods(p)
     chosen = p.add_mutually_exclusive_group()
-    chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test")
+    chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
-    p.add_argument("--case", help="name of a shipped case, or a folder")
+    p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=positive, metavar="N", help="processes here (default: 1)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     p.add_argument(
         "--time-limit", type=positive_number, metavar="S", help="per solve; 60 s later it is killed"
     )
-    p.add_argument("--out", type=Path, help="results folder")
+    p.add_argument("--out", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_solve)
 
 
@@ -70,11 +72,11 @@ def _add_score(commands: Any) -> None:
     p.add_argument("--name", help="what the rows of --schedules call your method")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
     chosen = p.add_mutually_exclusive_group()
-    chosen.add_argument("--split", choices=SPLITS, default="test", help="default: test; not for --results")
+    chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances; not for --results")
     chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
-    p.add_argument("--case", help="name of a shipped case, or a folder")
-    p.add_argument("--workers", type=positive, default=1)
+    p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
+    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
     p.add_argument("--out", type=Path, help="results folder for the rows of --schedules")
     p.add_argument("--json", action="store_true", help="one JSON object per schedule")
     p.set_defaults(run=_score)

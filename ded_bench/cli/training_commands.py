@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from ded_bench.cli.arguments import (
+    CASE_HELP,
     DEFAULT_CASE,
     MODEL_HELP,
     command,
     matching,
+    methods_text,
     names,
     natural,
     positive,
@@ -33,8 +35,8 @@ def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "train-ko", "identify the Koopman model from simulated trajectories")
     p.add_argument("--kind", choices=TRAINED, default=TRAINED[0], help="ours, or the paper's recipe")
-    p.add_argument("--case", default=DEFAULT_CASE)
-    p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
@@ -45,23 +47,24 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
     p.add_argument("--settings", default="default", metavar="S[,S]", help="of the training; may hold *")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
-    p.add_argument("--seed", type=natural, default=0)
+    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     budget = p.add_mutually_exclusive_group()
     budget.add_argument("--seconds", type=positive_number, metavar="S", help="train for so long")
-    budget.add_argument("--epochs", type=positive, metavar="N")
+    budget.add_argument("--epochs", type=positive, metavar="N", help="train for so many")
     p.add_argument("--limit", type=positive, help="only the first so many training instances")
-    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train")
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
+    p.ending = methods_text
     p.set_defaults(run=_train_dpc)
 
     p = command(commands, "rollouts", "errors of the surrogates under several kinds of schedules")
-    p.add_argument("--case", default=DEFAULT_CASE)
+    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--results", type=Path, help="results folder: gives models and optimal schedules")
     p.add_argument("--limit", type=positive, default=10, help="how many test instances' optimal schedules")
     p.add_argument("--draws", type=positive, default=30, metavar="N", help="drawn schedules, of all kinds")

@@ -1,4 +1,4 @@
-"""Commands that tell what results mean: bench, certify, compare, report."""
+"""Commands that tell what results mean: bench, certify, compare, report, overview."""
 
 from __future__ import annotations
 
@@ -80,6 +80,17 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that draw figures")
     p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_report)
+
+    p = command(commands, "overview", "one page over several grids: gaps, violations, time and memory")
+    p.add_argument(
+        "--results",
+        type=Path,
+        nargs="+",
+        metavar="DIR",
+        help="one case each; default: each shipped case's own results, else its reference run",
+    )
+    p.add_argument("--out", type=Path, default=Path("results/overview"), help="default: results/overview")
+    p.set_defaults(run=_overview)
 
 
 def _bench(a: argparse.Namespace) -> int:
@@ -181,4 +192,16 @@ def _report(a: argparse.Namespace) -> int:
         written = write_report(case, folder, problem_folder(a.case, case), pool)
         OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
+    return 0
+
+
+def _overview(a: argparse.Namespace) -> int:
+    from ded_bench.report.grids import default_folders
+    from ded_bench.report.overview import write_overview
+
+    folders = a.results or default_folders()
+    if not folders:
+        raise InputError("results", "", "holds no results of a shipped case; run `ded-bench solve` first")
+    written = write_overview(folders, a.out)
+    print(f"wrote {len(written)} files; read {a.out / 'overview.html'} or {a.out / 'overview.md'}")
     return 0

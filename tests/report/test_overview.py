@@ -1,0 +1,139 @@
+"""One page over several grids: what is read, tables across them, exponents, figures."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ded_bench.cli import main
+from ded_bench.evaluate.timing import TIMING, TimingRow
+from ded_bench.files.arrays import write_arrays
+from ded_bench.files.errors import InputError
+from ded_bench.files.results_folder import ResultsFolder
+from ded_bench.report.figures.growth import gap_figure, growth_figure
+from ded_bench.report.grids import across, read_grid, slopes
+from ded_bench.report.overview import write_overview
+from ded_bench.run.ac_scoring import AcResults, AcRow
+from ded_bench.run.results import Results, Row
+from tests.reading import Page
+from tests.report.test_figures import check_layout
+
+#: Generators of the shipped cases that the tests have rows of.
+GENERATORS = {"9bus": 2, "two-area": 3, "39bus": 9}
+
+
+def results_of(folder: Path, case: str) -> Path:
+    """The reference and ded-slp, 1 % above it, on two instances; times grow as generators squared."""
+    names = ("ded" if case == "9bus" else "ded-radau", "ded-slp")
+    facts = {"feasible": True, "feasible_strict": True, "freq_violation_hz": 0.0, "ramp_violation": 0.0}
+    facts |= {"bound_violation": 0.0, "initial_violation": 0.0, "case": case}
+    rows = [
+        Row(instance, "test", "TO", name, "default", "Optimal", objective=100.0 + place, **facts)
+        for instance in ("a", "b")
+        for place, name in enumerate(names)
+    ]
+    rows[-1] = dataclasses.replace(rows[-1], freq_violation_hz=1e-3, feasible=False)
+    Results(folder).add(rows)
+    seconds = 0.1 * GENERATORS[case] ** 2
+    times = TimingRow("r", 1, "TO", "ded-slp", "default", "a", "Optimal", solve_s=seconds, case=case)
+    TIMING.write(folder / "timing.csv", [dataclasses.replace(times, peak_memory_mib=300.0, host="h")])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("results")
+    made = [results_of(folder / case, case) for case in GENERATORS]
+    scored = AcRow("a", "TO", "ded-slp", "default", freq_violation_hz=2e-3, feasible=False, case="two-area")
+    AcResults(folder / "two-area").add([scored])
+    header = {"training": {"seconds": 12.5, "trajectories": 120}}
+    write_arrays(ResultsFolder(folder / "39bus").model("koopman"), {"k": np.zeros(1)}, header)
+    return made
+
+
+def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
+    """From the smallest grid to the largest, whatever the order of the folders."""
+    out = tmp_path / "overview"
+    assert main(["overview", "--results", *map(str, folders[::-1]), "--out", str(out)]) == 0
+
+    def table(name: str) -> pd.DataFrame:
+        return pd.read_csv(out / "tables" / f"{name}.csv").set_index(["regime", "title"])
+
+    assert list(pd.read_csv(out / "tables" / "grids.csv")["generators"]) == list(GENERATORS.values())
+    gaps = table("gaps")
+    assert list(gaps.columns) == list(GENERATORS)
+    assert gaps.loc[("TO", "DED (SLP)")].to_list() == ["+1 (2)"] * 3
+    assert gaps.loc[("TO", "DED (Radau)")].to_list() == ["–", "reference", "reference"]
+    assert table("verified").loc[("TO", "DED (SLP)"), "39bus"] == "100% → 50%"
+    assert table("violations").loc[("TO", "DED (SLP)"), "39bus"] == "0.001"
+    assert table("ac").loc[("TO", "DED (SLP)")].to_list() == ["–", "0%, 0.002", "–"]
+    fitted = table("slopes").loc[("TO", "DED (SLP)")]
+    assert fitted["solve_s"] == pytest.approx(2.0)
+    assert fitted["peak_memory_mib"] == pytest.approx(0.0, abs=1e-9)
+    trained = pd.read_csv(out / "tables" / "trainings.csv").to_dict("records")
+    assert [(row["case"], row["name"], row["seconds"]) for row in trained] == [("39bus", "koopman", 12.5)]
+    page = Page((out / "overview.html").read_text())
+    assert not page.open
+    assert len(list(page.every("img"))) == 2
+    assert "In TO, time grows with the number of generators to the power of: DED (SLP) 2.0." in page.text
+
+
+def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Path) -> None:
+    folder = results_of(tmp_path / "one", "9bus")
+    (folder / "timing.csv").unlink()
+    write_overview([folder], tmp_path / "out")
+    text = (tmp_path / "out" / "overview.md").read_text()
+    assert "No method was timed alone yet" in text
+    assert "Too few grids were timed" in text
+
+
+def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_path, capsys) -> None:
+    with pytest.raises(InputError, match="is missing"):
+        read_grid(tmp_path)
+    row = Row("a", "test", "TO", "ed", "default", "Optimal", objective=1.0, case="9bus")
+    Results(tmp_path / "two").add([row, dataclasses.replace(row, instance="b", case="39bus")])
+    with pytest.raises(InputError, match="is not one: 39bus, 9bus"):
+        read_grid(tmp_path / "two")
+    assert main(["overview", "--results", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
+    assert "typo/results.csv: is missing" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def points(**values: list[float]) -> pd.DataFrame:
+    """Rows of one method in one regime on three grids."""
+    facts = {"case": list("abc"), "generators": [2, 4, 8], "regime": "TO", "method": "ed", "title": "ED"}
+    return pd.DataFrame(facts | {"settings": "default", "correct_rate": [1.0, 0.5, 1.0]} | values)
+
+
+def test_exponents_of_a_power_law() -> None:
+    table = points(solve_s=[3.0, 3.0 * 2**1.5, 3.0 * 4**1.5], peak_memory_mib=[1.0, 2.0, np.nan])
+    (row,) = slopes(table, ["solve_s", "peak_memory_mib"]).to_dict("records")
+    assert row["solve_s"] == pytest.approx(1.5)
+    assert row["solve_s_grids"] == 3
+    assert np.isnan(row["peak_memory_mib"])  # two grids have no exponent
+    assert row["peak_memory_mib_grids"] == 2
+
+
+def test_a_method_without_any_cell_has_no_row() -> None:
+    table = points(solve_s=[1.0, 2.0, 3.0])
+    assert across(table, lambda row: "")["title"].to_list() == []
+    (row,) = across(table, lambda row: "x" * (row["case"] == "b")).to_dict("records")
+    assert json.loads(json.dumps(row)) == {"regime": "TO", "title": "ED", "a": "–", "b": "x", "c": "–"}
+
+
+def test_figures_over_grids(tmp_path: Path) -> None:
+    """Both axes logarithmic; hollow where some schedules are infeasible."""
+    table = points(solve_s=[1.0, 2.0, 4.0], gap_percent_mean=[0.0, 0.1, -1.0])
+    figure = growth_figure(table, [("solve_s", "time (s)")])
+    (ax,) = figure.axes
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    curve, hollow = ax.get_lines()
+    assert list(curve.get_xdata()) == [2, 4, 8]
+    assert (list(hollow.get_xdata()), hollow.get_markerfacecolor()) == ([4], "white")
+    check_layout(figure, tmp_path)
+    check_layout(gap_figure(table), tmp_path)

@@ -36,6 +36,8 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "executable": {"solver": "ipopt-executable", "options": LINEAR_OPTIONS},
     "highs": {"solver": "highs"},
 }
+#: Limit of the default settings where none is given: HiGHS, the last resort, knows no end on large grids.
+TIME_LIMIT_S = 1800.0
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -63,7 +65,8 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
 
     def solve(instance: Instance) -> Solution:
         points = np.arange(instance.steps + 1)
-        return solve_on_surrogate(case, surrogate, instance, regime, points, settings.time_limit_s)
+        limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
+        return solve_on_surrogate(case, surrogate, instance, regime, points, limit_s)
 
     return solve
 

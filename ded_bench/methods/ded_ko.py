@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix, reset
 from ded_bench.solvers.ipopt import LINEAR_OPTIONS
 from ded_bench.solvers.outcome import Compiled
+from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 
 #: Solver of the Pyomo model and its options by settings slug.
@@ -38,6 +39,8 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
 }
 #: Limit of the default settings where none is given: HiGHS, the last resort, knows no end on large grids.
 TIME_LIMIT_S = 1800.0
+#: Memory that a program takes for each entry of its equations (39bus), and may take in all.
+BYTES_PER_ENTRY, MAX_BYTES = 150, 4 * 2**30
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -65,10 +68,22 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
 
     def solve(instance: Instance) -> Solution:
         points = np.arange(instance.steps + 1)
+        if (needed := _bytes(case, surrogate, instance.steps)) > MAX_BYTES:
+            problem = f"the program of {len(points)} points would take {needed / 2**30:.0f} GiB"
+            return Solution(Status.FAILED, error=f"{problem}; `ded-ko-knots` takes fewer")
         limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
-        return solve_on_surrogate(case, surrogate, instance, regime, points, limit_s)
+        # Softly, since one widening for all of thousands of intervals would be a dense column.
+        solution = solve_on_surrogate(case, surrogate, instance, regime, points, limit_s, soft=True)
+        return replace(solution, schedule=None) if solution.status == Status.INFEASIBLE else solution
 
     return solve
+
+
+def _bytes(case: Case, surrogate: Surrogate, steps: int) -> int:
+    """Roughly what the program of all points takes in memory."""
+    n_gen = len(case.generators)
+    n_state = len(surrogate.k) if isinstance(surrogate, Koopman) else 2 * n_gen
+    return BYTES_PER_ENTRY * steps * n_state * (n_state + 2 * n_gen + 1)
 
 
 def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:

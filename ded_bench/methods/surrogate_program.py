@@ -10,7 +10,6 @@ import time
 import numpy as np
 
 from ded_bench.koopman.instance_model import model_along
-from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import Surrogate
 from ded_bench.koopman.trajectory import Indices
 from ded_bench.methods import ed
@@ -30,8 +29,6 @@ OMEGA_TOLERANCE = 2 * np.pi * 5e-7
 #: error grows with the square of the distance (two-area, TO, validation draws: 0.48 mHz at 1, 0.06 at 0.3,
 #: 0.03 at 0.2 and 0.1, 0.05 at 0.05).
 PACE = 0.2
-#: Memory that a program takes for each entry of its equations (39bus, all points), and may take in all.
-BYTES_PER_ENTRY, MAX_BYTES = 150, 4 * 2**30
 
 
 def solve_on_surrogate(
@@ -62,9 +59,6 @@ def solve_on_surrogate(
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
     if not is_reachable(case, instance, points):
         return _without(Status.INFEASIBLE, Status.INFEASIBLE.sentence, started)
-    if (needed := _bytes(case, surrogate, points)) > MAX_BYTES:
-        problem = f"the program of {len(points)} knots would take {needed / 2**30:.0f} GiB; take fewer"
-        return _without(Status.FAILED, problem, started)
     dispatched, model = reference(case, instance, points), None
     for p_gen in first_schedules(case, instance, dispatched, points):
         try:
@@ -76,10 +70,8 @@ def solve_on_surrogate(
         return _without(Status.FAILED, reason, started)
     program = KnotProgram(case, instance, case.omega_bound(regime), model)
     built = time.perf_counter()
-    # One widening for all of thousands of intervals would be a dense column.
-    is_every_point = len(points) == instance.steps + 1
     attempt = solve_with_rows_added(
-        program, set(), OMEGA_TOLERANCE, OMEGA_TOLERANCE, deadline, by_interval=soft or is_every_point
+        program, set(), OMEGA_TOLERANCE, OMEGA_TOLERANCE, deadline, by_interval=soft
     )
     schedule, objective, reason = None, None, ""
     if attempt.prediction is not None and (soft or attempt.status == Status.OPTIMAL):
@@ -99,13 +91,6 @@ def solve_on_surrogate(
         solver_version=attempt.version,
         error=reason,
     )
-
-
-def _bytes(case: Case, surrogate: Surrogate, points: Indices) -> int:
-    """Roughly what a program takes in memory."""
-    n_gen = len(case.generators)
-    n_state = len(surrogate.k) if isinstance(surrogate, Koopman) else 2 * n_gen
-    return BYTES_PER_ENTRY * (len(points) - 1) * n_state * (n_state + 2 * n_gen + 1)
 
 
 def reference(case: Case, instance: Instance, points: Indices) -> Array:

@@ -17,7 +17,7 @@ from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.linear import linear_model, nominal_model
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import find_surrogate
-from ded_bench.methods import ded_ko, ded_ko_knots, knot_program, surrogate_program
+from ded_bench.methods import ded_ko, ded_ko_knots, knot_program
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
 from ded_bench.methods.knot_program import knot_points
@@ -401,7 +401,7 @@ def test_one_form_for_every_surrogate(case: Case, name: str) -> None:
 
 
 def test_a_program_too_large_is_refused_at_once(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surrogate_program, "MAX_BYTES", 2**20)
+    monkeypatch.setattr(ded_ko, "MAX_BYTES", 2**20)
     for method, fits in ((ded_ko, False), (ded_ko_knots, True)):
         solution = method.prepare(ninebus, "NO", Settings(model="linear"))(short(ninebus, 0))
         assert (solution.status == Status.OPTIMAL) == fits

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pandas as pd
 
@@ -85,14 +86,19 @@ def draw_online(gallery: Gallery) -> Iterator[Call]:
     yield from _draw_scenarios(gallery, results, frame)
 
 
+def own_lines(folder: Path, case: Case) -> pd.DataFrame:
+    """The lines of the table OWN: methods at their own latency; none without rows."""
+    return _titled(own_latency(online_rows(OnlineResults(folder), case.id)))
+
+
 def online_tables(gallery: Gallery) -> dict[str, Table]:
     """The tables that have rows, by the name of their file."""
-    frame = online_rows(OnlineResults(gallery.sources.results.folder), gallery.sources.case.id)
-    own, table = own_latency(frame), crossed(sweeps(frame))
+    case, folder = gallery.sources.case, gallery.sources.results.folder
+    own, table = own_lines(folder, case), crossed(sweeps(online_rows(OnlineResults(folder), case.id)))
     tables = {}
     if len(own):
         caption = "Methods in the closed loop at their own latency, forecasts as announced"
-        tables["online_methods"] = Table(_titled(own), OWN, caption)
+        tables["online_methods"] = Table(own, OWN, caption)
     if len(table):
         known = tuple(c for c in CROSSED if c.name in table or c.name == "title")
         caption = "What latency costs, by what is known: means over the same scenarios"

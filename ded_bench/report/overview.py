@@ -14,6 +14,7 @@ from ded_bench.report.columns import Column
 from ded_bench.report.figures.growth import gap_figure, growth_figure
 from ded_bench.report.figures.style import save_figure
 from ded_bench.report.grids import Grid, across, points, read_grid, sizes, slopes, trainings
+from ded_bench.report.online_section import OWN, own_lines
 from ded_bench.report.page import (
     Block,
     Heading,
@@ -123,6 +124,10 @@ def _tables(grids: Sequence[Grid], found: pd.DataFrame) -> dict[str, Table]:
     trained = trainings(grids)
     if len(trained):
         tables["trainings"] = Table(trained, TRAININGS, "What was trained")
+    operated = pd.concat([own_lines(grid.folder, grid.case).assign(case=grid.case.id) for grid in grids])
+    if len(operated):
+        caption = "The closed loop: methods at their own latency, forecasts as announced"
+        tables["online"] = Table(operated, (Column("case", "Grid"), *OWN), caption)
     return tables
 
 
@@ -180,6 +185,7 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
         *part("Claimed and verified", "verified", "violations", "ac"),
         *part("Time and memory against size", "growth", "slopes", "times", "memory"),
         *missing,
+        *part("The closed loop", "online"),
         *part("Trainings", "trainings"),
         Heading("Where the rows come from"),
         Items((*items, f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}.")),

@@ -16,6 +16,7 @@ from ded_bench.online.online_summary import online_rows, own_latency, sweeps
 from ded_bench.online.planner import Plan
 from ded_bench.problem.scenario_sampling import sample_scenario
 from ded_bench.report.figures.online import forecast_figure, latency_figure
+from ded_bench.report.overview import write_overview
 from ded_bench.report.report import write_report
 from ded_bench.run.results import Results, Row
 
@@ -57,6 +58,22 @@ def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     Results(tmp_path / "other").add([Row("x", "test", "TO", "ed", "1s", "Feasible", objective=1.0)])
     write_report(threebus, tmp_path / "other", tmp_path / "no-problems")
     assert "The closed loop" not in (tmp_path / "other" / "report.md").read_text()
+
+
+def test_the_overview_sets_grids_side_by_side(tmp_path):
+    """Only grids that were operated have lines."""
+    row = OnlineRow("s", "TO", "ed", "1s", 1.0, 0.5, "announced", True, True, objective=1.0)
+    for case in ("9bus", "two-area"):
+        Results(tmp_path / case).add(
+            [Row("x", "test", "TO", "ed", "1s", "Feasible", objective=1.0, case=case)]
+        )
+    known = {"increase_percent": 0.25, "latency_source": "timing", "case": "two-area"}
+    OnlineResults(tmp_path / "two-area").table.add([dataclasses.replace(row, **known)])
+    write_overview([tmp_path / case for case in ("9bus", "two-area")], tmp_path / "out")
+    lines = pd.read_csv(tmp_path / "out" / "tables" / "online.csv")
+    assert lines[["case", "title", "increase_percent_mean"]].to_numpy().tolist() == [
+        ["two-area", "ED [1s]", 0.25]
+    ]
 
 
 def test_figures_show_the_numbers(threebus, folder):

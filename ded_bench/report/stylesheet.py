@@ -32,7 +32,7 @@ figure { margin: 1rem 0; }
 figcaption { color: var(--soft); font-size: 0.9rem; max-width: 46rem; margin: 0.5rem 0; }
 .table figcaption { color: var(--ink); font-weight: 600; }
 .scroll { overflow-x: auto; }
-img { display: block; max-width: 100%; min-width: min(100%, 34rem); height: auto; }
+img { display: block; max-width: min(100%, 56rem); min-width: min(100%, 34rem); height: auto; }
 table { border-collapse: collapse; font-size: 0.875rem; line-height: 1.35; font-variant-numeric: tabular-nums;
   border-top: 2px solid var(--ink); border-bottom: 2px solid var(--ink); }
 th { text-align: left; vertical-align: bottom; border-bottom: 1px solid var(--ink); }

@@ -7,7 +7,7 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
     CASE_HELP,
@@ -27,8 +27,12 @@ from ded_bench.files.strict import write_atomically
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import TRAINED, default_results
 from ded_bench.methods.registry import trainable
+from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.benchmark import problem_folder, select_split
 from ded_bench.problem.case import Case
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def add_commands(commands: Any) -> None:
@@ -38,6 +42,8 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
+    p.add_argument("--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac.npz")
+    p.add_argument("--noise", type=positive_number, metavar="HZ", help="of measured frequencies (--truth ac)")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
@@ -78,12 +84,18 @@ def _train_ko(a: argparse.Namespace) -> int:
     from ded_bench.koopman.linear import nominal_model
     from ded_bench.koopman.surrogates import model_file
 
-    case = Case.load(a.case)
-    out = a.out or model_file(a.results or default_results(case), a.kind)
+    case, is_ac = Case.load(a.case), a.truth == "ac"
+    if a.noise and not is_ac:
+        raise InputError("--noise", f"{a.noise:g}", "is for --truth ac")
+    if is_ac and a.kind != TRAINED[0]:
+        raise InputError("--kind", a.kind, "is not for --truth ac")
+    out = a.out or model_file(a.results or default_results(case), f"{a.kind}-ac" if is_ac else a.kind)
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
+    if is_ac:
+        return _train_ko_ac(a, case, out)
     if a.kind == "koopman":
         model = identify(case, a.seed, a.count)
     else:
@@ -91,7 +103,21 @@ def _train_ko(a: argparse.Namespace) -> int:
             from ded_bench.koopman.identify_paper import identify_paper
         model = identify_paper(case, a.seed, a.count)
     model.save(out)
-    table = rollout_table(case, [nominal_model(case), model], held_out(case, a.seed))
+    return _told(out, rollout_table(case, [nominal_model(case), model], held_out(case, a.seed)))
+
+
+def _train_ko_ac(a: argparse.Namespace, case: Case, out: Path) -> int:
+    from ded_bench.evaluate.ac_rollouts import ac_rollout_table
+    from ded_bench.koopman.identify_ac import identify_ac
+
+    data = AcCase.of(case)
+    model = identify_ac(case, data, a.seed, a.count, a.noise or 0.0)
+    model.save(out)
+    return _told(out, ac_rollout_table(case, data, model, a.seed))
+
+
+def _told(out: Path, table: pd.DataFrame) -> int:
+    """Write and print a new model's errors."""
     write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))
     print(table.to_string(index=False, float_format="{:.3g}".format))
     print(f"wrote {out}")

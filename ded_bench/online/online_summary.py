@@ -65,21 +65,21 @@ def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
-    """One line per regime, method, latency and kind, of methods swept over latencies.
+    """One line per regime, method, latency and kind, of methods swept over latencies, their own included.
 
     Only scenarios count that were operated at every latency of the kind's own sweep under announcements,
     so that lines of one method are about the same scenarios.
     """
-    given = frame[(frame["latency_source"] != "timing") & frame["warm"].astype(bool)]
+    frame = frame[frame["warm"].astype(bool)]
     parts = []
-    for _, rows in given.groupby(RUN, sort=False):
+    for _, rows in frame.groupby(RUN, sort=False):
         announced = rows[rows["kind"] == QUALITIES[0]]
         if announced["latency_s"].nunique() < SWEPT:
             continue
         counts = announced.groupby("scenario")["latency_s"].nunique()
         complete = counts.index[counts == announced["latency_s"].nunique()]
         parts.append(rows[rows["scenario"].isin(complete)])
-    swept = pd.concat(parts) if parts else given.iloc[:0]
+    swept = pd.concat(parts) if parts else frame.iloc[:0]
     return _lines(swept, [*LOOP, "kind"])
 
 

@@ -50,7 +50,7 @@ OWN = (
 )
 CROSSED = (
     *_HEAD,
-    Column("latency_s", "latency", "s", "g"),
+    Column("latency_s", "latency", "s", ".3g"),
     Column("n", "n"),
     *(Column(f"increase_percent_mean_{kind}", f"cost: {KIND_NAMES[kind]}", "%", ".4f") for kind in KINDS),
     *(Column(f"max_excess_mhz_mean_{kind}", f"excess: {KIND_NAMES[kind]}", "mHz", ".4f") for kind in KINDS),

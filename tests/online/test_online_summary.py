@@ -67,6 +67,7 @@ def test_sweeps_are_about_the_same_scenarios(results):
     assert found == pytest.approx(
         {
             ("announced", 0.0): 1.5,
+            ("announced", 0.5): 2.0,
             ("announced", 1.0): 2.5,
             ("announced", 3.0): 4.5,
             ("perfect", 0.0): 0.5,
@@ -74,10 +75,10 @@ def test_sweeps_are_about_the_same_scenarios(results):
         }
     )
     wide = crossed(lines)
-    assert wide["latency_s"].tolist() == [0.0, 1.0, 3.0]
-    assert wide["increase_percent_mean_announced"].tolist() == pytest.approx([1.5, 2.5, 4.5])
-    assert wide["increase_percent_mean_present"].isna().tolist() == [True, True, False]
-    assert wide["max_excess_mhz_mean_announced"].tolist() == pytest.approx([0.0, 1.0, 3.0])
+    assert wide["latency_s"].tolist() == [0.0, 0.5, 1.0, 3.0]
+    assert wide["increase_percent_mean_announced"].tolist() == pytest.approx([1.5, 2.0, 2.5, 4.5])
+    assert wide["increase_percent_mean_present"].isna().tolist() == [True, True, True, False]
+    assert wide["max_excess_mhz_mean_announced"].tolist() == pytest.approx([0.0, 0.5, 1.0, 3.0])
 
 
 def test_nothing_gives_empty_tables(tmp_path):

@@ -79,8 +79,7 @@ def test_the_overview_sets_grids_side_by_side(tmp_path):
 def test_figures_show_the_numbers(threebus, folder):
     """A method's marker lies at its latency; a forecast starts at what is measured."""
     frame = online_rows(OnlineResults(folder), "threebus")
-    given = frame.assign(latency_source="given")
-    figure = latency_figure(sweeps(given), own_latency(frame), "")
+    figure = latency_figure(sweeps(frame), own_latency(frame), "")
     cost = figure.axes[0]
     swept, own = cost.get_lines()[0], cost.get_lines()[1]
     assert list(swept.get_xdata()) == [0.0, 0.5, 2.0]

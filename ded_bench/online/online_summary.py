@@ -10,6 +10,8 @@ from ded_bench.problem.forecast import QUALITIES
 #: What rows of one line of a table share, besides the scenario.
 LOOP = ["regime", "method", "settings", "period_s", "latency_s", "forecast", "predicted", "warm"]
 RUN = ["regime", "method", "settings"]
+#: The operator's practice that others are set beside.
+STATIC = ("ed", "1s")
 #: A method with so many latencies at one forecast was swept.
 SWEPT = 3
 #: Forecasts of a sweep, and plans from the present state under announcements.
@@ -20,7 +22,7 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     """Rows of a case in the order of the table; `kind` is the forecast, or `present`.
 
     `over_known_percent` is the cost over the same method's on the scenario with a perfect forecast and no
-    latency, %.
+    latency, %; `static_objective` and `static_excess_hz` are those of static dispatch of every second.
     """
     frame = ONLINE.frame(row for row in results.table.rows.values() if row.case == case)
     announced = frame["forecast"] == QUALITIES[0]
@@ -31,7 +33,16 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     best = best[~best.index.duplicated()]
     same = best.reindex(pd.MultiIndex.from_frame(frame[[*RUN, "scenario"]])).to_numpy()
     frame["over_known_percent"] = 100 * (frame["objective"].to_numpy() / same - 1)
-    return frame
+    return frame.join(_static(frame), on=["regime", "scenario"])
+
+
+def _static(frame: pd.DataFrame) -> pd.DataFrame:
+    """Cost and excess of static dispatch of every second, by regime and scenario."""
+    static = (frame["method"] == STATIC[0]) & (frame["settings"] == STATIC[1]) & (frame["period_s"] == 1)
+    own = frame[static & (frame["latency_source"] == "timing") & (frame["kind"] == QUALITIES[0])]
+    found = own.drop_duplicates(["regime", "scenario"], keep="last").set_index(["regime", "scenario"])
+    names = {"objective": "static_objective", "max_excess_hz": "static_excess_hz"}
+    return found[list(names)].rename(columns=names)
 
 
 def line(rows: pd.DataFrame) -> dict[str, object]:
@@ -47,6 +58,8 @@ def line(rows: pd.DataFrame) -> dict[str, object]:
         "increase_percent_mean": done["increase_percent"].mean(),
         "increase_percent_max": done["increase_percent"].max(),
         "over_known_percent_mean": done["over_known_percent"].mean(),
+        "over_static_percent_mean": 100 * (done["objective"] / done["static_objective"] - 1).mean(),
+        "static_excess_mhz_mean": 1e3 * done["static_excess_hz"].mean(),
         "max_excess_mhz_mean": 1e3 * done["max_excess_hz"].mean(),
         "max_excess_mhz_max": 1e3 * done["max_excess_hz"].max(),
         "mean_excess_mhz": 1e3 * done["mean_excess_hz"].mean(),
@@ -67,8 +80,8 @@ def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
 def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method, latency and kind, of methods swept over latencies, their own included.
 
-    Only scenarios count that were operated at every latency of the kind's own sweep under announcements,
-    so that lines of one method are about the same scenarios.
+    Only scenarios count that were operated in all of a method's lines, so that these are about the same
+    scenarios; what was operated on fewer than half as many scenarios as another line has none.
     """
     frame = frame[frame["warm"].astype(bool)]
     parts = []
@@ -76,9 +89,11 @@ def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
         announced = rows[rows["kind"] == QUALITIES[0]]
         if announced["latency_s"].nunique() < SWEPT:
             continue
-        counts = announced.groupby("scenario")["latency_s"].nunique()
-        complete = counts.index[counts == announced["latency_s"].nunique()]
-        parts.append(rows[rows["scenario"].isin(complete)])
+        scenarios = [set(line["scenario"]) for _, line in rows.groupby(["latency_s", "kind"])]
+        most = max(map(len, scenarios))
+        common = set.intersection(*(some for some in scenarios if 2 * len(some) >= most))
+        kept = rows.groupby(["latency_s", "kind"])["scenario"].transform("nunique") * 2 >= most
+        parts.append(rows[kept & rows["scenario"].isin(common)])
     swept = pd.concat(parts) if parts else frame.iloc[:0]
     return _lines(swept, [*LOOP, "kind"])
 
@@ -92,7 +107,7 @@ def crossed(lines: pd.DataFrame) -> pd.DataFrame:
         index=index, columns="kind", values=["increase_percent_mean", "max_excess_mhz_mean"], sort=False
     )
     wide.columns = pd.Index(["_".join(pair) for pair in wide.columns])
-    counts = lines[lines["kind"] == QUALITIES[0]].set_index(index)["n"]
+    counts = lines.groupby(index)["n"].first()
     return wide.assign(n=counts).reset_index().sort_values(index, kind="stable", ignore_index=True)
 
 

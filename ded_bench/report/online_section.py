@@ -9,7 +9,7 @@ import pandas as pd
 
 from ded_bench.evaluate.summary import title
 from ded_bench.online.online_results import OnlineKey, OnlineResults, read_trajectory
-from ded_bench.online.online_summary import KINDS, RUN, crossed, online_rows, own_latency, sweeps
+from ded_bench.online.online_summary import KINDS, RUN, STATIC, crossed, online_rows, own_latency, sweeps
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
@@ -28,7 +28,6 @@ from ded_bench.run.pool import Call
 
 #: So many methods are drawn on one scenario: static dispatch of every second, then those of least excess.
 SHOWN = 3
-STATIC = ("ed", "1s")
 
 _HEAD = (Column("regime", "Regime"), Column("title", "Method"))
 OWN = (
@@ -40,8 +39,10 @@ OWN = (
     Column("increase_percent_mean", "cost over hindsight", "%", ".4f"),
     Column("increase_percent_max", "largest", "%", ".4f"),
     Column("over_known_percent_mean", "over perfect forecast and no latency", "%", ".4f"),
+    Column("over_static_percent_mean", "over ED every second", "%", ".4f"),
     Column("max_excess_mhz_mean", "largest excess, mean", "mHz", ".4f"),
     Column("max_excess_mhz_max", "largest", "mHz", ".4f"),
+    Column("static_excess_mhz_mean", "ED every second there, mean", "mHz", ".4f"),
     Column("share_outside", "time outside", form=".2%"),
     Column("slack_travel_pu", "slack travel", "pu", ".2f"),
     Column("late", "plans late", form=".1%"),

@@ -43,6 +43,8 @@ def results(tmp_path) -> OnlineResults:
     rows += [row(s, 0.5, 102.0, latency_source="timing", late=1, infeasible=4) for s in "ab"]
     rows += [row("c", 0.5, None, latency_source="timing", plans=0, failed=0, error="loses synchronism")]
     rows += [row("a", 0.5, 103.0, method="ed", latency_source="timing", case="elsewhere")]
+    static = {"method": "ed", "settings": "1s", "latency_source": "timing"}
+    rows += [row(s, 0.002, 102.0 + i, **static) for i, s in enumerate("ab")]
     kept = OnlineResults(tmp_path)
     kept.table.add(rows)
     return kept
@@ -50,7 +52,10 @@ def results(tmp_path) -> OnlineResults:
 
 def test_methods_at_their_own_latency(results):
     """Rows of this case alone; failures count, but not in means; plans are counted over all."""
-    (one,) = own_latency(online_rows(results, "here")).to_dict("records")
+    one, static = own_latency(online_rows(results, "here")).to_dict("records")
+    assert one["over_static_percent_mean"] == pytest.approx(50 * (102.0 / 103.0 - 1))
+    assert one["static_excess_mhz_mean"] == static["max_excess_mhz_mean"] == pytest.approx(0.002)
+    assert static["over_static_percent_mean"] == 0.0
     assert (one["method"], one["latency_s"], one["n"], one["failures"]) == ("ded-slp", 0.5, 2, 1)
     assert one["increase_percent_mean"] == pytest.approx(2.0)
     assert one["over_known_percent_mean"] == pytest.approx(100 * (102.0 / 100.5 - 1))
@@ -60,7 +65,7 @@ def test_methods_at_their_own_latency(results):
 
 
 def test_sweeps_are_about_the_same_scenarios(results):
-    """One that lacks a latency does not count, nor do cold starts and other present states."""
+    """Cold starts and other present states do not count, nor what few scenarios were operated under."""
     lines = sweeps(online_rows(results, "here"))
     assert set(lines["n"]) == {2}
     found = lines.set_index(["kind", "latency_s"])["increase_percent_mean"].to_dict()

@@ -1,0 +1,95 @@
+"""The wheel by itself, without torch, in an empty folder: methods answer, and a report shows their gaps."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ded_bench.problem.case import REPOSITORY
+
+WITHOUT_TORCH = """
+import sys
+
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+sys.meta_path.insert(0, Missing())
+from ded_bench.cli import main
+
+sys.exit(main())
+"""
+SETUP = "import setuptools; setuptools.setup()"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from this checkout, outside of it, with what is installed here."""
+    folder = tmp_path_factory.mktemp("wheel")
+    steps = ["egg_info", "--egg-base", folder, "build", "--build-base", folder / "build", "bdist_wheel"]
+    command = [sys.executable, "-c", SETUP, "-q", *steps, "--bdist-dir", folder / "b", "-d", folder / "dist"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    (built,) = (folder / "dist").glob("*.whl")
+    return built
+
+
+@pytest.fixture
+def command(wheel: Path, tmp_path: Path) -> list[str]:
+    """`ded-bench` from the unpacked wheel, where torch cannot be imported."""
+    site = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    for source in (REPOSITORY / "ded_bench").rglob("*.py"):
+        target = site / source.relative_to(REPOSITORY)
+        shutil.copystat(source, target)  # what Numba has compiled already, it finds by file and date
+        for compiled in (source.parent / "__pycache__").glob(f"{source.stem}.*.nb?"):
+            (target.parent / "__pycache__").mkdir(exist_ok=True)
+            shutil.copy2(compiled, target.parent / "__pycache__")
+    (site / "without_torch.py").write_text(WITHOUT_TORCH)
+    return [sys.executable, "-m", "without_torch"]
+
+
+def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path) -> None:
+    place = tmp_path / "empty"
+    place.mkdir()
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "OMP_NUM_THREADS": "1"}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            [*command, *arguments], cwd=place, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done
+
+    methods, limit = "ded-dpc,ded-ko-knots", "3"
+    said = run("solve", "--method", methods, "--regime", "TO", "--limit", limit, "--workers", "1").stderr
+    package = tmp_path / "site" / "ded_bench" / "_reference_runs" / "9bus-reference"
+    assert f"from {package / 'policies' / 'ded-dpc-TO.safetensors'}" in said
+    assert f"from {package / 'koopman' / 'koopman.safetensors'}" in said
+    run("report", "--workers", "1")
+    summary = pd.read_csv(place / "results" / "9bus" / "tables" / "summary.csv").set_index("method")
+    for method in methods.split(","):
+        assert summary.loc[method, "n"] == int(limit)
+        assert -0.1 < summary.loc[method, "gap_percent_mean"] < 1.0
+    assert [path.name for path in place.iterdir()] == ["results"]
+
+
+def test_it_weighs_little(wheel: Path) -> None:
+    """Models, policies and objectives of the reference runs; no rows, no schedules, no figures."""
+    with zipfile.ZipFile(wheel) as archive:
+        kept = [item for item in archive.infolist() if "_reference_runs/" in item.filename]
+        whole = sum(item.compress_size for item in archive.infolist())
+    assert {Path(item.filename).suffix for item in kept} == {".safetensors", ".csv"}
+    assert {Path(item.filename).name for item in kept if item.filename.endswith("csv")} == {"objectives.csv"}
+    assert whole < 20e6

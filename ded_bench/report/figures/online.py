@@ -70,7 +70,7 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
         heading: of the figure.
     """
     regimes = list(dict.fromkeys(swept["regime"]))
-    with new_figure(1.2 + 3.4 * len(regimes), 6.2) as figure:
+    with new_figure(max(7.2, 1.2 + 3.4 * len(regimes)), 6.6) as figure:
         axes = figure.subplots(2, len(regimes), sharex=True, squeeze=False)
         handles: list[Line2D] = []
         for (name, label, linear), row in zip(MEASURES, axes, strict=True):
@@ -86,7 +86,7 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
         for regime, top, bottom in zip(regimes, *axes, strict=True):
             top.set_title(regime)
             bottom.set_xlabel("latency (s)")
-        legend_below(figure, handles, columns=3)
+        legend_below(figure, handles, columns=2)
         figure.suptitle(heading)
     return figure
 

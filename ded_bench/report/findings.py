@@ -47,7 +47,9 @@ def _ratio(best: Line, lines: Sequence[Line]) -> str:
     """How much longer the reference takes."""
     slow = next((line.timing.get("solve_s", np.nan) for line in lines if line.reference), np.nan)
     ratio = slow / best.timing["solve_s"]
-    return f", {ratio:.2g} times faster than that" if np.isfinite(ratio) and ratio > 1 else ""
+    if not (np.isfinite(ratio) and ratio > 1):
+        return ""
+    return f", {float(f'{ratio:.2g}'):,g} times faster than that"
 
 
 def _claims(lines: Sequence[Line]) -> Iterator[str]:

@@ -15,7 +15,7 @@ p, ul { max-width: 46rem; }
 a { color: var(--link); }
 nav ul { display: flex; flex-wrap: wrap; gap: 0 1rem; list-style: none; padding: 0; margin: 0 0 0.5rem;
   max-width: none; font-size: 0.8rem; }
-.side { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 0 1.5rem; }
+.side { display: grid; grid-template-columns: minmax(0, 1.1fr) minmax(0, 0.9fr); gap: 0 1.5rem; }
 .side figure { margin: 0.4rem 0; }
 .side table { font-size: 0.78rem; line-height: 1.2; }
 .side th, .side td { padding-top: 0.18rem; padding-bottom: 0.18rem; padding-right: 0.35rem; }
@@ -54,8 +54,8 @@ tbody tr:hover { background: #f6f8fa; }
   img { max-width: none; width: 38rem; min-width: 100%; }
   .side img { width: 100%; }
   table { font-size: 0.8rem; }
-  .label { position: sticky; left: 0; background: #fff; white-space: normal; max-width: 8.5rem;
-    box-shadow: 1px 0 0 var(--line); }
+  .label { position: sticky; left: 0; background: #fff; white-space: normal;
+    min-width: 6.5rem; max-width: 8.5rem; box-shadow: 1px 0 0 var(--line); }
 }
 @media print { main { max-width: none; } .scroll { overflow: visible; } figure { break-inside: avoid; } }
 """

@@ -1,7 +1,8 @@
 """DED-KO: the paper's linear program over all points of the horizon, on a surrogate.
 
-By default its arrays are made directly (see `knot_program`: every grid point is a knot) and PIQP solves it,
-on any surrogate. Other settings solve the paper's formulation on a lifted model, written in Pyomo.
+On a lifted model it is the paper's formulation, written in Pyomo. By default PIQP solves it. Where the
+surrogate varies in time, and on grids whose Pyomo model would take minutes and gigabytes, the default makes
+the arrays of the same program directly (see `knot_program`: every grid point is a knot).
 """
 
 from __future__ import annotations
@@ -32,12 +33,15 @@ from ded_bench.truth.network import Network
 
 #: Solver of the Pyomo model and its options by settings slug.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {},
+    "default": {"solver": "piqp"},
     "ipopt": {"solver": "ipopt", "options": LINEAR_OPTIONS},
     "executable": {"solver": "ipopt-executable", "options": LINEAR_OPTIONS},
     "highs": {"solver": "highs"},
 }
-#: Limit of the default settings where none is given: HiGHS, the last resort, knows no end on large grids.
+#: Entries of the equations up to which the default is a Pyomo model; half of it takes 10 s and 0.5 GB
+#: (two-area), once.
+PYOMO_ENTRIES = 1_000_000
+#: Limit of the arrays' programs where none is given: HiGHS, the last resort, knows no end on large grids.
 TIME_LIMIT_S = 1800.0
 #: Memory that a program takes for each entry of its equations (39bus), and may take in all.
 BYTES_PER_ENTRY, MAX_BYTES = 150, 4 * 2**30
@@ -60,15 +64,29 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
         InputError: the settings want a lifted model, and this surrogate is none.
     """
     case.check_regimes([regime])
-    if SETTINGS[settings.name]:
+    if settings.name != "default":
         if not isinstance(surrogate, Koopman):
             problem = f"only its default settings solve `ded-ko` on {surrogate.kind}"
             raise InputError("--settings", settings.name, problem)
         return _pyomo_solver(case, surrogate, regime, settings)
+    by_arrays = _array_solver(case, surrogate, regime, settings)
+    if not isinstance(surrogate, Koopman):
+        return by_arrays
+    by_pyomo = _pyomo_solver(case, surrogate, regime, settings)
+
+    def solve(instance: Instance) -> Solution:
+        small = _entries(case, surrogate, instance.steps) <= PYOMO_ENTRIES
+        return by_pyomo(instance) if small else by_arrays(instance)
+
+    return solve
+
+
+def _array_solver(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
+    """A solver that makes the arrays of each instance's program."""
 
     def solve(instance: Instance) -> Solution:
         points = np.arange(instance.steps + 1)
-        if (needed := _bytes(case, surrogate, instance.steps)) > MAX_BYTES:
+        if (needed := BYTES_PER_ENTRY * _entries(case, surrogate, instance.steps)) > MAX_BYTES:
             problem = f"the program of {len(points)} points would take {needed / 2**30:.0f} GiB"
             return Solution(Status.FAILED, error=f"{problem}; `ded-ko-knots` takes fewer")
         limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
@@ -79,11 +97,11 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
     return solve
 
 
-def _bytes(case: Case, surrogate: Surrogate, steps: int) -> int:
-    """Roughly what the program of all points takes in memory."""
+def _entries(case: Case, surrogate: Surrogate, steps: int) -> int:
+    """Entries of the equations of the program of all points, if all blocks are dense."""
     n_gen = len(case.generators)
     n_state = len(surrogate.k) if isinstance(surrogate, Koopman) else 2 * n_gen
-    return BYTES_PER_ENTRY * steps * n_state * (n_state + 2 * n_gen + 1)
+    return steps * n_state * (n_state + 2 * n_gen + 1)
 
 
 def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:

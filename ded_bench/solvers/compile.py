@@ -1,4 +1,4 @@
-"""Solvers of Pyomo models by name: IPOPT, HiGHS; see the modules of these names.
+"""Solvers of Pyomo models by name: IPOPT, PIQP, HiGHS; see the modules of these names.
 
 A Pyomo model is compiled once and solved many times: between solves only variable bounds and
 initial values may change. What differs between instances is therefore written as variables fixed
@@ -16,11 +16,13 @@ from ded_bench.files.errors import InputError
 from ded_bench.solvers.highs import Highs
 from ded_bench.solvers.ipopt import CasadiIpopt, IpoptExecutable
 from ded_bench.solvers.outcome import Compiled, Options
+from ded_bench.solvers.piqp import Piqp
 
 #: Solvers by name. The name "ipopt" means IPOPT from the `casadi` wheel.
 SOLVERS: dict[str, Callable[[pyo.ConcreteModel, Options | None], Compiled]] = {
     "ipopt": CasadiIpopt,
     "ipopt-executable": IpoptExecutable,
+    "piqp": Piqp,
     "highs": Highs,
 }
 

@@ -1,22 +1,73 @@
-"""PIQP: a proximal interior-point method, here for linear programs given by their arrays."""
+"""PIQP: a proximal interior-point method, here for linear programs, as Pyomo models or as arrays."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import time
 from types import ModuleType
 
 import numpy as np
+import pyomo.environ as pyo
 import scipy.sparse as sp
 
 from ded_bench.files.errors import InputError
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, read_linear
+from ded_bench.solvers.outcome import Options, Outcome
 from ded_bench.solvers.status import Status
 
 #: The programs of this suite take 15 to 60 iterations.
 MAX_ITERATIONS = 150
 #: Relative duality gap that is small enough: round-off lets some programs stall at 5e-9.
 GAP = 1e-7
+
+
+class Piqp:
+    """PIQP on a linear Pyomo model; what it does not solve, IPOPT decides.
+
+    Raises:
+        InputError: the package `piqp` is not installed, or options are given: it takes none.
+    """
+
+    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
+        if options:
+            raise InputError("piqp", ", ".join(options), "takes no options")
+        started = time.perf_counter()
+        _piqp()
+        self._program = read_linear(model)
+        self._fallback: CasadiIpopt | None = None
+        self._setup_s = time.perf_counter() - started
+
+    def solve(self, time_limit_s: float | None = None) -> Outcome:
+        """See `Compiled`."""
+        started = time.perf_counter()
+        numbers = self._program.numbers()
+        form = self._program.free_form(numbers)
+        setup = self._setup_s + time.perf_counter() - started
+        self._setup_s = 0.0  # paid once, by the first solve
+        started = time.perf_counter()
+        answer = solve_form(form, np.inf if time_limit_s is None else time_limit_s)
+        elapsed = time.perf_counter() - started
+        said = (answer.iterations, setup, elapsed)
+        if answer.status == Status.OPTIMAL:
+            values = np.array(numbers.lower)
+            values[numbers.free] = answer.x
+            assign(self._program.columns, values)
+            objective = self._program.objective(numbers, values)
+            return Outcome(Status.OPTIMAL, True, *said, objective, answer.version, answer.message)
+        if answer.status == Status.TIME_LIMIT:
+            return Outcome(Status.TIME_LIMIT, False, *said, None, answer.version, answer.message)
+        rest = None if time_limit_s is None else max(time_limit_s - elapsed, 1e-3)  # IPOPT wants some
+        self._fallback = self._fallback or CasadiIpopt(self._program, LINEAR_OPTIONS)
+        verdict = self._fallback.solve(rest)
+        return dataclasses.replace(
+            verdict,
+            setup_s=setup + verdict.setup_s,
+            solve_s=elapsed + verdict.solve_s,
+            version=f"{answer.version}, {verdict.version}",
+            message=f"{answer.message}, {verdict.message}",
+        )
 
 
 def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = False) -> FormAnswer:

@@ -19,7 +19,7 @@ from ded_bench.solvers.compile import SOLVERS, compile_model, fix
 from ded_bench.solvers.linear_program import FreeForm, read_linear
 from ded_bench.solvers.status import Status
 
-LINEAR = ("ipopt", "highs")
+LINEAR = ("ipopt", "piqp", "highs")
 
 
 def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.ConcreteModel:
@@ -142,8 +142,9 @@ def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
     assert again.objective == pytest.approx(whole.objective, rel=1e-7)
 
 
-def test_linear_solvers_refuse_what_is_not_linear() -> None:
-    solver, model = "highs", diet()
+@pytest.mark.parametrize("solver", ["piqp", "highs"])
+def test_linear_solvers_refuse_what_is_not_linear(solver: str) -> None:
+    model = diet()
     model.curved = pyo.Constraint(expr=model.x**2 + model.y <= 9)
     with pytest.raises(ValueError, match="curved is not linear"):
         compile_model(model, solver)
@@ -207,7 +208,7 @@ def test_unknown_and_missing_solvers_are_named(monkeypatch: pytest.MonkeyPatch) 
         compile_model(diet(), "ipopt-executable")
     monkeypatch.setitem(sys.modules, "piqp", None)
     with pytest.raises(InputError, match="pip install piqp"):
-        piqp.solve_form(FORM)
+        compile_model(diet(), "piqp")
     assert set(LINEAR) | {"ipopt-executable"} == set(SOLVERS)
 
 

@@ -167,5 +167,6 @@ class KeyedTable(Generic[K, T]):
 
 
 def whole_lines(data: bytes) -> bytes:
-    """All but a torn last line."""
-    return data[: data.rfind(b"\n") + 1]
+    """All but a torn last line, and without blank lines at the end, so that rows may follow."""
+    end = len(data[: data.rfind(b"\n") + 1].rstrip(b"\r\n"))
+    return data[: data.index(b"\n", end) + 1] if end else b""

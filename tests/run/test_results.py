@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.run.results import ROWS, Key, Results, Row
+from ded_bench.run.results import ROWS, SCORING_FAILED, Key, Results, Row
 
 ROW = Row(
     instance="a-1",
@@ -38,8 +38,10 @@ def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(tmp_path: Path)
     """Its schedule need not be kept, unless it is still to be scored, or scoring it has failed."""
     results = Results(tmp_path)
     plain = dataclasses.replace(ROW, error="")
-    scored, failed = dataclasses.replace(plain, objective=1.0), dataclasses.replace(plain, error="why")
-    for row, alone, with_schedule in ((scored, True, True), (plain, False, False), (failed, False, True)):
+    scored, told = dataclasses.replace(plain, objective=1.0), dataclasses.replace(plain, error="why")
+    failed = dataclasses.replace(plain, error=f"{SCORING_FAILED}why")
+    cases = (scored, True, True), (plain, False, False), (told, False, False), (failed, False, True)
+    for row, alone, with_schedule in cases:
         results.add([row])
         assert results.has(row.key, "f") is alone
         assert not results.solved(row.key, "f")
@@ -77,3 +79,16 @@ def test_wrong_tables_are_refused_with_line_and_column(text: str, named: str, tm
         Results(tmp_path)
     assert str(path) in str(caught.value)
     assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", [b"", b"\n", b"\r\n\n"])
+def test_a_mark_and_blank_lines_of_an_editor_are_accepted(tmp_path: Path, ending: bytes) -> None:
+    """Also where rows are added after them."""
+    row = Row(*("x-0", "test", "NO", "ded", "default", "Optimal"), objective=1.0, case="x")
+    path = Results(tmp_path).path
+    Results(tmp_path).add([row])
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes() + ending)
+    opened = Results(tmp_path)
+    opened.add([dataclasses.replace(row, instance="x-1")])
+    assert [r.instance for r in Results(tmp_path).rows.values()] == ["x-0", "x-1"]
+    assert opened.rows == Results(tmp_path).rows

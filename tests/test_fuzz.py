@@ -41,6 +41,7 @@ from ded_bench.problem.sampling import Manifest, Split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run import runner
 from ded_bench.run.results import ROWS, Results, Row
+from ded_bench.run.scoring import scored_row
 from ded_bench.truth import score as scorer
 from tests.damage import (
     Mutant,
@@ -112,7 +113,7 @@ def scored(row: Row) -> Row:
     """A row with times and a verdict."""
     verdict = scorer.Score(2.0, 0.0, 1e-9, 0.0, 0.0)
     facts = {"solve_s": 0.1, "iterations": 3, "fingerprint": "00", "case": "threebus"}
-    return runner.scored_row(dataclasses.replace(row, **facts), verdict)
+    return scored_row(dataclasses.replace(row, **facts), verdict)
 
 
 @pytest.fixture(autouse=True)

@@ -28,7 +28,7 @@ from ded_bench.report.figures.plan import plan
 from ded_bench.report.report import write_report
 from ded_bench.run.pool import Workers
 from ded_bench.run.results import Key, Results, Row
-from ded_bench.run.runner import scored_row
+from ded_bench.run.scoring import scored_row
 from ded_bench.truth.score import score
 from tests.evaluate.test_summary import DED, with_gaps
 from tests.reading import Page

@@ -81,7 +81,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     case, instance = threebus, quiet_instance(threebus, horizon_s=0.05, seed=[2022, 7])
     write_record(case, folder / "case.json")
     write_record(instance, folder / "instances" / f"{instance.id}.json")
-    write_record(instance, folder / "instance.json")
+    own = quiet_instance(threebus, id="mine", horizon_s=0.05, seed=[2022, 7])  # no copy of another one
+    write_record(own, folder / "instance.json")
     write_record(Split(seed=1, train=(instance.id,), test=(instance.id,)), folder / "split.json")
     write_record(Manifest(version="1-abc", files={"case.json": "00"}), folder / "MANIFEST.json")
     t = np.linspace(0.0, 0.05, 6)

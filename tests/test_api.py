@@ -39,7 +39,16 @@ def test_help_waits_for_no_compiler() -> None:
     assert loaded_after("from ded_bench.cli.commands import parser; parser()") == ["scipy"]
 
 
-WITHOUT_TORCH = "import sys; sys.modules['torch'] = None\n"
+WITHOUT_TORCH = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+sys.meta_path.insert(0, NoTorch())
+"""
 
 
 def test_answers_need_no_torch() -> None:

@@ -118,7 +118,9 @@ def test_instances_are_drawn_as_many_as_before(threebus: Case, tmp_path: Path) -
     assert len(load_split(tmp_path).test) == 3
     assert main(command) == 0
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
-    assert main([*command, "--count", "10"]) == 0
+    assert main([*command, "--count", "10"]) == 2  # it would replace what is there
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
+    assert main([*command, "--count", "10", "--force"]) == 0
     split = load_split(tmp_path)
     assert (len(split.train), len(split.test), split.seed) == (8, 2, 11)
     assert main([*command, "--count", "2", "--test", "3"]) == 2

@@ -214,9 +214,9 @@ def test_the_command_line_names_the_scheduler_it_cannot_reach(
     shipped = CASE_FILES["9bus"].parent / "instances" / "9bus-0007.json"
     command = ["solve", "--method", "ed", "--regime", "NO", "--instance", str(shipped)]
     assert main([*command, "--out", str(tmp_path), "--scheduler", place]) == 2
-    line = capsys.readouterr().err
+    told, line = capsys.readouterr().err.splitlines()
+    assert told.startswith("ded-bench: 1 rows to solve")
     assert line.startswith(f"ded-bench: --scheduler: {place}")
-    assert line.count("\n") == 1
 
 
 def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

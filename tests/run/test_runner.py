@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.linear import linear_model, nominal_model
+from ded_bench.koopman.linear import linear_model
 from ded_bench.koopman.surrogates import model_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
@@ -92,7 +92,7 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     assert limited.fingerprint != free[0].fingerprint
     assert (free[0].time_limit_s, limited.time_limit_s) == (None, 100.0)
     assert unfinished(tasks(settings), results) == (tasks(settings)[:1], [])  # the limited one does not count
-    assert limited.model == f"linear@{nominal_model(threebus).fingerprint}"
+    assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
     assert limited.policy == ""
     assert limited.code == code_of("ded_bench.methods.ded_ko_knots")
     assert limited.score_code == code_of("ded_bench.truth.score")

@@ -37,7 +37,7 @@ class Selection:
 def problem_folder(name: str | Path, case: Case) -> Path:
     """The folder that holds a case's instances: the one given, or that of the shipped case."""
     path = Path(name)
-    if path.is_dir():
+    if (path / "case.json").is_file():
         return path
     return path.parent if path.is_file() else SHIPPED_CASES / case.id
 

@@ -180,14 +180,17 @@ class Case(_Extended):
     def load(name_or_path: str | Path) -> Case:
         """Read a case by the name of a shipped one, its folder, or its case.json.
 
+        A folder that holds no case, such as results named after theirs, does not hide the shipped case.
+
         Raises:
             InputError: there is no such case, or its file is wrong.
         """
         path = Path(name_or_path)
-        if path.is_dir():
-            path = path / "case.json"
-        elif not path.exists() and (SHIPPED_CASES / path / "case.json").is_file():
-            path = SHIPPED_CASES / path / "case.json"
+        own, shipped = path / "case.json", SHIPPED_CASES / path / "case.json"
+        if own.is_file() or (path.is_dir() and not shipped.is_file()):
+            path = own
+        elif not path.is_file() and shipped.is_file():
+            path = shipped
         elif not path.exists():
             known = ", ".join(sorted(p.parent.name for p in SHIPPED_CASES.glob("*/case.json")))
             raise InputError(name_or_path, "", f"no such case (shipped: {known})")

@@ -80,3 +80,11 @@ def test_wrong_choices_are_told(folder: Path) -> None:
         select_split("atlantis")
     with pytest.raises(InputError, match="no instance"):
         select_files([])
+
+
+def test_a_folder_of_results_does_not_hide_the_shipped_case(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "two-area" / "tables").mkdir(parents=True)
+    chosen = select_split("two-area", "test", 1)
+    assert chosen.case.id == "two-area"
+    assert len(chosen.instances) == 1

@@ -55,11 +55,13 @@ class Schedule:
         """
         header, rows = _read_table(path)
         wanted = ["t", *(f"P_{g}" for g in case.generators)]
+        expected = f"expected {','.join(wanted)}, found {repr(','.join(header)[:100])[1:-1] or 'nothing'}"
         for name in wanted:
             if header.count(name) != 1:
-                raise InputError(path, name, "column required once")
+                what = "column is there twice" if name in header else "required column is missing"
+                raise InputError(path, name, f"{what} ({expected})")
         if unknown := [name for name in header if name not in wanted]:
-            raise InputError(path, unknown[0][:40], f"unknown column (expected {','.join(wanted)})")
+            raise InputError(path, repr(unknown[0][:40])[1:-1], f"unknown column ({expected})")
         values = _numbers(rows, header, path)[:, [header.index(name) for name in wanted]]
         schedule = Schedule(t=values[:, 0].copy(), p=values[:, 1:].copy())
         schedule.check(horizon_s, path)

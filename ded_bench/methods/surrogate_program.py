@@ -6,12 +6,13 @@ What it claims is what the surrogate says: no answer is simulated.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
 from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.surrogates import Surrogate
-from ded_bench.koopman.trajectory import Indices
+from ded_bench.koopman.trajectory import Indices, TrajectoryModel
 from ded_bench.methods import ed
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, is_reachable, solve_with_rows_added
@@ -55,6 +56,34 @@ def solve_on_surrogate(
         time_limit_s: s.
         soft: `Infeasible` comes with the schedule of least frequency excess, summed over knot intervals.
     """
+
+    def along(p_gen: Array) -> TrajectoryModel:
+        return model_along(case, surrogate, instance, p_gen, points)
+
+    return solve_along(case, instance, regime, points, along, time_limit_s, soft)
+
+
+def solve_along(
+    case: Case,
+    instance: Instance,
+    regime: str,
+    points: Indices,
+    along: Callable[[Array], TrajectoryModel],
+    time_limit_s: float | None = None,
+    soft: bool = False,
+) -> Solution:
+    """`solve_on_surrogate` on any linear model.
+
+    Args:
+        case: the grid.
+        instance: what to solve.
+        regime: gives the bound of |ω|.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        along: makes the model of this instance along powers at the knots, shape (n_knots, n_gen), pu;
+            SimulationError if the system cannot follow them.
+        time_limit_s: s.
+        soft: see `solve_on_surrogate`.
+    """
     started = time.perf_counter()
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
     if not is_reachable(case, instance, points):
@@ -62,7 +91,7 @@ def solve_on_surrogate(
     dispatched, model = reference(case, instance, points), None
     for p_gen in first_schedules(case, instance, dispatched, points):
         try:
-            model = model_along(case, surrogate, instance, p_gen, points)
+            model = along(p_gen)
             break
         except SimulationError as error:
             reason = str(error)

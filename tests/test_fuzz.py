@@ -30,7 +30,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import policy as dpc_policy
-from ded_bench.methods.dpc.network import StagedNetwork
+from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc_paper import paper_policy
 from ded_bench.methods.dpc_paper.paper_features import n_channels

@@ -156,9 +156,8 @@ def test_modules_stay_small(module):
 
 
 def test_no_two_modules_share_a_name() -> None:
-    """But for `network`: that of a grid, and that of a policy."""
     names = [path.stem for path in MODULES.values() if path.stem != "__init__"]
-    assert {name for name in names if names.count(name) > 1} <= {"network"}
+    assert {name for name in names if names.count(name) > 1} == set()
 
 
 def oversized(source: str) -> list[str]:

@@ -338,7 +338,7 @@ def _facts(case: Case, job: Job) -> dict[str, str]:
     method = get_method(job.method)
     used = method.artifacts(case, job.regime, job.settings)
     shaped_by = {kind: named(used, kind) for kind in ("model", "policy")}
-    made_by = {"code": code_of_method(method, used), "version": version(), "host": host()}
+    made_by = {"code": code_of_method(method, job.settings.name, used), "version": version(), "host": host()}
     return shaped_by | made_by | {"case": case.id}
 
 

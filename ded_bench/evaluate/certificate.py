@@ -313,7 +313,7 @@ def _made_by(case: Case, method: str, reference: str, regime: str, settings: Set
     for name, field, own in ((method, "code", settings), (reference, "reference_code", _plain(settings))):
         answering = get_method(name)
         artifacts = answering.artifacts(case, regime, own)
-        found[field] = code_of_method(answering, artifacts)
+        found[field] = code_of_method(answering, own.name, artifacts)
         used += [artifact for artifact in artifacts if artifact not in used]
     for kind in ("model", "policy"):
         found[kind] = named(used, kind)

@@ -1,4 +1,4 @@
-"""The sequence of `ded-slp` on the full AC network: steps have a limited length.
+"""The sequence of `ded-slp` on the full AC network (its setting `ac`): steps have a limited length.
 
 With constant-power loads and fixed E' many optima lie near the end of what the network can carry. There
 linear models are right only nearby: a full step may raise the excess, or lead to where there is no solution.
@@ -10,16 +10,19 @@ Maza, Nonlinear programming and nonsmooth optimization by successive linear prog
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ded_bench.koopman.ac_trajectory import linearise_along_ac
 from ded_bench.koopman.trajectory import Indices
+from ded_bench.methods.ded_slp import SlpSolver
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, is_reachable, solve_with_rows_added
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -29,6 +32,8 @@ from ded_bench.truth.ac_network import AcNetwork
 from ded_bench.truth.ac_simulate import simulate_ac
 from ded_bench.truth.simulate import SimulationError, Trajectory
 
+#: This setting has no options.
+SETTINGS: Mapping[str, Mapping[str, Any]] = {"ac": {}}
 #: A step that brings less than the first part of what its program promises is not taken; below the second
 #: part the radius shrinks, above the third it grows if it limited the step.
 TAKEN, POOR, GOOD = 0.1, 0.3, 0.7
@@ -40,6 +45,17 @@ PRICE = 0.05
 SMALLEST = 1e-5
 #: Programs of one instance; from the second number on steps shrink until a schedule is feasible.
 MAX_PROGRAMS, SETTLING = 40, 20
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
+    """Return a solver of single instances, which may start from an earlier solution.
+
+    Raises:
+        InputError: the case has no AC data.
+    """
+    case.check_regimes([regime])
+    sequence = functools.partial(AcSequence, data=AcCase.of(case))
+    return SlpSolver(case, regime, settings.time_limit_s, sequence=sequence)
 
 
 class _Iterate(NamedTuple):

@@ -6,10 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ded_bench.koopman.surrogates import find_model_file, find_surrogate
-from ded_bench.methods.solution import Settings
-from ded_bench.problem.case import Case
-
 
 @dataclass(frozen=True)
 class Artifact:
@@ -26,14 +22,3 @@ class Artifact:
     name: str
     fingerprint: str
     path: Path | None = None
-
-
-def model_artifact(case: Case, settings: Settings) -> Artifact:
-    """The surrogate that the settings name.
-
-    Raises:
-        InputError: there is no such model, or its file is wrong.
-    """
-    model = find_surrogate(case, settings.model, settings.search)
-    path = find_model_file(case, settings.model, settings.search)
-    return Artifact("model", model.kind, model.fingerprint, path)

@@ -2,104 +2,69 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyomo.dae as dae
 import pyomo.environ as pyo
 
-from ded_bench.methods.ded_sequential import SequentialDed
-from ded_bench.methods.ded_start import STARTS
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solver_answer import answer
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
-from ded_bench.solvers.outcome import Compiled, Outcome
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.outcome import Compiled
 from ded_bench.truth.network import Network
-from ded_bench.truth.simulate import simulate
 
-
-@dataclass(frozen=True)
-class Choice:
-    """How the discretised problem is solved: a solver of `solvers`, or a sequence of linear programs."""
-
-    solver: str = "ipopt"
-    start: str = ""  # one of STARTS; the state at t = 0, if empty
-
-
+#: What sets the point that a solver starts from: called with the model and its instance.
+Start = Callable[[pyo.ConcreteModel, Instance], None]
 #: One solution of the linear system per iteration, refined only where its residual asks for it: the
 #: iterates are the same, without a tenth of the time.
 _IPOPT_OPTIONS = {"min_refinement_steps": 0}
-#: By settings slug. IPOPT has its default tolerances in all of them.
+#: Solver of `solvers` by settings slug. IPOPT has its default tolerances in all of them.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {},
+    "default": {"solver": "ipopt"},
     "executable": {"solver": "ipopt-executable"},
-    "accelerated": {"solver": "sequential"},
-    **{f"start-{start}": {"start": start} for start in STARTS},
 }
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
+    return prepare_with(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
+
+
+def prepare_with(
+    case: Case, regime: str, time_limit_s: float | None, solver: str = "ipopt", start: Start | None = None
+) -> Solver:
+    """Return a solver of single instances.
+
+    Args:
+        case: the grid.
+        regime: whose frequency bound.
+        time_limit_s: of the solver, s.
+        solver: a name of `solvers`.
+        start: sets the point that the solver starts from in a model that is set to an instance; without it,
+            that is the state at t = 0.
+    """
     case.check_regimes([regime])
-    choice = Choice(**SETTINGS[settings.name])
-    if choice.solver == "sequential":
-        return functools.partial(_solve_sequentially, case, regime, settings)
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         model = _built(case, instance.steps, instance.dt_s)
         set_instance(model, case, instance, regime)
-        if choice.start:
-            start_from(model, case, instance, STARTS[choice.start](case, instance, regime))
+        if start is not None:
+            start(model, instance)
         build_s = time.perf_counter() - started
-        compiled = _compiled(case, instance.steps, instance.dt_s, choice.solver)
-        outcome = compiled.solve(settings.time_limit_s)
+        compiled = _compiled(case, instance.steps, instance.dt_s, solver)
+        outcome = compiled.solve(time_limit_s)
         return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
     return solve
-
-
-def _solve_sequentially(case: Case, regime: str, settings: Settings, instance: Instance) -> Solution:
-    """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
-    started = time.perf_counter()
-    programs = _programs(case, regime, instance.steps, instance.dt_s)
-    build_s = time.perf_counter() - started
-    outcome, schedule = programs.solve(instance, settings.time_limit_s)
-    if outcome.status != Status.FAILED:
-        return answer(outcome, build_s, lambda: schedule)
-    limit = settings.time_limit_s
-    rest = None if limit is None else max(limit - outcome.solve_s, 1e-3)
-    verdict = prepare(case, regime, Settings(time_limit_s=rest))(instance)
-    return dataclasses.replace(
-        verdict,
-        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
-        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
-        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
-    )
-
-
-def answer(outcome: Outcome, build_s: float, schedule: Callable[[], Schedule | None]) -> Solution:
-    """A solver's outcome as the method's answer; the schedule is read only if there is one."""
-    return Solution(
-        status=outcome.status,
-        schedule=schedule() if outcome.has_values else None,
-        iterations=outcome.iterations,
-        build_s=build_s,
-        setup_s=outcome.setup_s,
-        solve_s=outcome.solve_s,
-        solver_objective=outcome.objective,
-        solver_version=outcome.version,
-        error="" if outcome.has_values else outcome.message,
-    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -110,11 +75,6 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 @functools.lru_cache(maxsize=1)
 def _compiled(case: Case, steps: int, dt: float, solver: str) -> Compiled:
     return compile_model(_built(case, steps, dt), solver, _IPOPT_OPTIONS)
-
-
-@functools.lru_cache(maxsize=2)
-def _programs(case: Case, regime: str, steps: int, dt: float) -> SequentialDed:
-    return SequentialDed(case, regime, steps, dt)
 
 
 def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
@@ -241,27 +201,26 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     points = (len(p_load), 1)
     still = np.zeros((len(p_load), len(case.generators)))
     slack = np.tile(network.injections(angles)[network.slack], len(p_load))
-    _start(m, case, np.tile(angles, points), still, np.tile(p_initial, points), slack)
+    set_start(m, case, np.tile(angles, points), still, np.tile(p_initial, points), slack)
     for j, g in enumerate(case.generators):
         fix(m.p_gen[g, 0], float(p_initial[j]))
         fix(m.omega[g, 0], float(omega_initial[j]))
         fix(m.theta[g, 0], float(angles[network.generators[j]]))
 
 
-def start_from(m: pyo.ConcreteModel, case: Case, instance: Instance, schedule: Schedule) -> None:
-    """Make the initial point of a model that is set to an instance what a schedule does on the true DAE.
-
-    Raises:
-        SimulationError: the system loses synchronism under this schedule.
-    """
-    truth = simulate(case, instance, schedule)
-    _start(m, case, truth.theta, truth.omega, truth.p_gen, truth.p_slack)
-
-
-def _start(
+def set_start(
     m: pyo.ConcreteModel, case: Case, theta: Array, omega: Array, p_gen: Array, p_slack: Array
 ) -> None:
-    """Set the values of all variables but the data; rows are points, columns buses or generators."""
+    """Set the values of all variables but the data: the point that the solver starts from.
+
+    Args:
+        m: the built model.
+        case: its case.
+        theta: angles of all buses, shape (n_points, n_bus), rad.
+        omega: frequencies of the generators, shape (n_points, n_gen), rad/s.
+        p_gen: their powers, shape (n_points, n_gen), pu.
+        p_slack: slack power, shape (n_points,), pu.
+    """
     network, along = Network(case), _along_time(m)
     wanted = {
         "theta": theta[:, network.generators],

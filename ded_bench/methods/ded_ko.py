@@ -19,8 +19,10 @@ import pyomo.environ as pyo
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import Surrogate, find_surrogate
-from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solver_answer import answer
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -115,17 +117,7 @@ def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings)
         set_instance(model, case, koopman, instance, regime)
         build_s = time.perf_counter() - started
         outcome = _compiled(program, settings.name).solve(settings.time_limit_s)
-        return Solution(
-            status=outcome.status,
-            schedule=schedule_of(model, case, instance) if outcome.has_values else None,
-            iterations=outcome.iterations,
-            build_s=build_s,
-            setup_s=outcome.setup_s,
-            solve_s=outcome.solve_s,
-            solver_objective=outcome.objective,
-            solver_version=outcome.version,
-            error="" if outcome.has_values else outcome.message,
-        )
+        return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
     return solve
 

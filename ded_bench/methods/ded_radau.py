@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.ded import answer
 from ded_bench.methods.radau_program import RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solver_answer import answer
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.truth.network import Network

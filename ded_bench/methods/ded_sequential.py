@@ -1,20 +1,28 @@
-"""Full DED as a short sequence of linear programs: the same discretised problem as `ded`, solved faster.
+"""Full DED as a short sequence of linear programs: the problem of `ded`, solved faster.
 
 Given the generators' angles, the loads fix all others, so that the paper's eq. (DED_OG) under backward
 Euler has one nonlinear part: f at the generators and the slack bus. It is linearised along the last
 trajectory, exactly in the loads, and a linear program without the other angles is solved; where
 f is met to `TOLERANCE` the trajectory meets the optimality conditions of the nonlinear program, since then
 both programs have the same derivatives there. Newton's convergence makes that two to four programs.
+This is the setting `accelerated` of `ded`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
+from ded_bench.methods import ded
+from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solver_answer import answer
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -28,6 +36,38 @@ from ded_bench.truth.network import Network, PowerFlowError
 TOLERANCE = 1e-8
 #: A sequence that is longer does not converge.
 MAX_PROGRAMS = 10
+#: This setting of `ded` has no options.
+SETTINGS: Mapping[str, Mapping[str, Any]] = {"accelerated": {}}
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return a solver of single instances; one set of programs per process serves them all."""
+    case.check_regimes([regime])
+    return functools.partial(_solve, case, regime, settings)
+
+
+def _solve(case: Case, regime: str, settings: Settings, instance: Instance) -> Solution:
+    """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
+    started = time.perf_counter()
+    programs = _programs(case, regime, instance.steps, instance.dt_s)
+    build_s = time.perf_counter() - started
+    outcome, schedule = programs.solve(instance, settings.time_limit_s)
+    if outcome.status != Status.FAILED:
+        return answer(outcome, build_s, lambda: schedule)
+    limit = settings.time_limit_s
+    rest = None if limit is None else max(limit - outcome.solve_s, 1e-3)
+    verdict = ded.prepare_with(case, regime, rest)(instance)
+    return dataclasses.replace(
+        verdict,
+        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
+        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
+        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
+    )
+
+
+@functools.lru_cache(maxsize=2)
+def _programs(case: Case, regime: str, steps: int, dt: float) -> SequentialDed:
+    return SequentialDed(case, regime, steps, dt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +165,15 @@ class SequentialDed:
                 if time_limit_s is not None and time.perf_counter() - started > time_limit_s:
                     status, message = Status.TIME_LIMIT, "the time limit passed between two programs"
                     break
-                answer = solve_form(self._program(instance, theta, along))
-                iterations, version, message = iterations + answer.iterations, answer.version, answer.message
-                if answer.status != Status.OPTIMAL:
+                found = solve_form(self._program(instance, theta, along))
+                iterations, version, message = iterations + found.iterations, found.version, found.message
+                if found.status != Status.OPTIMAL:
                     break
-                moved = np.vstack([initial, answer.x[self._theta]])
+                moved = np.vstack([initial, found.x[self._theta]])
                 predicted = along.f + np.einsum("nij,nj->ni", along.slope, moved - theta)
                 theta, along = moved, injections_along(network, moved, load)
                 if np.abs(along.f - predicted).max() < TOLERANCE:
-                    power = np.vstack([instance.p_initial(case), answer.x[self._p_gen]])
+                    power = np.vstack([instance.p_initial(case), found.x[self._p_gen]])
                     status, schedule = Status.OPTIMAL, Schedule(t=instance.grid, p=power)
                     cost = power @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(
                         along.f[:, -1]

@@ -4,20 +4,20 @@ A schedule is simulated on the true DAE; the linear program around its trajector
 gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
 costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
 surrogate. It takes one to three programs, since the linear models differ only by the second order
-of what one schedule changes. Settings `ac` do the same on the full AC network (see `ac_sequence`).
+of what one schedule changes. Setting `ac` does the same on the full AC network (see `ac_sequence`).
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ded_bench.koopman.trajectory import Indices, linearise_along
 from ded_bench.methods import ed
-from ded_bench.methods.ac_sequence import AcSequence
 from ded_bench.methods.knot_program import (
     KnotProgram,
     Limit,
@@ -27,15 +27,14 @@ from ded_bench.methods.knot_program import (
 )
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
-#: The case's own knots, or others this far apart; along simulations on the full AC network.
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}, "ac": {"ac": True}}
+#: The case's own knots, or others this far apart.
+SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}}
 
 #: Trajectories, and halvings of a step that the system cannot follow.
 MAX_ROUNDS, MAX_HALVINGS = 15, 6
@@ -44,9 +43,30 @@ MAX_ROUNDS, MAX_HALVINGS = 15, 6
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """Return a solver of single instances, which may start from an earlier solution."""
     case.check_regimes([regime])
-    options = SETTINGS[settings.name]
-    data = AcCase.of(case) if options.get("ac") else None
-    return SlpSolver(case, regime, settings.time_limit_s, options.get("knot_interval_s"), data)
+    return SlpSolver(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
+
+
+class Sequence(Protocol):
+    """One instance's sequence of trajectories and programs."""
+
+    iterations: int  # of all programs
+    claimed: float  # cost that the last program predicts
+    version: str  # of the solver
+    message: str
+
+    def run(self, start: Schedule, is_near: bool) -> tuple[Status, Schedule | None]:
+        """Go on until a simulated schedule confirms its program.
+
+        Args:
+            start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
+            is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
+        """
+        ...
+
+
+#: Makes a sequence of: case, instance, bound (rad/s), grid points of the knots, deadline (on the clock of
+#: `time.perf_counter`), and whether an infeasible instance has a schedule, too.
+Start = Callable[[Case, Instance, float, Indices, float, bool], Sequence]
 
 
 @dataclass(frozen=True)
@@ -57,7 +77,7 @@ class SlpSolver:
     regime: str
     time_limit_s: float | None = None
     knot_interval_s: float | None = None  # None: the case's knots
-    data: AcCase | None = None  # None: on the lossless network
+    sequence: Start | None = None  # None: on the lossless network
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve from the static dispatch of every second."""
@@ -79,8 +99,8 @@ class SlpSolver:
         start = ed.dispatch(self.case, instance, 1.0) if near is None else near
         points = self._knots(instance)
         bound = self.case.omega_bound(self.regime)
-        problem = self.case, instance, bound, points, started + limit, soft
-        sequence = _Sequence(*problem) if self.data is None else AcSequence(*problem, data=self.data)
+        make = self.sequence or _Sequence
+        sequence = make(self.case, instance, bound, points, started + limit, soft)
         status, schedule = sequence.run(start, is_near=near is not None)
         return Solution(
             status=status,

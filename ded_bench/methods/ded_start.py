@@ -1,17 +1,22 @@
-"""Schedules that full DED may start from instead of the state at t = 0: is its optimum the same from all?"""
+"""Full DED that starts from a schedule instead of the state at t = 0: is its optimum the same from all?
+
+These are the settings `start-...` of `ded`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
+import pyomo.environ as pyo
 
 from ded_bench.koopman.linear import linear_model
-from ded_bench.methods import ded_ko, ed
-from ded_bench.methods.solution import Settings
+from ded_bench.methods import ded, ded_ko, ed
+from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.simulate import simulate
 
 #: Seconds between the set-points of a random schedule.
 RANDOM_INTERVAL_S = 5.0
@@ -37,9 +42,29 @@ def random(case: Case, instance: Instance, regime: str) -> Schedule:
     return ed.follow(case, instance, targets, RANDOM_INTERVAL_S)
 
 
-#: Start by the name that follows `start-` in the settings' slug.
-STARTS: dict[str, Callable[[Case, Instance, str], Schedule]] = {
-    "ed": dispatched,
-    "ko": linearised,
-    "random": random,
+#: Schedule to start from, by settings slug.
+SETTINGS: Mapping[str, Mapping[str, Callable[[Case, Instance, str], Schedule]]] = {
+    "start-ed": {"schedule": dispatched},
+    "start-ko": {"schedule": linearised},
+    "start-random": {"schedule": random},
 }
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return a solver of single instances; the schedule's trajectory is part of the time to build."""
+    schedule = SETTINGS[settings.name]["schedule"]
+
+    def start(model: pyo.ConcreteModel, instance: Instance) -> None:
+        start_from(model, case, instance, schedule(case, instance, regime))
+
+    return ded.prepare_with(case, regime, settings.time_limit_s, start=start)
+
+
+def start_from(m: pyo.ConcreteModel, case: Case, instance: Instance, schedule: Schedule) -> None:
+    """Make the initial point of a model that is set to an instance what a schedule does on the true DAE.
+
+    Raises:
+        SimulationError: the system loses synchronism under this schedule.
+    """
+    truth = simulate(case, instance, schedule)
+    ded.set_start(m, case, truth.theta, truth.omega, truth.p_gen, truth.p_slack)

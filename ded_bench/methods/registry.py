@@ -7,6 +7,9 @@ to be trained, its line here names the module whose `train` does it (see `traini
 `ded-bench train-dpc` knows it. What `prepare` returns may also have `solve(instance, last=None)`, which
 the closed loop calls: it may start from the plan in force, and where no schedule meets every limit it
 may answer `Infeasible` with the schedule that exceeds them least.
+
+A setting whose answers depend on much more than the method's others has a module of its own, which offers
+the same and which the method's line names: the code of a row is that of the module that answers.
 """
 
 from __future__ import annotations
@@ -32,15 +35,23 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
+    elsewhere: tuple[tuple[str, str], ...] = ()  # settings that another module answers: slug, module
 
-    @property
-    def _loaded(self) -> Any:
-        return plugin.load(self.module) if ":" in self.module else importlib.import_module(self.module)
+    def module_of(self, settings: str) -> str:
+        """The module that answers, by the settings' name or their slug in the results."""
+        of_slug = (module for slug, module in self.elsewhere if f"{settings}-".startswith(f"{slug}-"))
+        return next(of_slug, self.module)
+
+    def _answering(self, settings: str = "") -> Any:
+        module = self.module_of(settings)
+        return plugin.load(module) if ":" in module else importlib.import_module(module)
 
     @property
     def settings(self) -> Mapping[str, Mapping[str, Any]]:
         """The settings this method knows: options by slug."""
-        known: Mapping[str, Mapping[str, Any]] = self._loaded.SETTINGS
+        known: dict[str, Mapping[str, Any]] = dict(self._answering().SETTINGS)
+        for slug, module in self.elsewhere:
+            known[slug] = importlib.import_module(module).SETTINGS[slug]
         return known
 
     def options(self, settings: Settings) -> Mapping[str, Any]:
@@ -62,7 +73,7 @@ class Method:
             InputError: unknown settings, or a model or policy that does not fit.
         """
         self.options(settings)  # says what is wrong with them
-        solver: Solver = self._loaded.prepare(case, regime, settings)
+        solver: Solver = self._answering(settings.name).prepare(case, regime, settings)
         return solver
 
     def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -72,7 +83,7 @@ class Method:
             InputError: unknown settings, or a model or policy that is missing or does not fit.
         """
         self.options(settings)  # says what is wrong with them
-        find = getattr(self._loaded, "artifacts", None)
+        find = getattr(self._answering(settings.name), "artifacts", None)
         return tuple(find(case, regime, settings)) if find else ()
 
     @property
@@ -91,9 +102,24 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("ded", "ded_bench.methods.ded", "DED"),
+        Method(
+            "ded",
+            "ded_bench.methods.ded",
+            "DED",
+            elsewhere=(
+                ("accelerated", "ded_bench.methods.ded_sequential"),
+                ("start-ed", "ded_bench.methods.ded_start"),
+                ("start-ko", "ded_bench.methods.ded_start"),
+                ("start-random", "ded_bench.methods.ded_start"),
+            ),
+        ),
         Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
-        Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
+        Method(
+            "ded-slp",
+            "ded_bench.methods.ded_slp",
+            "DED (SLP)",
+            elsewhere=(("ac", "ded_bench.methods.ac_sequence"),),
+        ),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
         Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),

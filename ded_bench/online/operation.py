@@ -93,7 +93,7 @@ def make_operations(
             artifacts = method.artifacts(case, regime, settings)
             seconds, source = _latency(case, (regime, method.name, settings.slug), latency, timing)
             own = dataclasses.replace(options, latency_s=seconds)
-            code = code_of_method(method, artifacts)
+            code = code_of_method(method, settings.name, artifacts)
             shared = own, limit_s, source, artifacts
             for scenario in scenarios:
                 fingerprint = _fingerprint(

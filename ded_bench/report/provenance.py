@@ -70,9 +70,13 @@ def _code_notes(made: pd.DataFrame) -> Iterator[str]:
     unknown = made[(made["code"] == "") | (made["score_code"] == "")]
     if len(unknown):
         yield f"{len(unknown)} rows do not say which code made them: {_titles(unknown['method'])}."
+    # Settings that another module answers have a code of their own.
+    module = pd.Series(
+        [_module(*of) for of in zip(made["method"], made["settings"], strict=True)], made.index
+    )
     mixed = [
         f"{title(str(method))} ({_listed(codes)})"
-        for method, codes in made.groupby("method", sort=False)["code"]
+        for (method, _), codes in made["code"].groupby([made["method"], module], sort=False)
         if codes.nunique() > 1
     ]
     if mixed:
@@ -82,14 +86,18 @@ def _code_notes(made: pd.DataFrame) -> Iterator[str]:
             f"Rows were scored by different code ({_listed(made['score_code'])}); "
             "`ded-bench score --results DIR --update` scores the kept schedules anew."
         )
-    ours = {name: code_of(METHODS[name].module) for name in set(made["method"]) & METHODS.keys()}
-    known = made[made["method"].isin(list(ours)) & (made["code"] != "")]
-    other = known[known["code"] != known["method"].map(ours)]
+    known = made[(module != "") & (made["code"] != "")]
+    other = known[known["code"] != module[known.index].map(code_of)]
     if len(other):
         yield f"Rows come from other code than what is installed here: {_titles(other['method'])}."
     scored = made[made["score_code"] != ""]
     if len(scored) and (scored["score_code"] != code_of(scorer.__name__)).any():
         yield "Rows were scored by other code than what is installed here."
+
+
+def _module(method: str, settings: str) -> str:
+    """Which of our modules answers; nothing for the methods of others."""
+    return METHODS[method].module_of(settings) if method in METHODS else ""
 
 
 def _listed(values: Iterable[str]) -> str:

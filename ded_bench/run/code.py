@@ -34,10 +34,17 @@ def code_of(module: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def code_of_method(method: Method, artifacts: tuple[Artifact, ...]) -> str:
-    """The code of one of our methods, or what one of others says of its own."""
+def code_of_method(method: Method, settings: str, artifacts: tuple[Artifact, ...] = ()) -> str:
+    """The code of one of our methods under some settings, or what one of others says of its own.
+
+    Args:
+        method: the method.
+        settings: their name, or their slug in the results.
+        artifacts: what the answers depend on.
+    """
     foreign = [artifact.fingerprint for artifact in artifacts if artifact.kind == "code"]
-    return code_of(method.module) if _path(method.module) else "-".join(foreign)
+    module = method.module_of(settings)
+    return code_of(module) if _path(module) else "-".join(foreign)
 
 
 def named(artifacts: Iterable[Artifact], kind: str) -> str:

@@ -47,7 +47,7 @@ def make_tasks(
     for method in map(get_method, methods):
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
-            code = code_of_method(method, artifacts)
+            code = code_of_method(method, settings.name, artifacts)
             for instance, split in instances:
                 fingerprint = fingerprint_of(case, instance, regime, method.name, settings, artifacts)
                 task = Task(instance, split, regime, method.name, settings, fingerprint, artifacts, code)

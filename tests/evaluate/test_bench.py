@@ -90,7 +90,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
     monkeypatch.setattr(bench_module, "Workers", Inline)
-    monkeypatch.setattr(bench_module, "code_of_method", lambda method, artifacts: "abc")
+    monkeypatch.setattr(bench_module, "code_of_method", lambda method, settings, artifacts: "abc")
     bench_module._prepared.cache_clear()
     yield module
     bench_module._prepared.cache_clear()

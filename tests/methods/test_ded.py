@@ -6,9 +6,10 @@ import numpy as np
 import pyomo.environ as pyo
 import pytest
 
-from ded_bench.methods.ded import SETTINGS, build_ded, prepare, schedule_of, set_instance, start_from
+from ded_bench.methods import ded_sequential, ded_start
+from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
 from ded_bench.methods.ded_sequential import SequentialDed, injections_along
-from ded_bench.methods.ded_start import STARTS
+from ded_bench.methods.ded_start import start_from
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -160,7 +161,7 @@ def test_accelerated_finds_the_same_optimum(case: Case) -> None:
         for regime in case.regimes:
             instance = short(case, index)
             usual = prepare(case, regime, Settings())(instance)
-            fast = prepare(case, regime, Settings("accelerated"))(instance)
+            fast = ded_sequential.prepare(case, regime, Settings("accelerated"))(instance)
             assert usual.status == fast.status == Status.OPTIMAL
             assert fast.solver_version.startswith("piqp")
             assert fast.solver_objective == pytest.approx(usual.solver_objective, rel=1e-6)
@@ -209,7 +210,7 @@ def test_a_linear_program_has_the_derivatives_of_the_network(case: Case) -> None
 def test_what_a_sequence_cannot_solve_ipopt_decides(threebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     instance = short(threebus, 0)
     bad = instance.initial.model_copy(update={"power": {"plant": 0.95}})  # p_max is 0.9
-    solve = prepare(threebus, "NO", Settings("accelerated"))
+    solve = ded_sequential.prepare(threebus, "NO", Settings("accelerated"))
     solution = solve(instance.model_copy(update={"initial": bad}))
     assert solution.status == Status.INFEASIBLE
     assert solution.schedule is None
@@ -223,16 +224,17 @@ def test_what_a_sequence_cannot_solve_ipopt_decides(threebus: Case, monkeypatch:
     again = solve(instance)
     assert "ipopt" not in again.solver_version
     assert again.solver_objective == pytest.approx(patient.solver_objective, rel=1e-6)
-    hasty = prepare(threebus, "NO", Settings("accelerated", time_limit_s=1e-9))(instance)
+    hasty = ded_sequential.prepare(threebus, "NO", Settings("accelerated", time_limit_s=1e-9))(instance)
     assert hasty.status == Status.TIME_LIMIT
     assert hasty.error
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", ded_start.SETTINGS)
 def test_starts_are_schedules_and_the_optimum_does_not_depend_on_them(threebus: Case, start: str) -> None:
     instance = short(threebus, 2)
-    schedule = STARTS[start](threebus, instance, "NO")
-    assert schedule.p.tolist() == STARTS[start](threebus, instance, "NO").p.tolist()
+    make = ded_start.SETTINGS[start]["schedule"]
+    schedule = make(threebus, instance, "NO")
+    assert schedule.p.tolist() == make(threebus, instance, "NO").p.tolist()
     verdict = score(threebus, instance, schedule, "NO")
     assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8
     model = build_ded(threebus, instance.steps, instance.dt_s)
@@ -244,8 +246,7 @@ def test_starts_are_schedules_and_the_optimum_does_not_depend_on_them(threebus: 
             body, slack = pyo.value(row.body), 1e-8
             assert (row.lower is None) or body >= pyo.value(row.lower) - slack
             assert (row.upper is None) or body <= pyo.value(row.upper) + slack
-    assert f"start-{start}" in SETTINGS
-    there = prepare(threebus, "NO", Settings(f"start-{start}"))(instance)
+    there = ded_start.prepare(threebus, "NO", Settings(start))(instance)
     assert there.status == Status.OPTIMAL
     usual = prepare(threebus, "NO", Settings())(instance)
     assert there.solver_objective == pytest.approx(usual.solver_objective, rel=1e-6)

@@ -19,8 +19,8 @@ from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import Objective
-from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import CHUNK, METHOD, DispatchPolicy, prepare
+from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.training import Loss, Pool
 from ded_bench.methods.policy_file import Scope, policy_file

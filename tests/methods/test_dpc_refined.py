@@ -13,8 +13,8 @@ from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import DispatchPolicy
+from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.refined import SETTINGS, artifacts, prepare
 from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.dpc.response import Response

@@ -15,8 +15,8 @@ from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.export import network_of
 from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs, sequence_groups
-from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import SETTINGS, DispatchPolicy
+from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.training import train
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.problem.case import Case

@@ -8,7 +8,7 @@ import pandas as pd
 
 from ded_bench.methods.registry import METHODS
 from ded_bench.report.provenance import provenance, provenance_notes
-from ded_bench.run.code import code_of
+from ded_bench.run.code import code_of, code_of_method
 from tests.evaluate.test_summary import frame_of
 from tests.evaluate.test_summary import row as plain_row
 
@@ -18,7 +18,10 @@ COLUMNS = ["regime", "method", "settings", "code", "model", "policy"]
 
 def row(instance: str, method: str, **fields: Any) -> Any:
     """A row that the code installed here has made."""
-    made = {"code": code_of(METHODS[method].module), "score_code": SCORER} | fields
+    made = {
+        "code": code_of_method(METHODS[method], fields.get("settings", "default")),
+        "score_code": SCORER,
+    } | fields
     return plain_row(instance, method, 1.0, **made)
 
 
@@ -26,12 +29,12 @@ def timing(*rows: tuple[str, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-DED = code_of(METHODS["ded"].module)
+DED = code_of_method(METHODS["ded"], "default")
 
 
 def test_rows_of_one_making_need_no_note() -> None:
     frame = frame_of(row("a", "ded"), row("b", "ded"), row("a", "ded-dpc", policy="ded-dpc@123"))
-    policy = ("TO", "ded-dpc", "default", code_of(METHODS["ded-dpc"].module), "", "ded-dpc 123")
+    policy = ("TO", "ded-dpc", "default", code_of_method(METHODS["ded-dpc"], "default"), "", "ded-dpc 123")
     times = timing(("TO", "ded", "default", DED, "", ""), policy)
     assert provenance_notes(frame, times) == []
     table = provenance(frame, times).set_index("method")
@@ -53,6 +56,18 @@ def test_methods_have_code_of_their_own() -> None:
     assert provenance_notes(frame_of(row("a", "ded"), row("a", "ed")), timing()) == []
     stranger = plain_row("a", "mine", 1.0, code="abc", score_code=SCORER)
     assert provenance_notes(frame_of(stranger), timing()) == []
+
+
+def test_settings_that_another_module_answers_have_code_of_their_own() -> None:
+    """Those of `ded` that start from DED-KO depend on more than its default does."""
+    start, default = (code_of_method(METHODS["ded"], slug) for slug in ("start-ko", "default"))
+    assert start != default
+    frame = frame_of(row("a", "ded"), row("a", "ded", settings="start-ko"))
+    assert provenance_notes(frame, timing()) == []
+    wrong = frame_of(row("a", "ded", settings="start-ko", code=default))
+    assert provenance_notes(wrong, timing()) == [
+        "Rows come from other code than what is installed here: DED [start-ko]."
+    ]
 
 
 def test_rows_without_code_and_mixed_policies_are_counted() -> None:

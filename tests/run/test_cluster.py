@@ -21,7 +21,8 @@ from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.linear import linear_model
 from ded_bench.koopman.surrogates import find_model, model_file
-from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
 import pytest
 
-from ded_bench.methods.registry import METHODS
+from ded_bench.methods.registry import METHODS, Method
 from ded_bench.run import code
 from ded_bench.run.code import code_of, code_of_method, content_of, imports_of
 
@@ -46,7 +47,7 @@ def late():
 def test_the_scorers_code_is_not_a_methods() -> None:
     scorer = code_of("ded_bench.truth.score")
     assert re.fullmatch("[0-9a-f]{12}", scorer)
-    codes = {name: code_of_method(method, ()) for name, method in METHODS.items()}
+    codes = {name: code_of_method(method, "default") for name, method in METHODS.items()}
     assert len({*codes.values(), scorer}) == len(codes) + 1
 
 
@@ -77,3 +78,52 @@ def test_a_change_reaches_what_depends_on_it(tmp_path: Path, monkeypatch: pytest
     assert codes() == before
     for cached in (code_of, code._module, code._path):
         cached.cache_clear()
+
+
+def modules_of(module: str) -> set[str]:
+    """A module and all of the package that it imports, however far."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += code._module(name)[1]
+    return {name.removeprefix("ded_bench.") for name in found}
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "foreign"),
+    [
+        ("ed", "default", r"truth|koopman|solvers\.(?!status)|methods\.d"),
+        ("ded", "default", r"koopman|truth\.(?!network)|methods\.(?!(ded|solution|solver_answer)$)"),
+        ("ded-radau", "default", r"koopman|truth\.(?!network)|methods\.(ded$|ded_radau_model)"),
+        ("ded-slp", "default", r"\.ac_|koopman\.(?!trajectory)|methods\.ded_(?!slp$)"),
+        ("ded-slp", "100ms", r"\.ac_"),
+        ("ded-ko", "default", r"methods\.(ded$|ded_slp|ded_radau|dpc)"),
+        ("ded-dpc-paper", "default", r"koopman|methods\.dpc_paper\..*(training|loss|network)|methods\.dpc\."),
+        ("ded-dpc", "default", r"koopman\.(surrogates|trajectory|identify)|training|loss|policy_network"),
+    ],
+)
+def test_an_answer_depends_on_nothing_else(method: str, settings: str, foreign: str) -> None:
+    """What a method does not use, another of its settings does not either, does not change its code."""
+    used = modules_of(METHODS[method].module_of(settings))
+    assert [name for name in sorted(used) if re.search(foreign, name)] == []
+
+
+def test_settings_name_the_module_that_answers() -> None:
+    ded, slp = METHODS["ded"], METHODS["ded-slp"]
+    assert ded.module_of("default") == ded.module_of("executable") == "ded_bench.methods.ded"
+    assert ded.module_of("start-ko") == ded.module_of("start-ko-linear") == "ded_bench.methods.ded_start"
+    assert slp.module_of("ac") != slp.module_of("accurate") == slp.module_of("100ms")
+    assert len({code_of_method(ded, slug) for slug in ded.settings}) == 3
+
+
+@pytest.mark.parametrize("method", [method for method in METHODS.values() if method.elsewhere])
+def test_modules_offer_the_settings_that_are_theirs(method: Method) -> None:
+    own, slugs = importlib.import_module(method.module).SETTINGS, [slug for slug, _ in method.elsewhere]
+    assert set(method.settings) == {*own, *slugs}
+    assert not {*own} & {*slugs}
+    for module in {module for _, module in method.elsewhere}:
+        theirs = {slug for slug, name in method.elsewhere if name == module}
+        assert set(importlib.import_module(module).SETTINGS) == theirs

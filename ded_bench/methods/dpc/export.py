@@ -9,8 +9,8 @@ import torch
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.dpc.inputs import n_channels
-from ded_bench.methods.dpc.network import StagedNetwork
 from ded_bench.methods.dpc.policy import DispatchPolicy
+from ded_bench.methods.dpc.policy_network import StagedNetwork
 
 
 def network_of(policy: DispatchPolicy) -> StagedNetwork:

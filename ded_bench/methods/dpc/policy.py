@@ -37,7 +37,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
 if TYPE_CHECKING:
-    from ded_bench.methods.dpc.network import StagedNetwork
+    from ded_bench.methods.dpc.policy_network import StagedNetwork
 
 METHOD = "ded-dpc"
 #: Instances that one thread takes at a time.

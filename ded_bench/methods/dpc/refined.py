@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from ded_bench.koopman.surrogates import find_model
-from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.refinement import STEPS, Refiner
+from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.policy_solver import VERSION, warmed_up
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case

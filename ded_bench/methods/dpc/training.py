@@ -20,8 +20,8 @@ from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.loss import Objective
-from ded_bench.methods.dpc.network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.policy import METHOD, DispatchPolicy
+from ded_bench.methods.dpc.policy_network import DILATIONS, STAGES, WIDTH, StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint

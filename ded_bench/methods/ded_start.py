@@ -39,7 +39,7 @@ def random(case: Case, instance: Instance, regime: str) -> Schedule:
     rng = np.random.default_rng(list(instance.fingerprint.encode()))
     count = int(np.ceil(instance.horizon_s / RANDOM_INTERVAL_S))
     targets = rng.uniform(case.p_min, case.p_max, size=(count, len(case.generators)))
-    return ed.follow(case, instance, targets, RANDOM_INTERVAL_S)
+    return ed.follow_set_points(case, instance, targets, RANDOM_INTERVAL_S)
 
 
 #: Schedule to start from, by settings slug.

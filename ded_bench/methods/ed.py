@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -56,23 +57,20 @@ def dispatch(case: Case, instance: Instance, interval_s: float) -> Schedule:
     # Loads are linear between grid points, so that the trapezoidal rule gives their exact mean.
     mean = [np.trapezoid(load[a : b + 1], axis=0) / (b - a) for a, b in zip(starts, ends, strict=True)]
     prices = instance.cost_gen(case), instance.cost_slack(case)
-    return follow(case, instance, merit_order(case, *prices, np.stack(mean)), interval_s)
+    return follow_set_points(case, instance, merit_order(case, *prices, np.stack(mean)), interval_s)
 
 
-def follow(case: Case, instance: Instance, targets: Array, interval_s: float) -> Schedule:
+def follow_set_points(case: Case, instance: Instance, targets: Array, interval_s: float) -> Schedule:
     """Move from P_0 to one set-point after another, as fast as the ramp limit lets.
 
     Args:
         targets: set-points of the intervals, shape (n_intervals, n_gen), pu.
         interval_s: time between set-points, s.
     """
-    grid = instance.grid
-    power = np.empty((len(grid), len(case.generators)))
-    power[0] = instance.p_initial(case)
-    for target, a, b in zip(targets, *_intervals(instance, interval_s), strict=True):
-        reach = case.ramp * (grid[a + 1 : b + 1, None] - grid[a])
-        power[a + 1 : b + 1] = power[a] + np.clip(target - power[a], -reach, reach)
-    return Schedule(t=grid, p=power)
+    starts, ends = _intervals(instance, interval_s)
+    at_points = np.repeat(targets, np.subtract(ends, starts), axis=0)
+    power = follow(at_points[None], instance.p_initial(case)[None], case.ramp * instance.dt_s)[0]
+    return Schedule(t=instance.grid, p=power)
 
 
 def _intervals(instance: Instance, interval_s: float) -> tuple[list[int], list[int]]:

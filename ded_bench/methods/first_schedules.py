@@ -40,4 +40,4 @@ def _shared_load(case: Case, instance: Instance) -> Array:
     """
     load = instance.p_load(case)[:: round(1.0 / instance.dt_s)].sum(axis=1)
     target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
-    return ed.follow(case, instance, np.clip(target, case.p_min, case.p_max)[1:], 1.0).p
+    return ed.follow_set_points(case, instance, np.clip(target, case.p_min, case.p_max)[1:], 1.0).p

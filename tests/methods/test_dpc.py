@@ -15,7 +15,6 @@ from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.export import export
-from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.inputs import Channels, Inputs, n_channels, sequence_groups
 from ded_bench.methods.dpc.loss import Objective
@@ -24,6 +23,7 @@ from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.dpc.training import Loss, Pool
 from ded_bench.methods.policy_file import Scope, policy_file
+from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order

@@ -13,11 +13,11 @@ import torch
 from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.export import network_of
-from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs, sequence_groups
 from ded_bench.methods.dpc.policy import SETTINGS, DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.training import train
+from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.problem.case import Case
 from tests.methods.test_dpc import some_instances, tensors

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.methods.dpc import kernels
 from ded_bench.methods.dpc.differentiable_follower import Clip, Follow
-from ded_bench.methods.dpc.follower import follow
+from ded_bench.methods.ramp_follower import follow
+from ded_bench.problem.compiled import compiled
 
 
 def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:
@@ -59,5 +59,5 @@ def test_functions_are_compiled_where_nothing_can_be_kept(monkeypatch: pytest.Mo
             values[i] *= 2.0
 
     values = np.ones(3)
-    kernels.compiled(double)(values)
+    compiled(double)(values)
     assert values.tolist() == [2.0, 2.0, 2.0]

@@ -96,8 +96,12 @@ def modules_of(module: str) -> set[str]:
     ("method", "settings", "foreign"),
     [
         ("ed", "default", r"truth|koopman|solvers\.(?!status)|methods\.d"),
-        ("ded", "default", r"koopman|truth\.(?!network)|methods\.(?!(ded|solution|solver_answer)$)"),
-        ("ded-radau", "default", r"koopman|truth\.(?!network)|methods\.(ded$|ded_radau_model)"),
+        (
+            "ded",
+            "default",
+            r"koopman|truth\.(?!network|integrator)|methods\.(?!(ded|solution|solver_answer)$)",
+        ),
+        ("ded-radau", "default", r"koopman|truth\.(?!network|integrator)|methods\.(ded$|ded_radau_model)"),
         ("ded-slp", "default", r"\.ac_|koopman\.(?!trajectory)|methods\.ded_(?!slp$)"),
         ("ded-slp", "100ms", r"\.ac_"),
         ("ded-ko", "default", r"methods\.(ded$|ded_slp|ded_radau|dpc)"),

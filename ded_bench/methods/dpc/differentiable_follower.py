@@ -1,4 +1,4 @@
-"""The follower and the clip of targets in torch, for training."""
+"""The ramp follower and the clip of targets in torch, for training."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from torch import Tensor
 
 
 class Follow(torch.autograd.Function):
-    """`follower.follow` for training; an adjoint by hand is ten times faster than recording 150 steps."""
+    """`ramp_follower.follow` for training.
+
+    An adjoint by hand is ten times faster than recording 150 steps.
+    """
 
     @staticmethod
     def forward(ctx: Any, targets: Tensor, p_initial: Tensor, step: Tensor) -> Tensor:
-        """See `follower.follow`."""
+        """See `ramp_follower.follow`."""
         p = [p_initial]
         for target in targets.unbind(1):
             p.append(torch.maximum(torch.minimum(p[-1] + step, target), p[-1] - step))

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from ded_bench.methods.dpc.inputs import Channels, n_channels
-from ded_bench.methods.dpc.kernels import NetworkInputs, PowerLimits, StageWeights, answer
+from ded_bench.methods.dpc.kernels import NetworkInputs, PowerLimits, StageWeights, correct
 from ded_bench.methods.dpc.response import Response
+from ded_bench.methods.ramp_follower import track
 from ded_bench.problem.case import Array, Case
 
 #: Width of the layer that constants of an instance pass through.
@@ -31,8 +32,8 @@ class CompiledStages:
         self._weights = StageWeights(
             *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
         )
-        step = case.ramp * (response.knots[1] - response.knots[0])
-        self._limits = PowerLimits(case.p_min, case.p_max, step)
+        self._limits = PowerLimits(case.p_min, case.p_max)
+        self._step = case.ramp * (response.knots[1] - response.knots[0])
         self._of_power, self._dilations = response.of_power, np.array(dilations)
 
     def __call__(self, channels: Channels) -> Array:
@@ -43,7 +44,9 @@ class CompiledStages:
             channels.sequence.swapaxes(1, 2),
             channels.free_response.swapaxes(1, 2),
         )
-        answer(p_gen, seen, self._of_power, self._limits, self._dilations, self._weights)
+        for stage in range(len(self._weights.mean)):
+            correct(p_gen, stage, seen, self._of_power, self._limits, self._dilations, self._weights)
+            track(p_gen, self._step)
         return p_gen.swapaxes(1, 2)
 
 

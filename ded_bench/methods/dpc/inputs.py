@@ -22,6 +22,7 @@ from ded_bench.methods.dpc.kernels import (
     fill_machines,
 )
 from ded_bench.methods.dpc.response import Array32, Response
+from ded_bench.methods.ramp_follower import track
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
@@ -137,11 +138,12 @@ class Channels:
             start=np.empty((batch, len(case.generators), len(knots))),
         )
         given = InstanceArrays(inputs.cost, inputs.p_initial, inputs.state)
-        limits = PowerLimits(case.p_min, case.p_max, case.ramp * (knots[1] - knots[0]))
+        limits = PowerLimits(case.p_min, case.p_max)
         fill_loads(inputs.load, nodes, channels.p_load, channels.sequence)
         at_knots = channels.sequence[:, : len(case.loads)].swapaxes(1, 2)
         static = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], at_knots)
         fill_machines(given, static, limits, dispatch, channels)
+        track(channels.start, case.ramp * (knots[1] - knots[0]))
         p_load, sequence, constants, start = channels
         free = response.free_response(inputs.state, p_load.swapaxes(1, 2))
         return Channels(sequence.swapaxes(1, 2), constants, start.swapaxes(1, 2), free)

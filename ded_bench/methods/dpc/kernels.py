@@ -1,4 +1,4 @@
-"""All that Numba compiles for `ded-dpc`, in one file.
+"""What Numba compiles for `ded-dpc`, in one file; the ramp follower is called between stages.
 
 Its cache on disk notices that a function's own file changed, not that a function which it calls did.
 """
@@ -21,11 +21,10 @@ SMALLEST_SUM = 1e-9
 
 
 class PowerLimits(NamedTuple):
-    """What a schedule of knots must keep to."""
+    """Bounds of the generators."""
 
     p_min: Array  # (n_gen,), pu, as the next
     p_max: Array
-    step: Array  # largest change between two knots, (n_gen,), pu
 
 
 class InstanceArrays(NamedTuple):
@@ -70,20 +69,6 @@ class StageWeights(NamedTuple):
 
 
 @compiled
-def track(targets: Array, step: Array, p_gen: Array) -> None:
-    """Follow the targets of one instance; both shape (n_gen, n_knots), pu, the first knot's are P_0.
-
-    Args:
-        step: largest change between two knots, (n_gen,), pu.
-    """
-    for g in range(len(targets)):
-        p = p_gen[g, 0] = targets[g, 0]
-        for j in range(1, targets.shape[1]):
-            p = min(max(targets[g, j], p - step[g]), p + step[g])
-            p_gen[g, j] = p
-
-
-@compiled
 def fill_loads(load: Array, nodes: Array, p_load: Array, sequence: Array) -> None:
     """Loads of a batch at the nodes, then at the knots and their bends; see `ChannelArrays`."""
     n_load = p_load.shape[1]
@@ -118,7 +103,6 @@ def fill_machines(
         for g in range(n_gen):
             start[b, g, 0] = given.p_initial[b, g]
         _constants(given.cost[b], given.p_initial[b], given.state[b, n_gen:], constants[b])
-        track(start[b], limits.step, start[b])
 
 
 @compiled
@@ -175,26 +159,31 @@ def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) ->
 
 
 @compiled
-def answer(
+def correct(
     p_gen: Array,
+    s: int,
     seen: NetworkInputs,
     of_power: Array32,
     limits: PowerLimits,
     dilations: Array,
     weights: StageWeights,
 ) -> None:
-    """Turn the first schedules of a batch into answers, stage by stage.
+    """Add the corrections of one stage to the schedules of a batch, within bounds; then they are targets.
 
     Args:
-        p_gen: (batch, n_gen, n_knots), pu; receives the answers.
+        p_gen: (batch, n_gen, n_knots), pu; receives the targets, beside P_0.
+        s: the stage.
+        seen: what all stages see.
         of_power: see `response.Response`.
+        limits: bounds of the generators.
         dilations: of the convolutions of each stage.
+        weights: of all stages.
     """
     mean, enter, enter_bias, embed, embed_bias, first, spread, mix, mix_bias, last, last_bias = weights
     constants, sequence, free_response = seen
-    low, high, step = limits
+    low, high = limits
     _, n_gen, n = p_gen.shape
-    n_stages, width, n_in = len(first), first.shape[1], mean.shape[1]
+    width, n_in = first.shape[1], mean.shape[1]
     n_seen, margin = n_gen + free_response.shape[1], dilations.max()
     p32, forced = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
     inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
@@ -203,53 +192,51 @@ def answer(
     embedded, bias = np.empty(enter.shape[1], np.float32), np.empty(embed.shape[1], np.float32)
     corrections = np.empty((n_gen, n), np.float32)
     for b in range(len(p_gen)):
-        for s in range(n_stages):
-            np.dot(enter[s], constants[b], embedded)
-            for i in range(len(embedded)):
-                embedded[i] = max(embedded[i] + enter_bias[s, i], np.float32(0.0))
-            np.dot(embed[s], embedded, bias)
-            for i in range(len(bias)):
-                bias[i] += embed_bias[s, i]
-            # what the stage sees: the schedule so far, its response, the instance
-            for i in range(n_in):
-                inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
-            for g in range(n_gen):
-                _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
-                _copy(p_gen[b, g], inputs[g, 1 : n + 1])
-            np.dot(p32, of_power, forced)
-            for i in range(n_gen, n_seen):
-                row, output = inputs[i, 1 : n + 1], i - n_gen
-                free, due = free_response[b, output], forced[output * n :]
-                for j in range(n):
-                    row[j] = free[j] + due[j]
-            for i in range(n_seen, n_in):
-                _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
-            # its corrections
-            _gather(inputs, 1, input_columns)
-            np.dot(first[s], input_columns, change)
+        np.dot(enter[s], constants[b], embedded)
+        for i in range(len(embedded)):
+            embedded[i] = max(embedded[i] + enter_bias[s, i], np.float32(0.0))
+        np.dot(embed[s], embedded, bias)
+        for i in range(len(bias)):
+            bias[i] += embed_bias[s, i]
+        # what the stage sees: the schedule so far, its response, the instance
+        for i in range(n_in):
+            inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
+        for g in range(n_gen):
+            _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
+            _copy(p_gen[b, g], inputs[g, 1 : n + 1])
+        np.dot(p32, of_power, forced)
+        for i in range(n_gen, n_seen):
+            row, output = inputs[i, 1 : n + 1], i - n_gen
+            free, due = free_response[b, output], forced[output * n :]
+            for j in range(n):
+                row[j] = free[j] + due[j]
+        for i in range(n_seen, n_in):
+            _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
+        # its corrections
+        _gather(inputs, 1, input_columns)
+        np.dot(first[s], input_columns, change)
+        for o in range(width):
+            row = hidden[o, margin : margin + n]
+            for j in range(n):
+                row[j] = change[o, j] + bias[o]
+        for i in range(len(dilations)):
+            _gather(hidden, dilations[i], columns)
+            np.dot(spread[s, i], columns, inner)
+            _add_and_rectify(inner, bias[(1 + i) * width : (2 + i) * width])
+            np.dot(mix[s, i], inner, change)
             for o in range(width):
                 row = hidden[o, margin : margin + n]
                 for j in range(n):
-                    row[j] = change[o, j] + bias[o]
-            for i in range(len(dilations)):
-                _gather(hidden, dilations[i], columns)
-                np.dot(spread[s, i], columns, inner)
-                _add_and_rectify(inner, bias[(1 + i) * width : (2 + i) * width])
-                np.dot(mix[s, i], inner, change)
-                for o in range(width):
-                    row = hidden[o, margin : margin + n]
-                    for j in range(n):
-                        row[j] += change[o, j] + mix_bias[s, i, o]
-            for o in range(width):
-                row = hidden[o, margin : margin + n]
-                for j in range(n):
-                    inner[o, j] = max(row[j], np.float32(0.0))
-            np.dot(last[s], inner, corrections)
-            for g in range(n_gen):
-                for j in range(1, n):
-                    target = p_gen[b, g, j] + corrections[g, j] + last_bias[s, g]
-                    p_gen[b, g, j] = min(max(target, low[g]), high[g])
-            track(p_gen[b], step, p_gen[b])
+                    row[j] += change[o, j] + mix_bias[s, i, o]
+        for o in range(width):
+            row = hidden[o, margin : margin + n]
+            for j in range(n):
+                inner[o, j] = max(row[j], np.float32(0.0))
+        np.dot(last[s], inner, corrections)
+        for g in range(n_gen):
+            for j in range(1, n):
+                target = p_gen[b, g, j] + corrections[g, j] + last_bias[s, g]
+                p_gen[b, g, j] = min(max(target, low[g]), high[g])
 
 
 # Loops run over views of one row: of elements by two indices Numba makes no vector instructions.

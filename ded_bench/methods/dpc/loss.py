@@ -1,6 +1,6 @@
 """The loss of `ded-dpc`: relative cost and an exact penalty on the frequency bound, on a coarser grid.
 
-Everything but the frequency bound holds by construction (see `follower`), so that only two terms
+Everything but the frequency bound holds by construction (see `ramp_follower`), so that only two terms
 remain. Both are evaluated on the condensed rollout (`koopman.condensed`) at every tenth of a second.
 """
 

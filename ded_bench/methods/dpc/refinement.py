@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.follower import follow
 from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.methods.ramp_follower import follow
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 

@@ -66,7 +66,7 @@ def test_settings_that_another_module_answers_have_code_of_their_own() -> None:
     assert provenance_notes(frame, timing()) == []
     wrong = frame_of(row("a", "ded", settings="start-ko", code=default))
     assert provenance_notes(wrong, timing()) == [
-        "Rows come from other code than what is installed here: DED [start-ko]."
+        "Rows come from other code than what is installed here: DED."
     ]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record
+from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import SHIPPED_CASES, Case, Magnitude, Name, NonNegative, Number
 
 Complex = NDArray[np.complex128]
@@ -62,7 +61,7 @@ class AcMachine(Record):
     share: Annotated[float, Field(gt=0, le=1)]
 
 
-class AcCase(Record):
+class AcCase(Fingerprinted):
     """What the full AC network has beyond a case's lossless one."""
 
     schema_: Literal["ded-bench/ac/1"] = Field(alias="schema", default="ded-bench/ac/1")
@@ -195,19 +194,6 @@ class AcCase(Record):
         if found[case.slack].bus != str(self.slack_machine_bus):
             raise InputError(source, "slack_machine_bus", f"the case's slack is at {found[case.slack].bus}")
         return tuple(found[bus] for bus in internal)
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change when anything in the data does."""
-        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
-
-    def __eq__(self, other: object) -> bool:
-        """Equal content; cached arrays do not count."""
-        return isinstance(other, AcCase) and self.fingerprint == other.fingerprint
-
-    def __hash__(self) -> int:
-        """Equal data have equal hashes."""
-        return hash(self.fingerprint)
 
 
 @functools.lru_cache(maxsize=8)

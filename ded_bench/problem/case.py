@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record
+from ded_bench.files.strict import Fingerprinted, Record, read_record
 
 Array = NDArray[np.float64]
 #: Numbers beyond these are typing errors or in other units; within them no product overflows.
@@ -117,7 +116,7 @@ class Sampling(_Extended):
         return self
 
 
-class Case(_Extended):
+class Case(Fingerprinted, _Extended):
     """One grid. Buses keep the file's order; generators and loads are named by their bus."""
 
     schema_: Literal["ded-bench/case/1", "ded-bench/case/2"] = Field(alias="schema")
@@ -271,16 +270,3 @@ class Case(_Extended):
                     "regime",
                     f"unknown regime {regime!r} (known: {', '.join(self.regimes)})",
                 )
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change when anything in the case does."""
-        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
-
-    def __eq__(self, other: object) -> bool:
-        """Equal content; cached arrays do not count."""
-        return isinstance(other, Case) and self.fingerprint == other.fingerprint
-
-    def __hash__(self) -> int:
-        """Cases are dictionary keys of models that are built once per case."""
-        return hash(self.fingerprint)

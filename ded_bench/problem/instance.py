@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from pydantic import (
 )
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record
+from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
 
 if TYPE_CHECKING:
@@ -87,6 +86,15 @@ def _load_of_its_kind(value: Any, _: Any) -> LoadRamp | LoadPoints:
 Load = Annotated[LoadRamp | LoadPoints, WrapValidator(_load_of_its_kind)]
 
 
+def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
+    """Raise ValueError unless a time of this name is a number of steps, and not too many."""
+    steps = length_s / dt_s
+    if steps > MAX_STEPS:  # first, since the quotient may be infinite
+        raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
+    if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
+        raise ValueError(f"{name}: must be a whole multiple of dt_s")
+
+
 class Initial(Record):
     """State at t = 0, by generator bus: power in pu, frequency deviation in rad/s, angle in rad.
 
@@ -102,7 +110,7 @@ class Initial(Record):
         return {name: value for name, value in write(self).items() if value is not None}
 
 
-class Instance(Record):
+class Instance(Fingerprinted):
     """One DED problem; angles at t = 0: see `truth.network.Network.initial_angles`."""
 
     schema_: Literal["ded-bench/instance/1", "ded-bench/instance/2"] = Field(alias="schema")
@@ -124,11 +132,7 @@ class Instance(Record):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> Instance:
-        steps = self.horizon_s / self.dt_s
-        if steps > MAX_STEPS:  # first, since the quotient may be infinite
-            raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
-        if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
-            raise ValueError("horizon_s: must be a whole multiple of dt_s")
+        check_whole_steps("horizon_s", self.horizon_s, self.dt_s)
         return self
 
     @model_validator(mode="after")
@@ -229,19 +233,6 @@ class Instance(Record):
     def cost_slack(self, case: Case) -> float:
         """Cost c_s of one pu at the slack bus, of either sign."""
         return self.cost[case.slack]
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change when anything in the instance does."""
-        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
-
-    def __eq__(self, other: object) -> bool:
-        """Equal content; cached arrays do not count."""
-        return isinstance(other, Instance) and self.fingerprint == other.fingerprint
-
-    def __hash__(self) -> int:
-        """Equal instances have equal hashes."""
-        return hash(self.fingerprint)
 
 
 def load_instances(paths: Sequence[str | Path], case: Case | None = None) -> tuple[list[Instance], Case]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,9 +11,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record
+from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
-from ded_bench.problem.instance import MAX_STEPS, Initial, Instance, LoadPoints, LoadRamp
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp, check_whole_steps
 
 
 class ScenarioRamp(Record):
@@ -76,7 +75,7 @@ class ScenarioLoad(Record):
         return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
 
 
-class Scenario(Record):
+class Scenario(Fingerprinted):
     """Operation of one case for `duration_s`; the loads go on for a horizon of the case beyond it."""
 
     schema_: Literal["ded-bench/scenario/1"] = Field(alias="schema", default="ded-bench/scenario/1")
@@ -91,11 +90,7 @@ class Scenario(Record):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> Scenario:
-        steps = self.duration_s / self.dt_s
-        if steps > MAX_STEPS:  # first, since the quotient may be infinite
-            raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
-        if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
-            raise ValueError("duration_s: must be a whole multiple of dt_s")
+        check_whole_steps("duration_s", self.duration_s, self.dt_s)
         if self.initial.theta is not None:
             raise ValueError("initial.theta: a scenario starts from the power flow")
         return self
@@ -158,19 +153,6 @@ class Scenario(Record):
             load=load,
             initial=self.initial,
         )
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change when anything in the scenario does."""
-        return hashlib.sha256(self.model_dump_json(by_alias=True).encode()).hexdigest()[:12]
-
-    def __eq__(self, other: object) -> bool:
-        """Equal content; cached arrays do not count."""
-        return isinstance(other, Scenario) and self.fingerprint == other.fingerprint
-
-    def __hash__(self) -> int:
-        """Equal scenarios have equal hashes."""
-        return hash(self.fingerprint)
 
 
 def load_scenarios(paths: Sequence[str | Path], case: Case) -> list[Scenario]:

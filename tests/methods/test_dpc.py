@@ -224,8 +224,9 @@ def test_a_ramp_and_its_points_are_the_same_load(case: Case) -> None:
     seen = [channels_of(case, Inputs.of(case, batch)) for batch in (ramps, points, [points[0], ramps[1]])]
     for name in ("sequence", "constants", "start", "free_response"):
         values = [getattr(channels, name) for channels in seen]
-        np.testing.assert_allclose(values[1], values[0], atol=1e-6)
-        np.testing.assert_allclose(values[2], values[0][:2], atol=1e-6)
+        # single precision: a batch of another size may be summed in another order
+        np.testing.assert_allclose(values[1], values[0], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(values[2], values[0][:2], rtol=1e-6, atol=1e-6)
     grid = ramps[0].grid
     expected = np.stack([i.p_load(case, grid) for i in ramps])
     for batch in (ramps, points):

@@ -55,7 +55,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """
     case.check_regimes([regime])
     sequence = functools.partial(AcSequence, data=AcCase.of(case))
-    return SlpSolver(case, regime, settings.time_limit_s, sequence=sequence)
+    return SlpSolver(case, regime, settings.time_limit_s, sequence=sequence, **SETTINGS[settings.name])
 
 
 class _Iterate(NamedTuple):

@@ -7,7 +7,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.ac_trajectory import linearise_along_ac
-from ded_bench.methods import ac_sequence, ded_ko_knots
+from ded_bench.methods import ac_sequence, ded_ko_knots, ded_slp
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
@@ -61,7 +61,7 @@ def test_claims_what_the_scorer_finds(index):
     found = score_ac(TWO_AREA, DATA, instance, solution.schedule, "TO")
     assert found.feasible_strict
     assert found.objective == pytest.approx(solution.solver_objective, rel=1e-6)
-    lossless = ac_sequence.prepare(TWO_AREA, "TO", Settings())(instance)
+    lossless = ded_slp.prepare(TWO_AREA, "TO", Settings())(instance)
     assert lossless.schedule is not None
     assert not score_ac(TWO_AREA, DATA, instance, lossless.schedule, "TO").feasible
 

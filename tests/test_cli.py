@@ -31,6 +31,9 @@ from ded_bench.run.results import Results, Row
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
 
+#: So much processor time may pass before the first line of a command, twice what its user should wait, s.
+FIRST_LINE_S = 4.0
+
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -221,7 +224,8 @@ def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path
     results.add([dataclasses.replace(row, objective=None, feasible=None, error="stopped") for row in rows])
     capsys.readouterr()
     assert main(["report", "--case", str(problem), "--results", str(out), "--workers", "1"]) == 0
-    assert f"ded-bench: {len(rows)} rows were solved but not scored; scored now" in capsys.readouterr().err
+    assert len(rows) == 1
+    assert "ded-bench: 1 row solved but not scored: scored now" in capsys.readouterr().err
     assert [row.objective for row in Results(out).rows.values()] == [row.objective for row in rows]
 
 
@@ -285,7 +289,7 @@ def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys
     capsys.readouterr()
     assert main(check) == 0
     said = capsys.readouterr().out
-    summary = f"4 rows checked in {results.path}, 0 differences, 1 rows without a kept schedule\n"
+    summary = f"4 rows checked in {results.path}, 0 differences, 1 row without a kept schedule\n"
     assert said == summary
     results.add([dataclasses.replace(second, objective=second.objective * (1 + 1e-8))])
     assert main([*check, "--json"]) == 1
@@ -297,7 +301,7 @@ def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys
     again = [*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]
     capsys.readouterr()
     assert main(again) == 0  # a scored row is finished, though its schedule is not kept
-    assert "5 were there already" in capsys.readouterr().err
+    assert "5 there already" in capsys.readouterr().err
 
 
 def test_a_results_folder_that_cannot_be_checked(problem: Path, tmp_path: Path, capsys) -> None:
@@ -328,7 +332,7 @@ def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp
     monkeypatch.setattr(os, "fsync", full)
     assert main([*SOLVE, "--instance", str(instance_file), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert said == ["ded-bench: 1 rows to solve", "ded-bench: No space left on device"]
+    assert said == ["ded-bench: 1 row to solve", "ded-bench: No space left on device"]
 
 
 def test_half_written_files_do_not_stay(tmp_path: Path) -> None:
@@ -400,6 +404,33 @@ def test_people_hear_at_once_what_a_command_does(monkeypatch, capsys: pytest.Cap
     monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
     assert main(["cases"]) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("cases", "9bus", "--count", "1"),
+        ("score", "--results", "results"),
+        ("bench", "--method", "ded", "--instances", "1", "--results", "results"),
+        ("report", "--results", "results"),
+        ("train-ko", "--results", "results"),
+        ("solve", "--help"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_pipe_hears_in_time_what_is_about_to_take_long(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """Processor time, not the clock's: other tests share the core."""
+    Results(tmp_path / "results").add(
+        [Row("9bus-0001", "test", "NO", "ded", "default", "Optimal", case="9bus")]
+    )
+    command = [sys.executable, "-m", "ded_bench", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        used = psutil.Process(process.pid).cpu_times()
+        process.terminate()
+    assert first.strip()
+    assert used.user + used.system < FIRST_LINE_S, first
 
 
 def test_a_locale_without_arrows(tmp_path: Path) -> None:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import sys
 import textwrap
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.surrogates import MODELS
 from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
 from ded_bench.run.environment import version
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 #: The shipped case that is meant where none is named.
 DEFAULT_CASE = "9bus"
@@ -38,11 +42,12 @@ class Parser(argparse.ArgumentParser):
 
     ending: Callable[[], str] | None = None
 
-    def format_help(self) -> str:
-        """Options, then the ending."""
+    def print_help(self, file: SupportsWrite[str] | None = None) -> None:
+        """Options at once, then the ending."""
+        super().print_help(file)
         if self.ending is not None:
-            self.epilog = self.ending()
-        return super().format_help()
+            sys.stdout.flush()
+            print(f"\n{self.ending()}", file=file)
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with code 2."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,13 +21,14 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.messages import counted, say
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
-from ded_bench.koopman.reference_run import search_folders
+from ded_bench.koopman.reference_run import reference_run, search_folders
 from ded_bench.koopman.surrogates import default_results
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.run.pool import Workers
 from ded_bench.solvers.status import Status
 
@@ -94,8 +94,6 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.bench import bench, choose_sample, runs_of
-    from ded_bench.evaluate.timing import timing_summary
     from ded_bench.methods.registry import get_method, registered
     from ded_bench.run.results import Results
     from ded_bench.truth.servable import servable
@@ -104,14 +102,20 @@ def _bench(a: argparse.Namespace) -> int:
     case = chosen.case
     results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
-    jobs = runs_of(results.rows, Settings(search=search_folders(case, results.folder)), methods)
-    if not a.method:
-        for name in sorted({key.method for key in results.rows} - set(methods)):
-            print(f"ded-bench: {name}: not timed, since no method has this name", file=sys.stderr)
-    if not jobs:
+    known = {key.method for key in results.rows}
+    if not known & set(methods):
         raise InputError(
             results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
         )
+    timed = ", ".join(sorted(known & set(methods)))
+    say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
+    if not a.method:
+        for name in sorted(known - set(methods)):
+            say(f"{name}: not timed, since no method has this name")
+    from ded_bench.evaluate.bench import bench, choose_sample, runs_of
+    from ded_bench.evaluate.timing import timing_summary
+
+    jobs = runs_of(results.rows, Settings(search=search_folders(case, results.folder)), methods)
     rows = bench(
         case,
         choose_sample([instance for instance, _ in chosen.instances], a.instances),
@@ -131,13 +135,18 @@ def _bench(a: argparse.Namespace) -> int:
 
 
 def _certify(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.certificate import Criteria, certify, rows_file, save_certificate
+    from ded_bench.methods.registry import get_method
 
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
     folder = a.results or default_results(case)
     settings = Settings(a.settings, a.model, a.policy, search=search_folders(case, folder))
+    for regime in regimes:
+        get_method(a.method).artifacts(case, regime, settings)  # says what is missing
+    say(f"{a.method} and ded-ko-knots on {counted(a.count, 'fresh instance')}, {' and '.join(regimes)}")
+    from ded_bench.evaluate.certificate import Criteria, certify, rows_file, save_certificate
+
     for regime in regimes:
         certificate = certify(
             case,
@@ -177,17 +186,20 @@ def _score_waiting(place: str, results: Results, workers: int) -> None:
         with Workers(workers) as pool:
             rows = score_unscored(chosen.case, instances, results, pool)
         if rows:
-            print(f"ded-bench: {len(rows)} rows were solved but not scored; scored now", file=sys.stderr)
+            say(f"{counted(len(rows), 'row')} solved but not scored: scored now")
 
 
 def _report(a: argparse.Namespace) -> int:
     with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
-        from ded_bench.report.report import write_report
-        from ded_bench.run.objectives import OBJECTIVES, objectives_file, objectives_of
         from ded_bench.run.results import Results
 
         case = Case.load(a.case)
         folder = a.results or default_results(case)
+        if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
+            say(f"tables and figures of {counted(rows, 'row')} in {folder}")
+        from ded_bench.report.report import write_report
+        from ded_bench.run.objectives import OBJECTIVES, objectives_file, objectives_of
+
         _score_waiting(a.case, Results(folder), a.workers)
         written = write_report(case, folder, problem_folder(a.case, case), pool)
         OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
@@ -195,13 +207,22 @@ def _report(a: argparse.Namespace) -> int:
     return 0
 
 
-def _overview(a: argparse.Namespace) -> int:
-    from ded_bench.report.grids import default_folders
-    from ded_bench.report.overview import write_overview
+def _default_folders() -> list[Path]:
+    """Of each shipped case its results below the working directory, else its reference run, if any."""
+    cases = [Case.load(path) for path in sorted(SHIPPED_CASES.glob("*/case.json"))]
+    choices = [(default_results(case), reference_run(case)) for case in cases]
+    found = [next((p for p in pair if ResultsFolder(p).results.is_file()), None) for pair in choices]
+    return [path for path in found if path is not None]
 
-    folders = a.results or default_folders()
+
+def _overview(a: argparse.Namespace) -> int:
+    folders = a.results or _default_folders()
     if not folders:
         raise InputError("results", "", "holds no results of a shipped case; run `ded-bench solve` first")
+    if all(ResultsFolder(folder).results.is_file() for folder in folders):
+        say(f"tables and figures over {', '.join(map(str, folders))}")
+    from ded_bench.report.overview import write_overview
+
     written = write_overview(folders, a.out)
     print(f"wrote {len(written)} files; read {a.out / 'overview.html'} or {a.out / 'overview.md'}")
     return 0

@@ -18,6 +18,7 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.messages import counted, say
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.koopman.surrogates import default_results
 from ded_bench.problem.benchmark import problem_folder
@@ -81,7 +82,9 @@ def _online(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
-    rows = operate(case, _operations(a, case, folder), OnlineResults(folder), a.workers, _print_row)
+    operations = _operations(a, case, folder)
+    say(f"{counted(len(operations), 'row')} asked for, each a scenario of some minutes")
+    rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row)
     return 1 if any(row.objective is None for row in rows) else 0
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import CASE_HELP, DEFAULT_CASE, command, natural, positive
+from ded_bench.cli.messages import counted, say
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import problem_folder
@@ -66,7 +67,7 @@ def _instances(a: argparse.Namespace) -> int:
         return write_benchmark(case, count, seed, folder, test, servable)
 
     manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
-    print(f"{count} instances of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
+    print(f"{counted(count, 'instance')} of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
     if manifest.redraws:
         print(f"{manifest.redraws} loads or instances were drawn again: their sign changed, or no power flow")
     return 0
@@ -122,6 +123,9 @@ def _check(case: Case, count: int) -> int:
     from ded_bench.evaluate.case_check import check_case
     from ded_bench.truth.network import PowerFlowError
 
+    sizes = f"{len(case.buses)} buses, {len(case.generators)} generators, {len(case.loads)} loads"
+    print(f"case {case.id}: {sizes}", flush=True)
+    say(f"drawing and simulating {counted(count, 'instance')}")
     try:
         found = check_case(case, count)
     except PowerFlowError as error:
@@ -137,8 +141,6 @@ def _check(case: Case, count: int) -> int:
 def _print_check(case: Case, found: CaseCheck) -> None:
     import numpy as np
 
-    sizes = f"{len(case.buses)} buses, {len(case.generators)} generators, {len(case.loads)} loads"
-    print(f"case {case.id}: {sizes}")
     angle = f"largest angle across a line {found.angle_deg:.1f} degrees"
     print(f"power flow   slack {found.p_slack:.4g} pu, {angle}")
     print(f"modes        {len(found.frequency_hz)}; knots {case.n_knots}, suggested {found.knots}")
@@ -169,5 +171,7 @@ def _scenarios(a: argparse.Namespace) -> int:
         return write_scenarios(case, a.count, a.seed, folder, servable)
 
     manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
-    print(f"{a.count} scenarios of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}")
+    print(
+        f"{counted(a.count, 'scenario')} of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}"
+    )
     return 0

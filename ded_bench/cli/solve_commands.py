@@ -21,6 +21,7 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.reference_run import search_folders
@@ -95,10 +96,10 @@ def _solve(a: argparse.Namespace) -> int:
         for task in make_tasks(case, chosen.instances, [name], a.regime or tuple(case.regimes), settings)
     ]
     for line in fallbacks(tasks, results.folder):
-        print(f"ded-bench: {line}", file=sys.stderr)
+        say(line)
     todo, unscored = unfinished(tasks, results)
     if unscored:
-        print(f"ded-bench: {len(unscored)} rows are solved already and only scored now", file=sys.stderr)
+        say(f"{counted(len(unscored), 'row')} solved already, only scored now")
 
     def print_row(row: Row) -> None:
         if a.instance:
@@ -111,13 +112,13 @@ def _solve(a: argparse.Namespace) -> int:
     if todo or unscored:
         check_writable(results.path)
         sweep(results.folder)
-    there = f", {len(finished)} are there already" if finished else ""
-    print(f"ded-bench: {len(todo)} rows to solve{there}", file=sys.stderr, flush=True)
+    there = f", {len(finished)} there already" if finished else ""
+    say(f"{counted(len(todo), 'row')} to solve{there}")
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
     bad = [row for row in rows if row.status == Status.FAILED or row.objective is None]
     print(
-        f"{len(rows)} rows in {results.path} "
-        f"({len(finished)} were there already, {len(bad)} without a score)",
+        f"{counted(len(rows), 'row')} in {results.path} "
+        f"({len(finished)} there already, {len(bad)} without a score)",
         file=sys.stderr,
     )
     return 1 if any(row.status == Status.FAILED for row in rows) else 0
@@ -138,16 +139,17 @@ def _score(a: argparse.Namespace) -> int:
 
 def _score_one(a: argparse.Namespace) -> int:
     """One schedule file, for one instance."""
-    from ded_bench.truth.ac_simulate import score_ac
-    from ded_bench.truth.score import score
-    from ded_bench.truth.simulate import SimulationError
-
     if len(a.instance or ()) != 1 or len(a.regime) != 1:
         raise InputError("--schedule", str(a.schedule), "needs one --instance and one --regime")
     chosen, (regime,) = _chosen(a), a.regime
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
+    say(f"simulating {a.schedule}")
+    from ded_bench.truth.ac_simulate import score_ac
+    from ded_bench.truth.score import score
+    from ded_bench.truth.simulate import SimulationError
+
     try:
         if a.truth == "ac":
             verdict = score_ac(case, _ac_data(a, case), instance, schedule, regime)
@@ -171,31 +173,33 @@ def _score_one(a: argparse.Namespace) -> int:
 def _score_results(a: argparse.Namespace) -> int:
     """The schedules kept in a results folder, against its rows."""
     from ded_bench.run.results import Results
-    from ded_bench.run.scoring import rescore
 
     results = Results(a.results)
     if not results.rows:
         raise InputError(results.path, "", "is missing or has no rows")
     case, instances = _instances_of(a, results)
     stream = sys.stderr if a.json else sys.stdout
+    say(f"simulating the schedules of {counted(len(results.rows), 'row')} in {a.results}")
 
-    def say(sentence: str) -> None:
+    def tell(sentence: str) -> None:
         print(sentence, file=stream, flush=True)
 
     if a.truth == "ac":
-        return _score_results_on_ac(a, case, instances, results, say)
-    check = rescore(case, instances, results, a.workers, update=a.update, on_difference=say)
+        return _score_results_on_ac(a, case, instances, results, tell)
+    from ded_bench.run.scoring import rescore
+
+    check = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)
     if a.json:
         for row in check.rows:
             _print_row(results, row)
     parts = [
-        f"{len(check.rows)} rows {'scored anew' if a.update else 'checked'} in {results.path}",
-        f"{len(check.differences)} differences",
-        f"{check.without_schedule} rows without a kept schedule",
+        f"{counted(len(check.rows), 'row')} {'scored anew' if a.update else 'checked'} in {results.path}",
+        counted(len(check.differences), "difference"),
+        f"{counted(check.without_schedule, 'row')} without a kept schedule",
         *([f"{check.unscored} not scored yet"] if check.unscored else []),
         *([f"{check.unknown} of unknown instances"] if check.unknown else []),
     ]
-    say(", ".join(parts))
+    tell(", ".join(parts))
     return 0 if a.update or not check.differences else 1
 
 
@@ -204,7 +208,7 @@ def _score_results_on_ac(
     case: Case,
     instances: dict[str, Instance],
     results: Results,
-    say: Callable[[str], None],
+    tell: Callable[[str], None],
 ) -> int:
     """The schedules kept in a results folder, on the AC network."""
     from ded_bench.run.ac_scoring import score_on_ac
@@ -216,8 +220,8 @@ def _score_results_on_ac(
     bad = [row for row in rows if row.objective is None]
     before = [row for row in rows if results.rows[row.key].feasible]
     after = sum(bool(row.feasible) for row in before)
-    say(f"{len(rows)} rows in {table}, {len(bad)} without a score")
-    say(f"{after} of the {len(before)} rows that are feasible on the paper's network are so on AC")
+    tell(f"{counted(len(rows), 'row')} in {table}, {len(bad)} without a score")
+    tell(f"{after} of the {len(before)} rows that are feasible on the paper's network are so on AC")
     return 1 if bad else 0
 
 
@@ -256,14 +260,14 @@ def _score_folder(a: argparse.Namespace) -> int:
     done = submit(chosen, a.schedules, a.name, a.regime, results, a.workers)
     bad = [row for row in done.rows if row.objective is None]
     for row in bad[:10]:
-        print(f"ded-bench: {row.regime} {row.instance}: {row.error}", file=sys.stderr)
+        say(f"{row.regime} {row.instance}: {row.error}")
     if done.unused:
         named = ", ".join(path.name for path in done.unused[:3])
-        print(f"ded-bench: {len(done.unused)} files of other instances: {named}", file=sys.stderr)
+        say(f"{counted(len(done.unused), 'file')} of other instances: {named}")
     if a.json:
         for row in done.rows:
             _print_row(results, row)
-    print(f"{len(done.rows)} rows in {results.path} ({len(bad)} without a score)", file=sys.stderr)
+    print(f"{counted(len(done.rows), 'row')} in {results.path} ({len(bad)} without a score)", file=sys.stderr)
     return 1 if bad else 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
 )
+from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
@@ -79,9 +79,6 @@ def add_commands(commands: Any) -> None:
 
 
 def _train_ko(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.rollouts import rollout_table
-    from ded_bench.koopman.identify import held_out, identify
-    from ded_bench.koopman.linear import nominal_model
     from ded_bench.koopman.surrogates import model_file
 
     case, is_ac = Case.load(a.case), a.truth == "ac"
@@ -94,8 +91,13 @@ def _train_ko(a: argparse.Namespace) -> int:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
+    say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
     if is_ac:
         return _train_ko_ac(a, case, out)
+    from ded_bench.evaluate.rollouts import rollout_table
+    from ded_bench.koopman.identify import held_out, identify
+    from ded_bench.koopman.linear import nominal_model
+
     if a.kind == "koopman":
         model = identify(case, a.seed, a.count)
     else:
@@ -143,6 +145,10 @@ def _train_dpc(a: argparse.Namespace) -> int:
         raise InputError("--settings", a.settings, "matches no settings of a method that is trained")
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method, settings and regime with --out")
+    for method in methods:
+        if not method.trainer:
+            _ = method.train  # says that it is not trained
+    say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
     if min(a.workers, len(jobs)) == 1:
         for job in jobs:
             print(train_one(a, *job), flush=True)
@@ -194,23 +200,25 @@ def _needing_torch() -> Iterator[None]:
 
 
 def _rollouts(a: argparse.Namespace) -> int:
-    from ded_bench.evaluate.lifted_bound import EXCHANGED, exchange_table
-    from ded_bench.evaluate.paper_numbers import read_paper
-    from ded_bench.evaluate.reference import choose_reference
-    from ded_bench.evaluate.rollouts import all_rollouts
     from ded_bench.koopman.surrogates import MODELS, TRAJECTORY_AC, find_surrogate
     from ded_bench.run.results import Results
 
     chosen = select_split(a.case, limit=a.limit)
     case = chosen.case
     results = Results(a.results or default_results(case))
+    say(f"simulating schedules of {case.id} on the true system and on every model")
+    from ded_bench.evaluate.lifted_bound import EXCHANGED, exchange_table
+    from ded_bench.evaluate.paper_numbers import read_paper
+    from ded_bench.evaluate.reference import choose_reference
+    from ded_bench.evaluate.rollouts import all_rollouts
+
     surrogates = []
     for name in MODELS:
         if name != TRAJECTORY_AC:  # it stands for another network than the one simulated here
             try:
                 surrogates.append(find_surrogate(case, name, search_folders(case, results.folder)))
             except InputError as error:
-                print(f"ded-bench: left out: {error}", file=sys.stderr)
+                say(f"left out: {error}")
     reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
     optimal = dict.fromkeys((reference.method, "ded-slp"))
     instances = [instance for instance, _ in chosen.instances]

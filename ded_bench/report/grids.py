@@ -18,8 +18,6 @@ from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
-from ded_bench.koopman.reference_run import reference_run
-from ded_bench.koopman.surrogates import default_results
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.sampling import load_split
 from ded_bench.run.ac_scoring import AC_ROWS, AcResults
@@ -47,14 +45,6 @@ class Grid:
     judged: pd.DataFrame
     timing: pd.DataFrame
     ac: pd.DataFrame
-
-
-def default_folders() -> list[Path]:
-    """Of each shipped case its results below the working directory, else its reference run, if any."""
-    cases = [Case.load(path) for path in sorted(SHIPPED_CASES.glob("*/case.json"))]
-    choices = [(default_results(case), reference_run(case)) for case in cases]
-    found = [next((p for p in pair if ResultsFolder(p).results.is_file()), None) for pair in choices]
-    return [path for path in found if path is not None]
 
 
 def read_grid(folder: Path) -> Grid:

@@ -216,7 +216,7 @@ def test_the_command_line_names_the_scheduler_it_cannot_reach(
     command = ["solve", "--method", "ed", "--regime", "NO", "--instance", str(shipped)]
     assert main([*command, "--out", str(tmp_path), "--scheduler", place]) == 2
     told, line = capsys.readouterr().err.splitlines()
-    assert told.startswith("ded-bench: 1 rows to solve")
+    assert told.startswith("ded-bench: 1 row to solve")
     assert line.startswith(f"ded-bench: --scheduler: {place}")
 
 

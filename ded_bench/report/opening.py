@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from ded_bench.evaluate.ablation import split_slug
 from ded_bench.evaluate.reference import DEFAULT
 from ded_bench.report.columns import FRONT_V, FRONT_VI, Column, tabulate, without_paper
 from ded_bench.report.details import rows_caption
@@ -37,7 +38,7 @@ def opening_blocks(
         alarms: why there is nothing to compare; in sight.
     """
     case, reference = sources.case, sources.reference.title
-    front = [line for line in lines if line.paper] or [line for line in lines if line.settings == DEFAULT]
+    front = [line for line in lines if line.paper] or [line for line in lines if _default(line.settings)]
     five, six = result_columns(sources, FRONT_V, FRONT_VI)
     certificates = [f"**Certificate:** {certificate.sentence}" for certificate in sources.certificates]
     regimes = ", ".join(f"{name} |ω| ≤ {limit.omega_hz:g} Hz" for name, limit in case.regimes.items())
@@ -101,6 +102,11 @@ def result_blocks(
         Heading("Schedules and frequencies"),
         *figures,
     ]
+
+
+def _default(settings: str) -> bool:
+    """Whether settings are the default ones, on whatever model."""
+    return split_slug(settings)[0] == DEFAULT
 
 
 def _split_name(split: str) -> str:

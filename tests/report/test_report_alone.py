@@ -49,6 +49,24 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
 
 
 @pytest.mark.usefixtures("sketched")
+def test_without_a_paper_every_model_stands_on_the_first_screen(threebus: Case, tmp_path: Path) -> None:
+    """Which model a method plans with is what tells methods apart there; other settings stay folded."""
+    facts = {"objective": 100.0, "feasible": True, "feasible_strict": True, "case": threebus.id}
+    runs = [
+        ("ded-slp", "default"),
+        ("ded-ko-knots", "default"),
+        ("ded-ko-knots", "default-trajectory"),
+        ("ed", "1s"),
+    ]
+    Results(tmp_path).add([Row("x", "test", "TO", *run, "Optimal", **facts) for run in runs])
+    write_report(threebus, tmp_path, tmp_path / "no-problems")
+    front, _, rest = (tmp_path / "report.md").read_text().partition("<details>")
+    assert "DED-KO (50 knots) [trajectory]" in front
+    assert "| ED [1s] |" not in front
+    assert "| ED [1s] |" in rest
+
+
+@pytest.mark.usefixtures("sketched")
 def test_why_there_is_no_gap(threebus: Case, tmp_path: Path) -> None:
     facts = {"case": threebus.id, "problems_version": "1-x"}
     row = Row("x", "test", "TO", "ed", "default", "Optimal", objective=1.0, **facts)

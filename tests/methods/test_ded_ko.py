@@ -1,117 +1,30 @@
-"""DED-KO over all points and on knots: optima agree, solutions replay, statuses are honest."""
+"""DED-KO over all points and on knots: solutions replay, statuses are honest, every surrogate serves."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 import pyomo.environ as pyo
 import pytest
-from scipy.optimize import linprog
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.condensed import CondensedRollout
 from ded_bench.koopman.energy_form import injection_lift
 from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.linear import linear_model, nominal_model
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import find_surrogate
-from ded_bench.methods import ded_ko, ded_ko_knots, knot_program
+from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
-from ded_bench.methods.knot_program import knot_points
-from ded_bench.methods.solution import Settings, Solution
-from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE, reference
-from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import sample_instance
+from ded_bench.methods.solution import Settings
+from ded_bench.methods.surrogate_program import reference
+from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
-from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
 from ded_bench.truth.score import score
-
-HORIZON = 3.0
-METHODS = (ded_ko, ded_ko_knots)
-#: Settings that need nothing installed beside the package's dependencies.
-SLUGS = sorted(set(SETTINGS) - {"executable"})
-
-
-def short(case: Case, index: int, **changes) -> Instance:
-    """An instance whose loads ramp from the start and whose slack costs differ with the index."""
-    instance = sample_instance(case, 77, index)
-    load = {bus: ramp.model_copy(update={"start": 0.5}) for bus, ramp in instance.load.items()}
-    return instance.model_copy(update={"horizon_s": HORIZON, "load": load, **changes})
-
-
-@pytest.fixture(scope="module")
-def koopman(case: Case) -> Koopman:
-    """The linearisation, starting from exact equilibria."""
-    return dataclasses.replace(linear_model(case), lift=injection_lift(case))
-
-
-class Replay(NamedTuple):
-    """What the Koopman model makes of a schedule, computed step by step."""
-
-    objective: float
-    omega: Array
-    p_slack: Array
-
-
-def replay(case: Case, koopman: Koopman, instance: Instance, schedule: Schedule) -> Replay:
-    p_gen = schedule.at(instance.grid)
-    psi = koopman.initial(Network(case), [instance])[0]
-    out = koopman.rollout(psi, np.hstack([p_gen, instance.p_load(case)]))
-    n_gen = len(case.generators)
-    p_slack = out[:, n_gen]
-    cost = p_gen @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(p_slack)
-    return Replay(float(cost.sum()), out[:, :n_gen], p_slack)
-
-
-def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Solution, regime: str) -> Replay:
-    """Every constraint at every point, and the objective that the solver claims."""
-    assert solution.status == Status.OPTIMAL
-    p_gen = solution.schedule.at(instance.grid)
-    model = replay(case, koopman, instance, solution.schedule)
-    assert model.objective == pytest.approx(solution.solver_objective, rel=1e-8)
-    assert (np.abs(model.omega[1:]) - case.omega_bound(regime)).max() <= 1.1 * OMEGA_TOLERANCE
-    assert (np.abs(np.diff(p_gen, axis=0)) <= case.ramp * instance.dt_s + 1e-9).all()
-    assert (p_gen - case.p_max).max() <= 1e-8
-    assert (case.p_min - p_gen).max() <= 1e-8
-    assert p_gen[0].tolist() == instance.p_initial(case).tolist()
-    return model
-
-
-def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
-    """The optimum on knots with every row there is, and a variable above |P_s| at every point."""
-    n_gen, grid = len(case.generators), instance.grid
-    knots = grid[knot_points(case.knot_times(grid[-1]), instance.dt_s)]
-    condensed = CondensedRollout.make(case, koopman, grid, knots)
-    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
-    n_x, n_s = len(knots) * n_gen, len(grid)
-    slack, omega = condensed.gamma[n_gen], condensed.gamma[:n_gen, 1:].reshape(-1, n_x)
-    ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
-    above, none, bound = np.eye(n_s), np.zeros, case.omega_bound(regime)
-    rows = [np.hstack([slack, -above]), np.hstack([-slack, -above])]
-    right = [-free[n_gen], free[n_gen]]
-    for sign in (1, -1):
-        rows += [np.hstack([sign * omega, none((len(omega), n_s))])]
-        right += [bound - sign * free[:n_gen, 1:].ravel()]
-        rows += [np.hstack([sign * ramps, none((len(ramps), n_s))])]
-        right += [np.outer(np.diff(knots), case.ramp).ravel()]
-    weight = np.outer(condensed.hat_weights, instance.cost_gen(case)).ravel()
-    p_initial = instance.p_initial(case)
-    bounds = [(p, p) for p in p_initial] + (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True))
-    answer = linprog(
-        np.append(weight, np.full(n_s, instance.cost_slack(case))),
-        A_ub=np.vstack(rows),
-        b_ub=np.concatenate(right),
-        bounds=bounds + n_s * [(0, None)],
-    )
-    assert answer.status == 0
-    return float(answer.fun)
+from tests.methods.on_surrogates import METHODS, SLUGS, check_limits, replay, short
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])
@@ -159,107 +72,6 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Ko
         assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9 if SETTINGS[slug] else 2e-7)
         assert again.build_s < 0.5  # built before
         assert again.setup_s < 0.5
-
-
-@pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_knots_reach_the_optimum_of_the_program_with_all_rows(
-    case: Case, koopman: Koopman, regime: str, index: int
-) -> None:
-    instance = short(case, index)
-    solution = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
-    check_limits(case, koopman, instance, solution, regime)
-    every_row = knots_with_all_rows(case, koopman, instance, regime)
-    # Where P_s has both signs within a piece, the program's cost is too low there and its answer a little
-    # dearer: by 3e-6 of the cost over a minute, by more in three seconds.
-    # What is left open of the bound is worth 2e-6.
-    assert every_row * (1 - 1e-5) <= solution.solver_objective <= every_row * (1 + 2e-4)
-    assert solution.schedule.p.shape == (case.n_knots, len(case.generators))
-
-
-@pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_knots_answer_alike_whatever_was_solved_before(case: Case, koopman: Koopman, regime: str) -> None:
-    """Every solve starts cold: not even the choice among equal optima depends on the last instance."""
-    solve = ded_ko_knots.prepare_with(case, koopman, regime, Settings())
-    fresh = solve(short(case, 0))
-    solve(short(case, 1))
-    again = solve(short(case, 0))
-    assert again.solver_objective == pytest.approx(fresh.solver_objective, rel=1e-12)
-    np.testing.assert_allclose(again.schedule.p, fresh.schedule.p, rtol=0, atol=1e-12)
-    assert again.iterations == fresh.iterations
-
-
-def least_excess(case: Case, koopman: Koopman, instance: Instance, regime: str) -> float:
-    """The least sum, over knot intervals, of the largest frequency excess in each; with every row."""
-    n_gen, grid = len(case.generators), instance.grid
-    points = knot_points(case.knot_times(grid[-1]), instance.dt_s)
-    first, knots = points[:-1], grid[points]
-    condensed = CondensedRollout.make(case, koopman, grid, knots)
-    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
-    excess = np.eye(len(first))[np.searchsorted(points, np.arange(1, len(grid))) - 1]
-    excess = np.tile(excess, (n_gen, 1))
-    omega = condensed.gamma[:n_gen, 1:].reshape(-1, len(knots) * n_gen)
-    ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
-    rows, right, bound = [], [], case.omega_bound(regime)
-    for sign in (1, -1):
-        rows += [
-            np.hstack([sign * omega, -excess]),
-            np.hstack([sign * ramps, np.zeros((len(ramps), len(first)))]),
-        ]
-        right += [bound - sign * free[:n_gen, 1:].ravel(), np.outer(np.diff(knots), case.ramp).ravel()]
-    bounds = [(p, p) for p in instance.p_initial(case)]
-    bounds += (len(knots) - 1) * list(zip(case.p_min, case.p_max, strict=True)) + len(first) * [(0, None)]
-    cost = np.append(np.zeros(len(knots) * n_gen), np.ones(len(first)))
-    answer = linprog(cost, A_ub=np.vstack(rows), b_ub=np.concatenate(right), bounds=bounds)
-    assert answer.status == 0
-    return float(answer.fun)
-
-
-def test_in_operation_what_is_infeasible_is_exceeded_least(ninebus: Case) -> None:
-    """A start beyond the bound: no schedule, but in operation the one of least excess; honest in both."""
-    koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))
-    instance, bound = short(ninebus, 0), ninebus.omega_bound("TO")
-    omega = {bus: 1.2 * bound for bus in ninebus.generators}
-    instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": omega})})
-    solver = ded_ko_knots.prepare_with(ninebus, koopman, "TO", Settings())
-    refused = solver(instance)
-    assert (refused.status, refused.schedule) == (Status.INFEASIBLE, None)
-    solution = solver.solve(instance)
-    assert (solution.status, solution.solver_objective) == (Status.INFEASIBLE, None)
-    first = knot_points(ninebus.knot_times(HORIZON), instance.dt_s)[:-1]
-    over = np.abs(replay(ninebus, koopman, instance, solution.schedule).omega).max(axis=1) - bound
-    total = np.maximum(np.maximum.reduceat(over[1:], first), 0.0).sum()
-    least = least_excess(ninebus, koopman, instance, "TO")
-    assert least > 0.2 * bound
-    assert total == pytest.approx(least, rel=1e-3)
-    feasible = short(ninebus, 1)
-    np.testing.assert_array_equal(solver.solve(feasible).schedule.p, solver(feasible).schedule.p)
-
-
-def test_tight_bounds_and_signs_need_more_rounds_than_one(ninebus: Case) -> None:
-    """Where frequency limits bind and P_s changes sign, rows must have been added, or nothing was tested."""
-    koopman = dataclasses.replace(linear_model(ninebus), lift=injection_lift(ninebus))
-    bound = ninebus.omega_bound("TO")
-    touched = crossed = 0
-    for index in range(4):
-        instance = short(ninebus, index)
-        solution = ded_ko_knots.prepare_with(ninebus, koopman, "TO", Settings())(instance)
-        model = replay(ninebus, koopman, instance, solution.schedule)
-        touched += bool((np.abs(model.omega[1:]) > bound * (1 - 1e-6)).any())
-        crossed += bool(np.ptp(np.sign(model.p_slack)) > 0)
-    assert touched
-    assert crossed
-
-
-def test_all_points_are_never_worse_than_knots(case: Case, koopman: Koopman) -> None:
-    for regime in case.regimes:
-        for index in range(3):
-            instance = short(case, index)
-            points = ded_ko.prepare_with(case, koopman, regime, Settings())(instance)
-            knots = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
-            assert points.solver_objective <= knots.solver_objective * (1 + 1e-8)
-            # 50 knots in 3 s leave little to be gained.
-            assert knots.solver_objective <= points.solver_objective * 1.01
 
 
 def test_a_looser_regime_is_never_dearer(case: Case, koopman: Koopman) -> None:
@@ -420,19 +232,3 @@ def test_a_program_too_large_is_refused_at_once(ninebus: Case, monkeypatch: pyte
         solution = method.prepare(ninebus, "NO", Settings(model="linear"))(short(ninebus, 0))
         assert (solution.status == Status.OPTIMAL) == fits
         assert fits or ("GiB" in solution.error and solution.schedule is None)
-
-
-@pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_what_piqp_does_not_solve_highs_does(regime, ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same optimum, and the row names both."""
-    instance = short(ninebus, 1)
-    solve = ded_ko_knots.prepare(ninebus, regime, Settings(model="linear"))
-    usual = solve(instance)
-    monkeypatch.setattr(
-        knot_program, "solve_form", lambda *_, **__: FormAnswer(Status.FAILED, np.empty(0), 3, "piqp", "hard")
-    )
-    rescued = solve(instance)
-    assert rescued.status == Status.OPTIMAL
-    assert "highs" in rescued.solver_version
-    # Rows that a relaxed program widens within its tolerance are worth so much.
-    assert rescued.solver_objective == pytest.approx(usual.solver_objective, rel=1e-5)

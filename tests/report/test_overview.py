@@ -21,7 +21,7 @@ from ded_bench.report.overview import write_overview
 from ded_bench.run.ac_scoring import AcResults, AcRow
 from ded_bench.run.results import Results, Row
 from tests.reading import Page
-from tests.report.test_figures import check_layout
+from tests.report.drawing import check_layout
 
 #: Generators of the shipped cases that the tests have rows of.
 GENERATORS = {"9bus": 2, "two-area": 3, "39bus": 9}

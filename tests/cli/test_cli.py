@@ -1,0 +1,200 @@
+"""The command line as a user meets it: the road on a small case, kill -9, results that are checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from ded_bench.cli import main
+from ded_bench.cli.arguments import matching
+from ded_bench.cli.outputs import sweep
+from ded_bench.run.results import Results, Row
+from tests.cli.command_line import SOLVE, run_cli
+from tests.conftest import CASE_FILES
+from tests.run.test_pool import runs, wait_until
+
+#: So much processor time may pass before the first line of a command, twice what its user should wait, s.
+FIRST_LINE_S = 4.0
+
+
+def test_solve_prints_one_object_per_row_and_score_agrees(
+    problem: Path, instance_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["solve", "--method", "ded", "--regime", "NO,TO", "--instance", instance_file, "--out", out]
+    first = run_cli(*arguments, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    rows = [json.loads(line) for line in first.stdout.splitlines()]
+    assert {row["regime"] for row in rows} == {"NO", "TO"}
+    for row in rows:
+        assert row["status"] == "Optimal"
+        scored = run_cli(
+            "score",
+            "--instance",
+            instance_file,
+            "--schedule",
+            row["schedule"],
+            "--regime",
+            row["regime"],
+            "--json",
+        )
+        verdict = json.loads(scored.stdout)
+        for name in ("objective", "freq_violation_hz", "ramp_violation", "bound_violation"):
+            assert verdict[name] == pytest.approx(row[name], rel=1e-9, abs=1e-12)
+        assert verdict["feasible"] is row["feasible"]
+    again = run_cli(*arguments, cwd=tmp_path)
+    assert [json.loads(line) for line in again.stdout.splitlines()] == rows
+    assert len(Results(out).rows) == 2
+
+
+def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
+    """First one of the workers is killed, then the main process, whose workers go with it."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "ded_bench", "solve", "--method", "ded", "--regime", "NO,TO"]
+    command += ["--case", str(problem), "--split", "all", "--workers", "2", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    workers: list[psutil.Process] = []
+
+    def wait_for_rows(count: int) -> None:
+        deadline = time.monotonic() + 120
+        while len(Results(out).rows) < count and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.01)
+        workers.extend(psutil.Process(process.pid).children())
+
+    wait_for_rows(1)
+    workers[0].kill()
+    wait_for_rows(2)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    finished = Results(out).rows
+    assert 2 <= len(finished) < 10
+    wait_until(lambda: not any(runs(worker.pid) for worker in workers))
+    rest = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert rest.returncode == 0, rest.stderr
+    after = Results(out).rows
+    assert len(after) == 10
+    assert all(row.objective is not None for row in after.values())
+    for key, row in finished.items():  # not solved a second time
+        assert (after[key].solve_s, after[key].date) == (row.solve_s, row.date)
+    assert not list(out.glob(".results.csv.*"))
+
+
+def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["solve", "--method", "ed", "--regime", "NO", "--case", str(problem), "--out", str(out)]) == 0
+    results = Results(out)
+    rows = list(results.rows.values())
+    results.add([dataclasses.replace(row, objective=None, feasible=None, error="stopped") for row in rows])
+    capsys.readouterr()
+    assert main(["report", "--case", str(problem), "--results", str(out), "--workers", "1"]) == 0
+    assert len(rows) == 1
+    assert "ded-bench: 1 row solved but not scored: scored now" in capsys.readouterr().err
+    assert [row.objective for row in Results(out).rows.values()] == [row.objective for row in rows]
+
+
+def test_errors_do_not_depend_on_the_working_directory(instance_file: Path, tmp_path: Path) -> None:
+    shipped = CASE_FILES["9bus"].parent / "instances" / "9bus-0007.json"
+    copy = tmp_path / "alone.json"
+    copy.write_bytes(shipped.read_bytes())  # no case beside it: the shipped one is meant
+    schedule = tmp_path / "s.csv"
+    schedule.write_text("t,P_2,P_3\n0,2.03748309,0.56635889\n60,2.03748309,0.56635889\n")
+    done = run_cli(
+        "score", "--instance", "alone.json", "--schedule", "s.csv", "--regime", "TO", "--json", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["initial_violation"] == 0.0
+
+
+def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys) -> None:
+    """Exit code 0 if every kept schedule says what its row says, else 1 and a line for each that does not."""
+    out = tmp_path / "out"
+    assert main([*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]) == 0
+    results = Results(out)
+    first, second, *_ = results.rows.values()
+    results.schedule_path(first.key).unlink()
+    check = ["score", "--results", str(out), "--case", str(problem)]
+    capsys.readouterr()
+    assert main(check) == 0
+    said = capsys.readouterr().out
+    summary = f"4 rows checked in {results.path}, 0 differences, 1 row without a kept schedule\n"
+    assert said == summary
+    results.add([dataclasses.replace(second, objective=second.objective * (1 + 1e-8))])
+    assert main([*check, "--json"]) == 1
+    out_text, err = capsys.readouterr()
+    assert len([json.loads(line) for line in out_text.splitlines()]) == 4
+    assert f"ded default NO {second.instance}: objective" in err
+    assert main([*check, "--update"]) == 0
+    assert main(check) == 0
+    again = [*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]
+    capsys.readouterr()
+    assert main(again) == 0  # a scored row is finished, though its schedule is not kept
+    assert "5 there already" in capsys.readouterr().err
+
+
+def test_half_written_files_do_not_stay(tmp_path: Path) -> None:
+    """Those that a killed process left, not those that another one is writing now, nor anything else."""
+    kept = [tmp_path / ".lock", tmp_path / "results.csv", tmp_path / "schedules" / ".x.csv.gz.abcd1234"]
+    left = [tmp_path / ".results.csv.a_b1c2d3", tmp_path / "schedules" / "ded" / ".a.csv.gz.12345678"]
+    for path in (*kept, *left):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    for path in (*kept[:2], *left):
+        os.utime(path, (0, 0))
+    sweep(tmp_path)
+    assert [path.exists() for path in (*kept, *left)] == [True, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("cases", "9bus", "--count", "1"),
+        ("score", "--results", "results"),
+        ("bench", "--method", "ded", "--instances", "1", "--results", "results"),
+        ("report", "--results", "results"),
+        ("train-ko", "--results", "results"),
+        ("solve", "--help"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_pipe_hears_in_time_what_is_about_to_take_long(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """Processor time, not the clock's: other tests share the core."""
+    Results(tmp_path / "results").add(
+        [Row("9bus-0001", "test", "NO", "ded", "default", "Optimal", case="9bus")]
+    )
+    command = [sys.executable, "-m", "ded_bench", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        used = psutil.Process(process.pid).cpu_times()
+        process.terminate()
+    assert first.strip()
+    assert used.user + used.system < FIRST_LINE_S, first
+
+
+def test_a_locale_without_arrows(tmp_path: Path) -> None:
+    """`compare` prints them between what was and what is."""
+    row = Row(*("x-0", "test", "NO", "ded", "default", "Optimal"), objective=1.0, case="x", feasible=True)
+    Results(tmp_path / "a").add([row])
+    Results(tmp_path / "b").add([dataclasses.replace(row, status="Infeasible", feasible=False)])
+    ascii_only = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-m", "ded_bench", "compare", "a", "b"]
+    done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=ascii_only, check=False)
+    assert done.returncode == 1, done.stderr
+    assert b"Optimal ? Infeasible" in done.stdout
+
+
+def test_settings_are_named_or_matched() -> None:
+    known = {"default": {}, "steps25": {}, "steps100": {}}
+    assert matching("default", known) == ["default"]
+    assert matching("steps*,default,steps25", known) == ["steps25", "steps100", "default"]
+    assert matching("nope", known) == ["nope"]  # its method says what is wrong
+    assert matching("nope*", known) == []

@@ -1,0 +1,83 @@
+"""What the command line says of itself."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+
+import pytest
+
+import ded_bench
+from ded_bench.cli import main
+from ded_bench.cli.arguments import ORDER
+from ded_bench.cli.commands import parser
+from ded_bench.methods import plugin
+from ded_bench.methods.registry import METHODS
+from tests.cli.command_line import run_cli
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"ded-bench {ded_bench.__version__}\n"
+    assert ded_bench.__version__.count(".") == 2
+
+
+def test_every_command_has_help() -> None:
+    overview = run_cli("--help").stdout
+    assert max(map(len, overview.splitlines())) <= 80
+    listed = [line.split()[0] for line in overview.splitlines() if line.startswith("    ") and line[4] != " "]
+    road = ["cases", "instances", "train-ko", "solve", "train-dpc", "bench", "report"]
+    assert listed[: len(road)] == road
+    assert listed == sorted(listed, key=ORDER.index)  # none is missing there
+
+
+def shown_help(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_help_tells_every_option_its_default(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    for name, command in commands.items():
+        text = shown_help(name, capsys)
+        for action in command._actions:
+            assert action.help, (name, action.dest)
+            default = action.default
+            if action.option_strings and default not in (None, argparse.SUPPRESS) and default is not False:
+                told = ",".join(default) if isinstance(default, tuple) else default
+                assert f"default: {told}" in text, (name, action.dest)
+
+
+def test_help_lists_methods_and_settings(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of other packages too; one that cannot be imported says so, and the help goes on."""
+    targets = {"flat": "tests.strange_methods:prepare", "gone": "no.such.module:solve"}
+    monkeypatch.setattr(plugin, "installed", lambda: targets)
+    for command in ("solve", "online", "bench", "train-dpc"):
+        text = shown_help(command, capsys)
+        for method in METHODS.values():
+            assert f"{method.name} {', '.join(method.settings)}" in text
+        assert "flat default" in text
+        assert "gone cannot be used: " in text
+
+
+def test_people_hear_at_once_what_a_command_does(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before the imports of the command itself; a pipe hears nothing but the answer."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    assert main(["cases"]) == 0
+    assert capsys.readouterr().err.startswith("ded-bench: list the shipped cases")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
+    assert main(["cases"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_windows_is_told_plainly() -> None:
+    code = "import sys; sys.platform = 'win32'; import ded_bench.cli"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "needs Linux or macOS" in done.stderr

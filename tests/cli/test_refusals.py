@@ -1,0 +1,171 @@
+"""Bad input of every kind: exit code 2 and one line that says what is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ded_bench.cli import main
+from ded_bench.run.results import Results, Row
+from tests.cli.command_line import SOLVE, refused
+from tests.conftest import CASE_FILES
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda d: d | {"colour": "red"}, "colour"),
+        (lambda d: {k: v for k, v in d.items() if k != "dt_s"}, "dt_s"),
+        (lambda d: d | {"horizon_s": float("nan")}, "horizon_s"),
+        (lambda d: d | {"horizon_s": 1.005}, "horizon_s"),
+        (lambda d: d | {"cost": d["cost"] | {"s": -1.0}}, "cost.s"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"duration": -1.0}}}, "load.town.duration"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"initial": -100.0}}}, "load"),
+        (lambda d: d | {"load": {"town": d["load"]["town"] | {"rate": -1e3, "start": 0.0}}}, "load"),
+        (lambda d: d | {"case": "atlantis"}, "atlantis"),
+    ],
+)
+@pytest.mark.parametrize("command", ["solve", "score"])
+def test_bad_instances(command, change, named, instance_file, schedule_file, tmp_path, capsys) -> None:
+    path = tmp_path / "bad.json"
+    path.write_text(json.dumps(change(json.loads(instance_file.read_text()))))
+    case = () if "atlantis" in named else ("--case", CASE_FILES["threebus"])
+    if command == "solve":
+        line = refused(capsys, *SOLVE, *case, "--instance", path, "--out", tmp_path / "out")
+    else:
+        line = refused(
+            capsys, "score", *case, "--instance", path, "--schedule", schedule_file, "--regime", "NO"
+        )
+    assert named in line
+    assert "bad.json" in line or named == "atlantis"
+
+
+def test_an_edited_copy_and_wrong_units(problem: Path, instance_file: Path, tmp_path: Path, capsys) -> None:
+    """Refused before anything is solved, also in a benchmark of one's own."""
+    out, text = tmp_path / "out", instance_file.read_text()
+    path = tmp_path / "copy.json"
+    case = ("--case", problem)
+    path.write_text(json.dumps(json.loads(text) | {"cost": {"s": 9.0, "plant": 1.0}}))
+    line = refused(capsys, *SOLVE, *case, "--instance", path, "--out", out)
+    assert "id: threebus-0000 is the name of" in line
+    own = tmp_path / "own"
+    shutil.copytree(problem, own)
+    for change, named in (
+        ({"initial": {"power": {"plant": 0.6}, "omega": {"plant": 59.9}}}, "initial.omega.plant: 59.9 rad/s"),
+        ({"initial": {"power": {"plant": 60.0}, "omega": {"plant": 0.0}}}, "the power flow has no"),
+    ):
+        changed = own / "instances" / instance_file.name
+        changed.write_text(json.dumps(json.loads(text) | change))
+        line = refused(capsys, *SOLVE, "--case", own, "--split", "all", "--out", out)
+        assert named in line
+        assert "instance threebus-0000" in line
+    assert not out.exists()
+
+
+def test_a_versioned_case_is_not_changed_by_chance(tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "threebus"
+    shutil.copytree(CASE_FILES["threebus"].parent, folder)
+    for command, wanted in (("instances", 4), ("scenarios", 2)):
+        draw = [command, "--case", str(folder)]
+        place = folder if command == "instances" else folder / "scenarios"
+        assert main([*draw, "--count", str(wanted)]) == 0  # it has no version yet
+        before = {path: path.read_bytes() for path in place.rglob("*.json")}
+        capsys.readouterr()
+        line = refused(capsys, *draw, "--count", "3", "--seed", "7")
+        assert "--out" in line
+        assert "--force" in line
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
+        lost = sorted(place.rglob("*0001.json"))[0]
+        lost.unlink()
+        assert main([*draw, "--count", str(wanted)]) == 0  # the same again: made whole
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
+        assert main([*draw, "--count", "3", "--seed", "7", "--out", str(tmp_path / command)]) == 0
+        assert main([*draw, "--count", "3", "--seed", "7", "--force"]) == 0
+        assert {path: path.read_bytes() for path in place.rglob("*.json")} != before
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("t,P_plant\n0.5,0.6\n6,0.6\n", "must start at 0"),
+        ("t,P_plant\n0,0.6\n5,0.6\n", "must end at the horizon"),
+        ("t,P_plant\n0,0.6\n0,0.6\n6,0.6\n", "increase strictly"),
+        ("t,P_plant\n0,nan\n6,0.6\n", "line 2, P_plant"),
+        ("t,P_7\n0,0.6\n6,0.6\n", "P_plant"),
+        ("", "empty"),
+    ],
+)
+def test_bad_schedules(text, named, instance_file, tmp_path, capsys) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    line = refused(capsys, "score", "--instance", instance_file, "--schedule", path, "--regime", "NO")
+    assert "bad.csv" in line
+    assert named in line
+
+
+def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
+    out = ("--out", tmp_path / "out")
+    chosen = ("--instance", instance_file)
+    assert "magic" in refused(capsys, "solve", "--method", "magic", "--regime", "NO", *chosen, *out)
+    assert "'XX'" in refused(capsys, "solve", "--method", "ded", "--regime", "XX", *chosen, *out)
+    assert "magic" in refused(capsys, *SOLVE, "--settings", "magic", *chosen, *out)
+    assert "nowhere.json" in refused(capsys, *SOLVE, "--instance", tmp_path / "nowhere.json", *out)
+    assert "--workers" in refused(capsys, *SOLVE, "--workers", "0", *chosen, *out)
+    both = ("--workers", "1", "--scheduler", "tcp://127.0.0.1:1")
+    assert "not allowed with" in refused(capsys, *SOLVE, *both, *chosen, *out)
+    assert "--time-limit" in refused(capsys, *SOLVE, "--time-limit", "nan", *chosen, *out)
+    assert "'XX'" in refused(capsys, "score", *chosen, "--schedule", schedule_file, "--regime", "XX")
+    assert "train-ko" in refused(capsys, "solve", "--method", "ded-ko", "--regime", "NO", *chosen, *out)
+    assert "COMMAND" in refused(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_results_folder_that_cannot_be_checked(problem: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "empty").mkdir()
+    for folder in ("nowhere", "file", "empty"):
+        assert folder in refused(capsys, "score", "--results", tmp_path / folder)
+    (tmp_path / "empty" / "results.csv").write_text("a,b\n1,2\n")
+    assert "(found: a, b)" in refused(capsys, "score", "--results", tmp_path / "empty")
+    Results(tmp_path / "odd").add([Row("x", "test", "NO", "ded", "default", "Optimal", case="atlantis")])
+    assert "atlantis" in refused(capsys, "score", "--results", tmp_path / "odd")
+    assert "--update" in refused(capsys, "score", "--schedule", "a.csv", "--regime", "NO", "--update")
+    assert "--regime" in refused(capsys, "score", "--schedule", "a.csv")
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "/proc/none"])
+def test_a_folder_that_cannot_be_made(place: str, instance_file: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / place
+    assert str(place) in refused(capsys, *SOLVE, "--instance", instance_file, "--out", out)
+    assert place in refused(capsys, "train-ko", "--case", CASE_FILES["threebus"].parent, "--out", out / "k")
+
+
+def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp_path: Path, capsys) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert main([*SOLVE, "--instance", str(instance_file), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["ded-bench: 1 row to solve", "ded-bench: No space left on device"]
+
+
+@pytest.mark.parametrize(
+    ("options", "problem_said"),
+    [
+        (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method, settings and regime"),
+        (("--settings", "nope*"), "matches no settings"),
+        (("--method", "ded", "--regime", "TO"), "is not trained"),
+    ],
+)
+def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train-dpc", *options]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert problem_said in err

@@ -1,0 +1,18 @@
+"""Models that several tests of methods share."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from ded_bench.koopman.energy_form import injection_lift
+from ded_bench.koopman.linear import linear_model
+from ded_bench.koopman.model import Koopman
+from ded_bench.problem.case import Case
+
+
+@pytest.fixture(scope="module")
+def koopman(case: Case) -> Koopman:
+    """The linearisation, starting from exact equilibria."""
+    return dataclasses.replace(linear_model(case), lift=injection_lift(case))

@@ -42,7 +42,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
-    p.add_argument("--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac.npz")
+    p.add_argument("--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac")
     p.add_argument("--noise", type=positive_number, metavar="HZ", help="of measured frequencies (--truth ac)")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")

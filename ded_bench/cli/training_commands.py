@@ -169,6 +169,7 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     from ded_bench.methods.registry import get_method
     from ded_bench.methods.solution import Settings
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
+    from ded_bench.run.code import code_of
 
     method, case = get_method(name), Case.load(a.case)
     setting: dict[str, Any] = dict(method.options(Settings(slug)))
@@ -182,7 +183,8 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     model = find_model(case, a.model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)
-    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume)
+    code = code_of(method.trainer) if method.trainer.startswith("ded_bench.") else ""
+    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume, code)
     facts = train(case, regime, instances, model, out, options, **setting).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"

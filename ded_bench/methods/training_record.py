@@ -36,6 +36,7 @@ class TrainingOptions:
     seconds: float | None = None  # end after so much training time; None: train for all epochs
     device: str = "cpu"  # or "cuda"
     resume: bool = False  # go on from the checkpoint, if there is one
+    code: str = ""  # hash of the sources that train, a fact that the policy's file tells
 
 
 class TrainedPolicy(Protocol):

@@ -258,6 +258,7 @@ TRAINING = (
     Column("seed", "seed"),
     Column("device", "device"),
     Column("torch", "torch"),
+    Column("code", "code"),
     Column("problem", "problem"),
 )
 MODELS = (

@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 import torch
 
+from ded_bench.cli import main
+from ded_bench.evaluate.ablation import training_table
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.condensed import free_response
 from ded_bench.koopman.linear import linear_model
@@ -27,12 +29,14 @@ from ded_bench.methods.dpc_paper.paper_policy import METHOD, SETTINGS, Policy, p
 from ded_bench.methods.dpc_paper.paper_training import LEARNING_RATE, Batch, Loss, Recipe, train
 from ded_bench.methods.policy_file import Scope, policy_file, weights_of
 from ded_bench.methods.policy_solver import method
+from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import HISTORY, TrainingOptions
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.code import code_of
 from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 
@@ -321,3 +325,10 @@ def test_what_is_timed_is_what_is_answered(policy: Policy, threebus: Case) -> No
     solve(instance)
     solve(instance)
     assert asked[1:] == ["mine", "mine"]
+
+
+def test_a_policy_trained_by_the_command_says_which_code_trained_it(tmp_path: Path) -> None:
+    out = tmp_path / "policies" / "p.safetensors"
+    arguments = ["--method", METHOD, "--regime", "TO", "--model", "linear", "--epochs", "1", "--limit", "1"]
+    assert main(["train-dpc", *arguments, "--out", str(out)]) == 0
+    assert training_table(tmp_path, ["code"])["code"].tolist() == [code_of(METHODS[METHOD].trainer)]

@@ -111,6 +111,6 @@ def test_a_place_that_cannot_be_written_is_told_before_the_training(problem: Pat
     (out / "file").write_text("")
     for place in (out / "file" / "p.safetensors", Path("/proc/p.safetensors")):
         assert train(problem, out, "--out", str(place)) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        _, line = capsys.readouterr().err.splitlines()  # after what it is about to do
         assert str(place) in line
         assert "cannot be written" in line

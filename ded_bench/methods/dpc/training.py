@@ -190,6 +190,7 @@ def train(
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
         "torch": torch.__version__,
+        "code": options.code,
         "device": device,
     }
     policy = DispatchPolicy.of(scope, network, training)

@@ -155,6 +155,7 @@ def train(
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
         "torch": torch.__version__,
+        "code": options.code,
         "device": options.device,
     }
     training["training_loss" if held_out is None else "held_out_loss"] = run.lowest

@@ -216,6 +216,12 @@ TIMING = (
     Column("date", "date"),
     Column("error", "error"),
 )
+FRONT_TIMING = tuple(
+    column
+    for column in TIMING
+    if column.name.startswith("solve_s")
+    or column.name in ("regime", "title", "instances", "repeats", "setup_s", "build_s", "peak_memory_mib")
+)
 LOADED_TIMES = (
     *_HEAD,
     Column("n", "n"),
@@ -300,3 +306,5 @@ CERTIFICATE = (
     Column("host", "host"),
     Column("date", "date"),
 )
+#: What was certified, and how surely; the rest tells how.
+FRONT_CERTIFICATE = CERTIFICATE[: [column.name for column in CERTIFICATE].index("tolerance_hz")]

@@ -17,6 +17,8 @@ from ded_bench.report.columns import (
     CERTIFICATE,
     CLAIMS,
     COVERAGE,
+    FRONT_CERTIFICATE,
+    FRONT_TIMING,
     GAPS,
     LOADED_TIMES,
     MODELS,
@@ -74,12 +76,17 @@ def method_blocks(sources: Sources, frames: dict[str, pd.DataFrame], gallery: Ga
     return blocks
 
 
-def _usual(frame: pd.DataFrame, columns: tuple[Column, ...], caption: str) -> list[Block]:
-    """A table of the default settings; that of all settings is folded away."""
+def _usual(
+    frame: pd.DataFrame, columns: tuple[Column, ...], caption: str, front: tuple[Column, ...] = ()
+) -> list[Block]:
+    """A table of the default settings, and of some columns; that of all is folded away."""
     usual = frame[frame["settings"] == DEFAULT]
-    if len(usual) in (0, len(frame)):
-        return [Table(frame, columns, caption)]
-    return [Table(usual, columns, caption), *folded("With all settings", Table(frame, columns, caption))]
+    shown = usual if len(usual) else frame
+    table = Table(shown, front or columns, caption)
+    if len(shown) == len(frame) and not front:
+        return [table]
+    summary = "With all settings and columns" if front else "With all settings"
+    return [table, *folded(summary, Table(frame, columns, caption))]
 
 
 def _worst(worst: pd.DataFrame, gallery: Gallery) -> list[Block]:
@@ -107,7 +114,7 @@ def _times(timing: pd.DataFrame, frames: dict[str, pd.DataFrame], gallery: Galle
             title=[title(m, s) for m, s in zip(ordered["method"], ordered["settings"], strict=True)]
         )
         caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
-        blocks += _usual(named, TIMING, caption)
+        blocks += _usual(named, TIMING, caption, FRONT_TIMING)
     else:
         blocks.append(Text("No method was timed alone yet; run `ded-bench bench`."))
     loaded = Table(frames["times_under_load"], LOADED_TIMES, "Comparable by orders of magnitude only, s")
@@ -128,7 +135,8 @@ def training_blocks(sources: Sources, frames: dict[str, pd.DataFrame], gallery: 
     blocks += gallery.of("koopman")
     blocks.append(Heading("Training of the policies"))
     if len(frames["training"]):
-        blocks.append(Table(frames["training"], TRAINING))
+        filled = frames["training"].map(lambda value: value not in ("", None)).any()
+        blocks.append(Table(frames["training"], tuple(c for c in TRAINING if filled[c.name])))
     else:
         blocks.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
     if len(frames["ablation"]):
@@ -136,6 +144,7 @@ def training_blocks(sources: Sources, frames: dict[str, pd.DataFrame], gallery: 
         caption = f"Ablation of {names}: short trainings, each with one thing changed; validation instances"
         blocks += folded(caption, Table(frames["ablation"], ABLATION))
     blocks += gallery.of("training")
+    blocks += folded("Trainings with other settings", *gallery.of("training_settings"))
     blocks.append(Heading("Certificate"))
     blocks += _certificates(sources.certificates)
     return blocks
@@ -145,7 +154,9 @@ def _certificates(certificates: Sequence[Certificate]) -> list[Block]:
     if not certificates:
         return [Text("No certificate was made for these results; `ded-bench certify` makes one.")]
     rows = [c.model_dump() | {"title": title(c.method, c.settings)} for c in certificates]
-    return [Table(pd.DataFrame(rows), CERTIFICATE)]
+    frame = pd.DataFrame(rows)
+    whole = Table(frame, CERTIFICATE)
+    return [Table(frame, FRONT_CERTIFICATE), *folded("With tolerances, seed, models and machine", whole)]
 
 
 #: What a table of rollout errors is about, by its name; the others have a model's.
@@ -164,8 +175,7 @@ def _rollout_errors(rollouts: Mapping[str, pd.DataFrame]) -> list[Block]:
             name, f"on simulated trajectories held out from the identification of `{name}`"
         )
         caption = f"Errors of rollouts over the whole horizon {where}"
-        table = Table(errors, columns, caption)
-        blocks += [table] if name in ERRORS_WHERE else folded(caption, table)
+        blocks += folded(caption, Table(errors, columns))
     return blocks
 
 

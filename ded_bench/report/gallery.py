@@ -67,7 +67,8 @@ class Gallery:
         name = re.sub(r"[^A-Za-z0-9_.-]+", "-", name)
         stem = self.sources.results.folder / "figures" / name
         self.files += [stem.parent / f"{name}.{form}" for form in formats]
-        self.pictures.setdefault(topic, []).append(Picture(f"figures/{name}.png", caption))
+        picture = Picture(f"figures/{name}.png", caption, wide=topic == "worst")
+        self.pictures.setdefault(topic, []).append(picture)
         return paint, (stem, formats, dpi, figure, arguments)
 
     def of(self, topic: str, otherwise: str = "") -> list[Block]:
@@ -345,19 +346,22 @@ def without_curve(frame: pd.DataFrame, profile: pd.DataFrame) -> str:
 
 
 def _draw_training(gallery: Gallery) -> Iterator[Call]:
-    """One figure per method; the short trainings of a study are left to its table."""
-    curves: dict[str, dict[str, pd.DataFrame]] = {}
+    """One figure per method, and one of its other settings; a study's trainings are left to its table."""
+    curves: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
     for history in gallery.sources.histories:
         if f"-{STUDY}" not in history.name:
-            curves.setdefault(history.method, {})[history.name] = history.table
-    for method, tables in curves.items():
+            usual = history.name.endswith(tuple(f"-{regime}" for regime in gallery.sources.case.regimes))
+            kind = "" if usual else "_settings"
+            curves.setdefault((history.method, kind), {})[history.name] = history.table
+    for (method, kind), tables in curves.items():
         trained = title(method) if method else "unknown methods"
+        trained += ", other settings," * bool(kind)
         caption = (
             f"Loss of each policy of {trained} over its training time; "
             "right: the terms of the loss, without those that hardly change."
         )
-        name = f"training_{method or 'other'}"
-        yield gallery.add("training", name, caption, history_figure, tables)
+        name = f"training_{method or 'other'}{kind}"
+        yield gallery.add(f"training{kind}", name, caption, history_figure, tables)
 
 
 def _draw_problem(gallery: Gallery) -> Iterator[Call]:

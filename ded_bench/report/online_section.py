@@ -18,12 +18,13 @@ from ded_bench.report.columns import Column
 from ded_bench.report.figures.online import (
     KIND_NAMES,
     Operated,
+    counted,
     forecast_figure,
     latency_figure,
     scenario_figure,
 )
 from ded_bench.report.gallery import Gallery
-from ded_bench.report.page import Block, Heading, Items, Table
+from ded_bench.report.page import Block, Heading, Items, Table, folded
 from ded_bench.run.pool import Call
 
 #: So many methods are drawn on one scenario: static dispatch of every second, then those of least excess.
@@ -79,7 +80,7 @@ def draw_online(gallery: Gallery) -> Iterator[Call]:
         name = title(str(method), str(settings))
         caption = (
             f"{name} in the closed loop against its latency, by what its plans know; the mean over "
-            f"{_counted(lines)} scenarios. Markers: methods at their own latency, over their own scenarios. "
+            f"{counted(lines)} scenarios. Markers: methods at their own latency, over their own scenarios. "
             "Axes are linear near zero."
         )
         drawn = (latency_figure, lines, own, f"{case.id}: {name}")
@@ -112,16 +113,13 @@ def online_blocks(gallery: Gallery) -> list[Block]:
     tables = online_tables(gallery)
     if not tables:
         return []
-    return [Heading("The closed loop"), Items(EXPLANATION), *tables.values(), *gallery.of("online")]
+    explained = folded("How to read the closed loop", Items(EXPLANATION))
+    return [Heading("The closed loop"), *tables.values(), *explained, *gallery.of("online")]
 
 
 def _titled(lines: pd.DataFrame) -> pd.DataFrame:
     names = [title(m, s) for m, s in zip(lines["method"], lines["settings"], strict=True)]
     return lines.assign(title=names)
-
-
-def _counted(lines: pd.DataFrame) -> str:
-    return "/".join(map(str, sorted(set(lines["n"]))))
 
 
 def _draw_scenarios(gallery: Gallery, results: OnlineResults, frame: pd.DataFrame) -> Iterator[Call]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,10 +62,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG, by its path relative to the results folder."""
+    """A PNG, by its path relative to the results folder; beside the next one unless `wide`."""
 
     path: str
     caption: str
+    wide: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,9 +134,7 @@ def render_html(blocks: Sequence[Block], folder: Path) -> str:
         if isinstance(block, Heading) and block.level == 2
     )
     contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    body = [_html(block, folder) for block in blocks]
-    body.insert(1, contents)  # under the page's own title
-    content = "\n".join(body)
+    content = "\n".join((_all(blocks[:1], folder), contents, _all(blocks[1:], folder)))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -142,6 +142,15 @@ def render_html(blocks: Sequence[Block], folder: Path) -> str:
         f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{content}\n</main>\n</body>\n</html>\n"
     )
+
+
+def _all(blocks: Sequence[Block], folder: Path) -> str:
+    """Blocks one after another; pictures that follow each other share the width of a screen."""
+    parts = []
+    for small, group in itertools.groupby(blocks, lambda b: isinstance(b, Picture) and not b.wide):
+        inside = "\n".join(_html(block, folder) for block in group)
+        parts.append(f'<div class="pictures">{inside}</div>' if small else inside)
+    return "\n".join(parts)
 
 
 def _html(block: Block, folder: Path) -> str:
@@ -165,10 +174,9 @@ def _html(block: Block, folder: Path) -> str:
             words = f"<figcaption>{_inline(caption)}</figcaption>"
             return f'<figure><div class="scroll">{image}</div>{words}</figure>'
         case Details(summary, blocks):
-            inside = "\n".join(_html(inner, folder) for inner in blocks)
-            return f"<details><summary>{_inline(summary)}</summary>\n{inside}\n</details>"
+            return f"<details><summary>{_inline(summary)}</summary>\n{_all(blocks, folder)}\n</details>"
         case SideBySide(left, right):
-            parts = ("\n".join(_html(inner, folder) for inner in part) for part in (left, right))
+            parts = (_all(part, folder) for part in (left, right))
             return f'<div class="side">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
 
 

@@ -11,6 +11,8 @@ from ded_bench.report.columns import Column
 
 #: Cells with more characters may be broken into lines.
 LONG, WORDS = 32, ' class="words"'
+#: Tables of so many columns are set in smaller type.
+MANY = 12
 #: The column that stays in sight when a narrow screen is scrolled sideways.
 LABEL = "title"
 
@@ -57,7 +59,8 @@ def to_html(frame: pd.DataFrame, columns: Sequence[Column]) -> str:
         previous = row[0]
         body.append(f"<tr{first}>{cells}</tr>")
     rows = "\n".join(body)
-    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
+    size = ' class="wide"' if len(columns) >= MANY else ""
+    return f"<table{size}>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
 
 
 def _class(frame: pd.DataFrame, column: Column) -> str:

@@ -32,6 +32,10 @@ figure { margin: 1rem 0; }
 figcaption { color: var(--soft); font-size: 0.9rem; max-width: 46rem; margin: 0.5rem 0; }
 .table figcaption { color: var(--ink); font-weight: 600; }
 .scroll { overflow-x: auto; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 34rem), 1fr));
+  gap: 0 1.5rem; }
+.pictures > figure { min-width: 0; }
+.pictures img { max-width: min(100%, 46rem); }
 img { display: block; max-width: min(100%, 56rem); min-width: min(100%, 34rem); height: auto; }
 table { border-collapse: collapse; font-size: 0.875rem; line-height: 1.35; font-variant-numeric: tabular-nums;
   border-top: 2px solid var(--ink); border-bottom: 2px solid var(--ink); }
@@ -39,6 +43,9 @@ th { text-align: left; vertical-align: bottom; border-bottom: 1px solid var(--in
 th, td { padding: 0.3rem 0.7rem 0.3rem 0; }
 th + th, td + td { padding-left: 0.7rem; }
 td { vertical-align: top; white-space: nowrap; }
+.wide { font-size: 0.78rem; }
+.wide th + th, .wide td + td { padding-left: 0.35rem; }
+.wide th, .wide td { padding-right: 0.35rem; }
 .words { white-space: normal; min-width: 14rem; }
 .number { text-align: right; }
 tr.first td { border-top: 1px solid var(--line); }
@@ -51,7 +58,7 @@ tbody tr:hover { background: #f6f8fa; }
   main { padding: 0.75rem 0.9rem 3rem; }
   h1 { font-size: 1.5rem; }
   h2 { font-size: 1.25rem; margin-top: 2rem; }
-  img { max-width: none; width: 38rem; min-width: 100%; }
+  img, .pictures img { max-width: none; width: 38rem; min-width: 100%; }
   .side img { width: 100%; }
   table { font-size: 0.8rem; }
   .label { position: sticky; left: 0; background: #fff; white-space: normal;

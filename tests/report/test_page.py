@@ -88,10 +88,29 @@ def test_both_renderings_of_every_block(tmp_path: Path) -> None:
         "<li>second</li>",
         'href="#part-one"',
         'id="part-one"',
-        '<div class="side"><div><p>on the left</p></div><div><figure>',
+        '<div class="side"><div><p>on the left</p></div><div><div class="pictures"><figure>',
         '<details><summary>more &amp; &lt;more&gt;</summary>\n<h3 id="folded">',
         '</h1>\n<nav aria-label="Contents">',
     ):
         assert part in text
     assert "A <title>" in page.text
     assert base64.b64encode(b"picture").decode() in text
+
+
+def test_pictures_that_follow_each_other_stand_side_by_side(tmp_path: Path) -> None:
+    """Wide ones, and those with something between them, do not."""
+    (tmp_path / "p.png").write_bytes(b"picture")
+    small, wide = Picture("p.png", "small"), Picture("p.png", "wide", wide=True)
+    text = render_html([Heading("T", 1), small, small, wide, small, Text("words"), wide], tmp_path)
+    rows = text.split('<div class="pictures">')[1:]
+    assert [row.partition("</div>\n<")[0].count("small</figcaption>") for row in rows] == [2, 1]
+    assert [row.partition("</figure></div>")[0].count("wide</figcaption>") for row in rows] == [0, 0]
+    assert text.count("<figure>") == 5
+    assert not Page(text).open
+
+
+def test_a_table_of_many_columns_is_set_smaller() -> None:
+    columns = [Column(f"c{i}", f"c{i}") for i in range(12)]
+    frame = pd.DataFrame({column.name: [1] for column in columns})
+    assert to_html(frame, columns).startswith('<table class="wide">')
+    assert to_html(frame, columns[:11]).startswith("<table>")

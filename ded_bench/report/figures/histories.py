@@ -15,7 +15,6 @@ from ded_bench.report.figures.style import (
     BUS_COLOURS,
     DASHES,
     GREY,
-    legend_above,
     legend_below,
     new_figure,
     plain,
@@ -44,11 +43,11 @@ def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
             for column, paint, width in (("training", GREY, 0.8), ("held out", BLACK, 1.4)):
                 taken = history.get(column, pd.Series(dtype=float)).dropna()
                 if len(taken):
-                    left.plot(minutes[taken.index], taken, color=paint, label=column, linewidth=width)
-            left.set_title(plain(name), fontsize=8.5, loc="right")
+                    handles += left.plot(
+                        minutes[taken.index], taken, color=paint, label=column, linewidth=width
+                    )
+            left.set_title(plain(name), fontsize=8.5, loc="left")
             left.set_ylabel("loss")
-            if left.get_lines():
-                legend_above(left, 2)
             if columns == 2:
                 handles += _draw_terms(panels[1], minutes, history[terms[name]])
         for ax in axes[-1]:

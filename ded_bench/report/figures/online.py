@@ -91,6 +91,11 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
     return figure
 
 
+def counted(lines: pd.DataFrame) -> str:
+    """How many scenarios lines are about: one number, or all that occur."""
+    return "/".join(map(str, sorted(set(lines["n"]))))
+
+
 def _sweep(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
     handles = []
     for kind in KINDS:
@@ -103,7 +108,7 @@ def _sweep(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
                 color=shade,
                 dashes=dash or (None, None),
                 marker=".",
-                label=KIND_NAMES[kind],
+                label=f"{KIND_NAMES[kind]} (n = {counted(chosen)})",
             )
     return handles
 
@@ -112,7 +117,7 @@ def _own(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
     handles = []
     for _, one in lines.iterrows():
         of_period = f", every {one['period_s']:g} s" if one["period_s"] != 1.0 else ""
-        label = plain(title(one["method"], one["settings"])) + of_period
+        label = f"{plain(title(one['method'], one['settings']))}{of_period} (n = {one['n']})"
         handles += ax.plot(
             [one["latency_s"]],
             [one[name]],
@@ -147,7 +152,13 @@ def scenario_figure(case: Case, regime: str, heading: str, shown: Sequence[Opera
         handles: list[Line2D] = []
         for i in loads:
             axes[0].plot(*thin(first["t"], -first["p_load"][:, i]), color=BUS_COLOURS[i % len(BUS_COLOURS)])
-            axes[0].annotate(case.loads[i], (first["t"][0], -first["p_load"][0, i]), fontsize=7)
+            axes[0].annotate(
+                f"bus {case.loads[i]}",
+                (first["t"][0], -first["p_load"][0, i]),
+                xytext=(4, 2),
+                textcoords="offset points",
+                fontsize=7,
+            )
         axes[0].set_ylabel("loads (pu)")
         limit = 1e3 * case.regimes[regime].omega_hz
         for power, omega, j in zip(axes[1 : 1 + n], axes[1 + n : -1], generators, strict=True):

@@ -13,8 +13,8 @@ from ded_bench.report.columns import Column
 LONG, WORDS = 32, ' class="words"'
 #: Tables of so many columns are set in smaller type.
 MANY = 12
-#: The column that stays in sight when a narrow screen is scrolled sideways.
-LABEL = "title"
+#: Columns that stay in sight when a narrow screen is scrolled sideways.
+LABELS = ("title", "policy")
 
 
 def rows_of(frame: pd.DataFrame, columns: Sequence[Column]) -> list[list[str]]:
@@ -64,7 +64,7 @@ def to_html(frame: pd.DataFrame, columns: Sequence[Column]) -> str:
 
 
 def _class(frame: pd.DataFrame, column: Column) -> str:
-    if column.name == LABEL:
+    if column.name in LABELS:
         return ' class="label"'
     return ' class="number"' if _numeric(frame, column) else ""
 

@@ -59,7 +59,6 @@ tbody tr:hover { background: #f6f8fa; }
   h1 { font-size: 1.5rem; }
   h2 { font-size: 1.25rem; margin-top: 2rem; }
   img, .pictures img { max-width: none; width: 38rem; min-width: 100%; }
-  .side img { width: 100%; }
   table { font-size: 0.8rem; }
   .label { position: sticky; left: 0; background: #fff; white-space: normal;
     min-width: 6.5rem; max-width: 8.5rem; box-shadow: 1px 0 0 var(--line); }

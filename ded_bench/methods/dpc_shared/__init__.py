@@ -1,0 +1,1 @@
+"""A learned dispatch policy whose weights are shared by all generators and knots."""

@@ -1,0 +1,88 @@
+"""What a grid answers to generator power: the swing equation at the nominal point, in its modes.
+
+With x the generators' angles relative to those at t = 0 and the same damping rate γ for all of them,
+
+    M ẍ + γ M ẋ + S x = P - P_0 - T (L - L_0) - r
+
+where S and T are the reduced stiffness and load share of the nominal point, and r is all that is not in
+them. In modal coordinates x = q shape each mode is an oscillator of its own, which is advanced exactly
+from one fine point to the next under an input that is linear between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from ded_bench.methods.dpc_shared.stage_kernels import Indices, Modes
+from ded_bench.problem.case import Array, Case
+from ded_bench.truth.network import Network
+
+#: Fine points per interval between knots.
+FINE = 4
+#: Instants at which the stiffness along a path is taken; linear between them.
+INSTANTS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class GridResponse:
+    """Constants of a case and its knots."""
+
+    knots: Array  # (n_knots,), s
+    fine: Array  # fine points, FINE per interval, (n_fine,), s
+    stiffness: Array  # S, (n_gen, n_gen), pu/rad
+    compliance: Array  # its inverse
+    share: Array  # T, (n_gen, n_load)
+    gain: Array  # powers into modes, (n_gen, n_modes): v = p @ gain
+    shape: Array  # modes into angles, (n_modes, n_gen): x = q @ shape
+    step: Array  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
+    damping: Array  # of the modes, less γ, (n_modes, n_modes), 1/s
+    instants: Indices  # knots at which stiffness along a path is taken, (n_instants,)
+    network: Network
+    theta: Array  # angles of the nominal point, (n_bus,), rad
+    inverse: Array  # of ∂f/∂θ there, without the slack, (n_bus - 1, n_bus - 1)
+
+    @staticmethod
+    def make(case: Case, knots: Array) -> GridResponse:
+        """Linearise a case at its nominal point; knots are equidistant."""
+        network = Network(case)
+        theta = network.power_flow(case.p_nominal, case.load_nominal)
+        linear = network.linearise(theta)
+        root = np.sqrt(linear.m)
+        squares, u = np.linalg.eigh(linear.stiffness / np.outer(root, root))
+        rate = float(linear.d.sum() / linear.m.sum())
+        fine = np.linspace(knots[0], knots[-1], FINE * (len(knots) - 1) + 1)
+        weights = network.coupling * np.cos(theta @ network.incidence.T)
+        full = network.incidence.T @ (weights[:, None] * network.incidence)
+        return GridResponse(
+            knots=knots,
+            fine=fine,
+            stiffness=linear.stiffness,
+            compliance=np.asarray(np.linalg.inv(linear.stiffness)),
+            share=linear.share,
+            gain=u / root[:, None],
+            shape=(u / root[:, None]).T.copy(),
+            step=np.stack([_oscillator(square, rate, fine[1]) for square in squares]),
+            damping=u.T @ np.diag(linear.d / linear.m - rate) @ u,
+            instants=np.linspace(0, len(knots) - 1, min(INSTANTS, len(knots))).round().astype(np.int64),
+            network=network,
+            theta=theta,
+            inverse=np.linalg.inv(full[np.ix_(network.unknown, network.unknown)]),
+        )
+
+    @property
+    def modes(self) -> Modes:
+        """What compiled functions see of it."""
+        return Modes(self.step, self.damping, 0.5 * float(self.fine[1]), self.instants * FINE)
+
+
+def _oscillator(square: float, rate: float, h: float) -> Array:
+    """Exact map of q̈ + rate q̇ + square q = v over h, v linear, (2, 4): (q, q̇, v, v⁺) -> (q⁺, q̇⁺)."""
+    generator = np.zeros((4, 4))
+    generator[0, 1] = generator[1, 2] = generator[2, 3] = 1.0
+    generator[1, :2] = -square, -rate
+    exact = expm(generator * h)[:2]
+    by_slope = exact[:, 3] / h
+    return np.column_stack([exact[:, :2], exact[:, 2] - by_slope, by_slope])

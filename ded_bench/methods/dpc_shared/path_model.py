@@ -1,0 +1,158 @@
+"""The grid along the path of a problem: start schedule, linearisation, response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.methods.dpc_shared.drawn_problems import Problems, averaged
+from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
+from ded_bench.methods.dpc_shared.path_kernels import Lines, follow_path, start_angles
+from ded_bench.methods.dpc_shared.stage_kernels import swing, track_rows
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
+
+#: Part of the bound on |ω| at which angles move in the start schedule.
+START_RATE = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Outset:
+    """What is known of problems before any decision."""
+
+    problems: Problems
+    served: NDArray[np.bool_]  # whether there is a power flow, (batch,)
+    theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
+    state: Array  # modes at t = 0, (batch, 2, n_modes)
+    fixed: Array  # T (L - L_0) at the fine points, (batch, n_fine, n_gen), pu
+    static: Array  # static dispatch at the knots, (batch, n_knots, n_gen), pu
+    start: Array  # first schedule, (batch, n_knots, n_gen), pu
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The grid linearised along a path: what is not P in the modes' inputs, and how stiffness changes."""
+
+    offset: Array  # -T (L - L_0) - r + ΔS x_ref at the fine points, less P_0, (batch, n_fine, n_gen), pu
+    change: Array  # ΔS of the modes at the instants, (batch, n_instants, n_modes, n_modes), 1/s²
+    slack: Array  # P_s at x = 0, at the fine points, (batch, n_fine), pu
+    stiffness: Array  # ΔS at the instants, (batch, n_instants, n_gen, n_gen), pu/rad
+
+
+class PathModel:
+    """The grid along the paths of problems, for one case and bound."""
+
+    def __init__(self, case: Case, bound: float, response: GridResponse) -> None:
+        network = response.network
+        self.case, self.bound, self.response, self.network = case, bound, response, network
+        places = network.generators, network.algebraic, network.loads
+        self.lines = Lines(network.ends, network.coupling, *places)
+        self.spacing = float(response.knots[1] - response.knots[0])
+        self.ramp = case.ramp * self.spacing
+        self.modes = response.modes
+        self.inverse = np.linalg.inv(response.shape)
+        at = response.instants
+        #: Linear interpolation from the instants to the fine points.
+        self.between = np.stack(
+            [np.interp(response.fine, response.knots[at], row) for row in np.eye(len(at))], axis=1
+        )
+
+    def outset(self, problems: Problems) -> Outset:
+        """Angles at t = 0 and the first schedule."""
+        response, network, batch = self.response, self.network, len(problems)
+        theta, served = np.empty((batch, network.n_bus)), np.empty(batch, bool)
+        wanted = np.zeros((batch, network.n_bus))
+        wanted[:, network.generators] = problems.p_initial
+        wanted[:, network.loads] = problems.load[:, 0]
+        for b in range(batch):
+            served[b] = start_angles(
+                self.lines, network.unknown, response.theta, response.inverse, wanted[b], theta[b]
+            )
+        fixed = (problems.load - problems.load[:, :1]) @ response.share.T
+        state = np.stack([problems.delta @ self.inverse, problems.omega @ self.inverse], axis=1)
+        at_knots = problems.load[:, ::FINE]
+        static = merit_order(self.case, problems.cost[:, None, 1:], problems.cost[:, :1], at_knots)
+        start = self._start(problems, static, fixed[:, ::FINE])
+        return Outset(problems, served, theta, state, fixed, static, start)
+
+    def _start(self, problems: Problems, static: Array, fixed: Array) -> Array:
+        """A schedule whose steady angles go to those of the static dispatch, at a rate below the bound."""
+        angles = (static - problems.p_initial[:, None] - fixed) @ self.response.compliance
+        angles[:, 0] = 0.0
+        rate = np.full(angles.shape[2], START_RATE * self.bound * self.spacing)
+        free = np.full(angles.shape[2], np.inf)
+        track_rows(angles, -free, free, rate)
+        powers = angles @ self.response.stiffness + problems.p_initial[:, None] + fixed
+        powers[:, 0] = problems.p_initial
+        track_rows(powers, self.case.p_min, self.case.p_max, self.ramp)
+        return np.asarray(powers)
+
+    def nominal(self, outset: Outset) -> Linear:
+        """The grid linearised at its nominal point."""
+        batch, n_gen, n = len(outset.fixed), outset.fixed.shape[2], len(self.response.instants)
+        none = np.zeros((batch, n, n_gen, n_gen))
+        initial = outset.problems.p_initial[:, None]
+        return Linear(-outset.fixed - initial, none, self._slack(outset, outset.fixed + initial), none)
+
+    def linearise(self, outset: Outset, path: Array) -> Linear:
+        """The grid linearised along paths of x.
+
+        Args:
+            outset: of the problems.
+            path: x at the fine points, (batch, n_fine, n_gen), rad; its fast swings are averaged out.
+        """
+        response, problems = self.response, outset.problems
+        slow = averaged(path, FINE)
+        batch, n_knots, n_gen = slow.shape
+        f = np.empty((batch, n_knots, n_gen))
+        stiffness = np.empty((batch, len(response.instants), n_gen, n_gen))
+        loads = np.ascontiguousarray(problems.load[:, ::FINE])
+        generators = self.network.generators
+        for b in range(batch):
+            if outset.served[b]:
+                angles = outset.theta[b, generators] + slow[b]
+                place = outset.theta[b], response.instants
+                outset.served[b] = follow_path(self.lines, angles, loads[b], *place, f[b], stiffness[b])
+        bad = np.logical_not(outset.served)
+        f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
+        change = stiffness - response.stiffness
+        rest = f - slow @ response.stiffness - outset.fixed[:, ::FINE]
+        along = np.einsum("ns,bsgh,bnh->bng", self.between[::FINE], change, slow, optimize=True)
+        taken = outset.fixed + self.to_fine(rest - along)
+        modal = response.gain.T @ change @ response.shape.T
+        return Linear(-taken, modal, self._slack(outset, taken), change)
+
+    @staticmethod
+    def _slack(outset: Outset, taken: Array) -> Array:
+        """What is left for the slack of what loads and generators take."""
+        return np.asarray(-taken.sum(axis=2) - outset.problems.load.sum(axis=2))
+
+    def respond(self, powers: Array, outset: Outset, linear: Linear) -> tuple[Array, Array, Array]:
+        """What the linearised grid does under powers at the knots, (batch, n_knots, n_gen), pu.
+
+        Returns:
+            At the fine points: x (batch, n_fine, n_gen), rad, ω likewise, rad/s, P_s (batch, n_fine), pu.
+        """
+        v = (self.to_fine(powers) + linear.offset) @ self.response.gain
+        q, speed = np.empty_like(v), np.empty_like(v)
+        q[:, 0], speed[:, 0] = outset.state[:, 0], outset.state[:, 1]
+        swing(self.modes, linear.change, v, q, speed)
+        x, omega = q @ self.response.shape, speed @ self.response.shape
+        p_slack = linear.slack - (self.slack_stiffness(linear) * x).sum(axis=2)
+        return x, omega, p_slack
+
+    def slack_stiffness(self, linear: Linear) -> Array:
+        """Σ_g of S + ΔS at the fine points, (batch, n_fine, n_gen), pu/rad."""
+        return np.asarray(self.response.stiffness.sum(axis=0) + self.between @ linear.stiffness.sum(axis=2))
+
+    def to_fine(self, at_knots: Array) -> Array:
+        """Linear between knots, (batch, n_knots, n) to (batch, n_fine, n)."""
+        found = np.empty((at_knots.shape[0], len(self.response.fine), at_knots.shape[2]))
+        for i in range(FINE):
+            found[:, i::FINE][:, : at_knots.shape[1] - 1] = at_knots[:, :-1] * (1 - i / FINE) + at_knots[
+                :, 1:
+            ] * (i / FINE)
+        found[:, -1] = at_knots[:, -1]
+        return found

@@ -1,0 +1,140 @@
+"""DED-DPC (`ded-dpc`): a learned optimiser looks at what a schedule would do and corrects it, in stages.
+
+Its weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
+and P_0 hold for any weights.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.dpc_shared.drawn_problems import Problems
+from ded_bench.methods.dpc_shared.grid_response import GridResponse
+from ded_bench.methods.dpc_shared.path_model import PathModel
+from ded_bench.methods.dpc_shared.unrolled_inference import CompiledNetwork, weight_shapes
+from ded_bench.methods.policy_file import (
+    Scope,
+    Weights,
+    checked_weights,
+    find_policy_file,
+    read_policy,
+    weights_fingerprint,
+    weights_of,
+    write_policy,
+)
+from ded_bench.methods.policy_solver import method
+from ded_bench.methods.solution import Settings, Solver
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.truth.network import PowerFlowError
+
+if TYPE_CHECKING:
+    from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
+
+METHOD = "ded-dpc-shared"
+SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
+#: Instances answered at a time.
+CHUNK = 50
+
+
+@dataclass(frozen=True, eq=False)
+class SharedPolicy:
+    """A trained network with all that is needed to apply it."""
+
+    scope: Scope
+    weights: Weights
+    training: dict[str, Any]  # facts of the training; `stages`, `width` and `margin` shape answers
+
+    @staticmethod
+    def of(scope: Scope, network: UnrolledNetwork, training: dict[str, Any]) -> SharedPolicy:
+        """The policy of a network in torch."""
+        return SharedPolicy(scope, weights_of(network), training | network.shape)
+
+    @functools.cached_property
+    def model(self) -> PathModel:
+        """The grid as the policy sees it; its bound is tighter by the margin."""
+        case = self.scope.case
+        response = GridResponse.make(case, case.knot_times(self.scope.horizon_s))
+        bound = case.omega_bound(self.scope.regime) * (1.0 - float(self.training.get("margin", 0.0)))
+        return PathModel(case, bound, response)
+
+    @property
+    def knots(self) -> Array:
+        """Knot times, shape (n_knots,), s."""
+        return self.model.response.knots
+
+    @functools.cached_property
+    def _compiled(self) -> CompiledNetwork:
+        return CompiledNetwork(self.model, self.weights)
+
+    def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
+        """Schedules of one instance or several, on the knots.
+
+        Raises:
+            InputError: an instance belongs to another case or horizon, or its loads cannot be served.
+        """
+        batch = [instances] if isinstance(instances, Instance) else list(instances)
+        self.scope.check(batch)
+        if not batch:
+            return []
+        try:
+            problems = Problems.of(self.scope.case, batch, self.model.response.fine)
+        except PowerFlowError as error:
+            raise InputError(f"instance {batch[0].id}", "initial", str(error)) from None
+        return [Schedule(self.knots, p) for p in self.powers(problems)]
+
+    def powers(self, problems: Problems) -> Array:
+        """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
+        if len(problems) > CHUNK:
+            starts = range(0, len(problems), CHUNK)
+            return np.concatenate([self.powers(problems[i : i + CHUNK]) for i in starts])
+        outset = self.model.outset(problems)
+        path = self.model.respond(outset.start, outset, self.model.nominal(outset))[0]
+        return self._compiled(outset, self.model.linearise(outset, path))
+
+    def save(self, path: Path) -> None:
+        """Write weights and header."""
+        write_policy(path, METHOD, self.scope, self.weights, self.training)
+
+    @staticmethod
+    def load(path: str | Path, case: Case, regime: str) -> SharedPolicy:
+        """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
+        arrays, scope, training = read_policy(path, METHOD, case, regime)
+        stages, width = training.get("stages"), training.get("width")
+        if not (isinstance(stages, int) and isinstance(width, int) and 0 < stages < 99 and 0 < width < 999):
+            raise InputError(path, "training", "stages and width of the network are missing or mistyped")
+        return SharedPolicy(scope, checked_weights(arrays, weight_shapes(stages, width), path), training)
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when any weight does."""
+        return weights_fingerprint(self.weights)
+
+
+def find_policy(case: Case, regime: str, settings: Settings) -> SharedPolicy:
+    """Load the policy that settings and folders to search name.
+
+    Raises:
+        InputError: there is none yet (names the command that trains one), or it does not fit.
+    """
+    return SharedPolicy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
+
+
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy that `prepare` would use."""
+    path = find_policy_file(METHOD, case, regime, settings)
+    return (Artifact("policy", METHOD, SharedPolicy.load(path, case, regime).fingerprint, path),)
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return the policy as a method."""
+    return method(find_policy(case, regime, settings))

@@ -1,0 +1,148 @@
+"""The network of the shared policy without torch, whose overhead per layer would dominate a single answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ded_bench.methods.dpc_shared.grid_response import FINE
+from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
+from ded_bench.methods.dpc_shared.stage_kernels import (
+    CORRECTIONS,
+    MIXED,
+    Array32,
+    Given,
+    Units,
+    Weights,
+    answer,
+)
+from ded_bench.problem.case import Array
+
+#: Channels that a stage sees at every knot, the constants of a generator, and what a stage hands on.
+N_SEQUENCE, N_CONSTANT, N_MEMORY = 20, 11, 4
+#: Channels among the constants that depend on the knot: time, and a decay after t = 0.
+TIMES = slice(6, 8)
+DECAYS = 12.0
+#: Costs whose mean is smaller are as good as free.
+SMALLEST_COST = 1e-3
+#: A stage sees so many seconds to either side.
+REACH_S = 11.0
+
+
+def dilations_of(spacing_s: float) -> tuple[int, int, int]:
+    """1, √n and n knots, where n knots are REACH_S."""
+    n = max(REACH_S / spacing_s, 1.0)
+    return 1, round(np.sqrt(n)), round(n)
+
+
+def weight_shapes(stages: int, width: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights, in the order of its state dict: the same on every grid."""
+    blocks = len(dilations_of(1.0))
+    stage: dict[str, tuple[int, ...]] = {
+        "first": (width, 3 * (N_SEQUENCE + N_MEMORY)),
+        "constant": (width, N_CONSTANT),
+        "first_bias": (width,),
+        "spread": (blocks, width, 3 * width),
+        "spread_bias": (blocks, width),
+        "mix": (blocks, width, width + 3 * MIXED),
+        "mix_bias": (blocks, width),
+        "last": (CORRECTIONS + N_MEMORY, width),
+        "last_bias": (CORRECTIONS + N_MEMORY,),
+    }
+    return {f"stages.{i}.{name}": shape for i in range(stages) for name, shape in stage.items()}
+
+
+def units_of(model: PathModel) -> Units:
+    """Limits of a model's case, and the units of powers in it."""
+    case, response = model.case, model.response
+    turn, own = model.bound * model.spacing, np.diag(response.stiffness)
+    return Units(
+        low=case.p_min,
+        high=case.p_max,
+        step=model.ramp,
+        unit=np.minimum(model.ramp, own * turn),
+        turn=turn,
+        bound=model.bound,
+        stiffness=response.stiffness,
+        compliance=response.compliance,
+        by_stiffness=_others(response.stiffness),
+        by_compliance=_others(response.compliance),
+        gain=response.gain,
+        shape=response.shape,
+    )
+
+
+def _others(matrix: Array) -> Array32:
+    weights = (matrix - np.diag(np.diag(matrix))) / np.diag(matrix)[:, None]
+    return weights.astype(np.float32)
+
+
+def constants_of(model: PathModel, units: Units, outset: Outset) -> tuple[Array, Array]:
+    """What a stage sees of a generator at all knots, (batch, N_CONSTANT, n_gen), and costs in their means.
+
+    The entries `TIMES` are zero; they depend on the knot.
+    """
+    problems, (batch, n_gen) = outset.problems, outset.problems.p_initial.shape
+    mean = np.maximum(problems.cost.mean(axis=1, keepdims=True), SMALLEST_COST)
+    cost, dear = problems.cost[:, 1:], problems.cost[:, :1]
+    speed = np.clip(problems.omega / units.bound, -3.0, 3.0)
+    found = np.zeros((batch, N_CONSTANT, n_gen))
+    found[:, 0] = (cost - dear) / np.maximum(cost + dear, SMALLEST_COST)
+    found[:, 1], found[:, 2] = cost / mean - 1.0, dear / mean - 1.0
+    found[:, 3] = (2.0 * problems.p_initial - units.low - units.high) / (units.high - units.low)
+    found[:, 4], found[:, 5] = speed, speed @ units.by_stiffness.T
+    own = np.diag(units.stiffness)
+    found[:, 8] = np.log(0.02 * (units.high - units.low) / units.unit)
+    found[:, 9] = np.log(own * units.turn / units.step)
+    found[:, 10] = np.log(np.sqrt(own / model.network.m) * model.spacing)
+    return found, problems.cost / mean
+
+
+def times_of(n_knots: int) -> Array:
+    """Channels that depend on the knot alone, (2, n_knots)."""
+    t = np.linspace(0.0, 1.0, n_knots)
+    return np.stack([t, np.exp(-DECAYS * t)])
+
+
+class CompiledNetwork:
+    """The same function as an UnrolledNetwork, with its state dict as arrays; powers in float64."""
+
+    def __init__(self, model: PathModel, state: Mapping[str, np.ndarray]) -> None:
+        n_stages = 1 + max(int(name.split(".")[1]) for name in state)
+        layer = {
+            name: np.stack([state[f"stages.{i}.{name}"] for i in range(n_stages)]).astype(np.float32)
+            for name in (key.removeprefix("stages.0.") for key in state if key.startswith("stages.0."))
+        }
+        times = layer["constant"][:, :, TIMES] @ times_of(len(model.response.knots)).astype(np.float32)
+        self._weights = Weights(
+            first=layer["first"],
+            constant=layer["constant"],
+            times=times + layer["first_bias"][:, :, None],
+            spread=layer["spread"],
+            spread_bias=layer["spread_bias"],
+            mix=layer["mix"],
+            mix_bias=layer["mix_bias"],
+            last=layer["last"],
+            last_bias=layer["last_bias"],
+        )
+        self._model, self._units = model, units_of(model)
+        self._dilations = np.array(dilations_of(model.spacing))
+
+    def __call__(self, outset: Outset, linear: Linear) -> Array:
+        """Powers at the knots, (batch, n_knots, n_gen), pu."""
+        constant, cost = constants_of(self._model, self._units, outset)
+        given = Given(
+            cost=cost,
+            static=outset.static,
+            fixed=np.ascontiguousarray(outset.fixed[:, ::FINE]),
+            offset=linear.offset,
+            slack=linear.slack,
+            leverage=self._model.slack_stiffness(linear),
+            change=linear.change,
+            state=outset.state,
+            constant=constant.astype(np.float32),
+        )
+        powers = outset.start.copy()
+        answer(powers, given, self._units, self._model.modes, self._dilations, self._weights)
+        return powers

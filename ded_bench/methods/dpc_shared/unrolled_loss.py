@@ -1,0 +1,97 @@
+"""The loss of the shared policy: cost as a part of the static dispatch's, and a penalty on |ω| out of bounds.
+
+Everything but the bound on |ω| holds by construction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ded_bench.methods.dpc_shared.grid_response import FINE
+from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
+from ded_bench.problem.case import Array
+
+#: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
+MARGIN = 0.015
+#: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
+#: exact penalty, above nearly all of the optimum's multipliers. It grows from the first to the second.
+PRICE = (0.01, 0.08)
+#: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
+DOUBLING = 0.05
+#: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
+STRAIGHT = 0.2
+#: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per pair
+#: of generators.
+SMALLEST_COST = 0.05
+#: Part of the loss of each stage before the last.
+EARLIER = 0.1
+
+#: Powers (batch, n_knots, n_gen), ω (batch, n_fine, n_gen) and P_s (batch, n_fine).
+Outcome = tuple[Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Cost relative to the static dispatch, penalty, and largest relative excess of |ω|, each (batch,)."""
+
+    cost: Tensor
+    penalty: Tensor
+    excess: Tensor
+
+
+class ScheduleLoss:
+    """Judges outcomes of one case and bound."""
+
+    def __init__(self, model: PathModel) -> None:
+        self.model = model
+        self.spacing = float(model.response.fine[1])
+        self.at_fine = _means(model.response.fine)
+        self.at_knots = _means(model.response.knots)
+
+    def __call__(self, outset: Outset, outcome: Outcome, margin: float = 0.0) -> Judged:
+        """Judge schedules by what they do.
+
+        Args:
+            outset: of their problems.
+            outcome: powers, frequencies and slack powers.
+            margin: fraction by which the bound is tightened.
+        """
+        powers, omega, p_slack = outcome
+        cost = torch.as_tensor(outset.problems.cost, dtype=torch.float32)
+        generators = ((powers * cost[:, None, 1:]).sum(dim=2) * self.at_knots).sum(dim=1)
+        total = generators + cost[:, 0] * (p_slack.abs() * self.at_fine).sum(dim=1)
+        excess = (omega.abs() / self.model.bound - (1.0 - margin)).relu()
+        bent = excess.clamp_max(STRAIGHT)
+        penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * self.spacing
+        return Judged(total / self._scale(outset), penalty, excess.amax(dim=(1, 2)))
+
+    def _scale(self, outset: Outset) -> Tensor:
+        """Mean cost of the static dispatch, (batch,)."""
+        problems, static = outset.problems, outset.static
+        p_slack = problems.load[:, ::FINE].sum(axis=2) + static.sum(axis=2)
+        cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(p_slack)
+        least = SMALLEST_COST * max(1.0, static.shape[2] / 2)
+        return torch.as_tensor(np.maximum(cost.mean(axis=1), least), dtype=torch.float32)
+
+
+def total_loss(judged: list[Judged], price: float, used: Tensor) -> Tensor:
+    """Loss over all stages; the last one counts most.
+
+    Args:
+        judged: of each stage.
+        price: of the penalty.
+        used: which problems count, (batch,).
+    """
+    parts = [(j.cost + price * j.penalty)[used].mean() for j in judged]
+    return parts[-1] + EARLIER * torch.stack([*parts[:-1], parts[-1].new_zeros(())]).sum()
+
+
+def _means(times: Array) -> Tensor:
+    """Weights of the mean over time of what is linear between points."""
+    weights = np.gradient(times)
+    weights[[0, -1]] *= 0.5
+    return torch.as_tensor(weights / weights.sum(), dtype=torch.float32)

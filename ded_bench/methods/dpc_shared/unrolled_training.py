@@ -1,0 +1,211 @@
+"""Train the shared policy on problems drawn afresh for every step; no solution is needed."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ded_bench.files.errors import InputError
+from ded_bench.koopman.model import Koopman
+from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw
+from ded_bench.methods.dpc_shared.grid_response import GridResponse
+from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
+from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy
+from ded_bench.methods.dpc_shared.unrolled_loss import MARGIN, PRICE, ScheduleLoss, total_loss
+from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
+from ded_bench.methods.policy_file import Scope, Weights, weights_fingerprint
+from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
+from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import POLICY_SEED
+
+#: Stages of the network and its width.
+STAGES, WIDTH = 5, 16
+#: Steps of an epoch, epochs.
+STEPS, EPOCHS = 100, 80
+#: Problems of a step: so many that generators times knots of all are near the first number.
+ROWS, SMALLEST_BATCH = 4000, 8
+LEARNING_RATE, WEIGHT_DECAY, CLIP_NORM = 4e-3, 1e-4, 1.0
+#: Fractions of the training: warm-up of the learning rate, then a cosine down to `LAST` of it.
+WARM_UP, LAST = 0.02, 1e-3
+AVERAGE = 0.998  # of the weights, exponentially
+#: Most instances on which weights are compared.
+HELD_OUT = 100
+PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
+
+
+def batch_of(case: Case) -> int:
+    """Problems of a step, by the size of a case."""
+    return max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
+
+
+@repeatable()
+def train(
+    case: Case,
+    regime: str,
+    instances: Sequence[Instance],
+    model: Koopman,
+    out: Path,
+    options: TrainingOptions,
+    /,
+    *,
+    epochs: int = EPOCHS,
+    stages: int = STAGES,
+    width: int = WIDTH,
+    rate: float = LEARNING_RATE,
+    start: Weights | None = None,
+) -> SharedPolicy:
+    """Train a policy; see `training_record.Trainer`. The grid itself is the model: `model` is not used.
+
+    Args:
+        instances: choose the best weights, and are never trained on.
+        start: weights of another policy to start from, of the same stages and width.
+    """
+    del model
+    if options.device != "cpu":
+        raise InputError("--device", options.device, f"{METHOD} is trained on the CPU")
+    horizon = instances[0].horizon_s
+    response = GridResponse.make(case, case.knot_times(horizon))
+    path_model = PathModel(case, case.omega_bound(regime), response)
+    with torch.random.fork_rng():
+        torch.manual_seed(options.seed)
+        network = UnrolledNetwork(path_model, stages, width)
+    if start is not None:
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
+    check = path_model.outset(Problems.of(case, instances[:HELD_OUT], response.fine))
+    run = _Run(network, options.seed, rate, batch_of(case), checkpoint_file(out))
+    if options.resume and run.checkpoint.is_file():
+        run.load()
+    run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
+    network.load_state_dict(run.best_weights)
+    training = {
+        "seed": options.seed,
+        "epochs": run.epoch,
+        "steps": run.step,
+        "batch": run.batch,
+        "seconds": run.spent,
+        "cpu_seconds": run.busy,
+        "instances": run.step * run.batch,
+        "held_out": len(check.served),
+        "held_out_loss": run.best,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "start": weights_fingerprint(start) if start is not None else "",
+        "torch": torch.__version__,
+        "device": options.device,
+    }
+    policy = SharedPolicy.of(Scope(case, regime, horizon), network, training)
+    policy.save(out)
+    write_history(out, run.history)
+    return policy
+
+
+class _Run:
+    """The state of one training: network, average of its weights, optimiser, progress."""
+
+    def __init__(
+        self, network: UnrolledNetwork, seed: int, rate: float, batch: int, checkpoint: Path
+    ) -> None:
+        self.network, self.seed, self.rate, self.batch, self.checkpoint = (
+            network,
+            seed,
+            rate,
+            batch,
+            checkpoint,
+        )
+        self.loss = ScheduleLoss(network.model)
+        self.average = copy.deepcopy(network)
+        self.optimiser = torch.optim.AdamW(
+            network.parameters(), lr=rate, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99)
+        )
+        self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
+        self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
+        self.history: list[dict[str, float]] = []
+
+    def go(self, check: Outset, epochs: int, seconds: float | None, title: str) -> None:
+        """Train until the epochs are done or the time is over."""
+        started, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
+        progress = self.epoch / epochs
+        with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
+            while progress < 1.0:
+                for i in range(1, STEPS + 1):
+                    self._update(progress)
+                    self.spent, self.busy = time.perf_counter() - started, time.process_time() - busy
+                    progress = (self.epoch + i / STEPS) / epochs
+                    if seconds is not None and (progress := max(progress, self.spent / seconds)) >= 1.0:
+                        break
+                self.epoch += 1
+                bar.update()
+                row = self._validate(check)
+                bar.set_postfix_str(f"cost {row['cost']:.5f}, excess {row['max excess']:.1e}")
+                self._save()
+
+    def _update(self, progress: float) -> None:
+        falling = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate * falling * min(1.0, 0.05 + progress / WARM_UP)
+        model = self.network.model
+        # a generator of its own for every step: a training that goes on draws what it would have drawn
+        generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, self.step]))
+        outset = model.outset(draw(model.case, model.bound, model.response.fine, self.batch, generator))
+        outcomes = self.network(outset)
+        price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress
+        judged = [self.loss(outset, outcome, MARGIN) for outcome in outcomes]
+        self.step += 1
+        used = torch.as_tensor(outset.served)
+        if not used.any():
+            return
+        self.optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(total_loss(judged, price, used))
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
+        if not torch.isfinite(norm):
+            return
+        self.optimiser.step()
+        keep = min(AVERAGE, 1.0 - 1.0 / (1.0 + self.step / 10.0))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - keep)
+
+    def _validate(self, check: Outset) -> dict[str, float]:
+        with torch.no_grad():
+            outcome = self.average(check)[-1]
+            tight, own = (self.loss(check, outcome, margin) for margin in (MARGIN, 0.0))
+        value = float((tight.cost + PRICE[1] * tight.penalty).mean())
+        hertz = own.excess * self.loss.model.bound / (2 * math.pi)
+        row = {
+            "epoch": self.epoch,
+            "step": self.step,
+            "seconds": self.spent,
+            "held out": value,
+            "cost": float(own.cost.mean()),
+            "mean excess": float(hertz.mean()),  # Hz, as the next
+            "max excess": float(hertz.max()),
+        }
+        self.history.append(row)
+        if value < self.best:
+            self.best, self.best_weights = value, copy.deepcopy(self.average.state_dict())
+        return row
+
+    def _save(self) -> None:
+        state: dict[str, Any] = {name: getattr(self, name) for name in PROGRESS}
+        state |= {name: getattr(self, name).state_dict() for name in ("network", "average", "optimiser")}
+        save_checkpoint(self.checkpoint, state)
+
+    def load(self) -> None:
+        """Go on from the checkpoint.
+
+        Raises:
+            InputError: it is no checkpoint, or one of another training.
+        """
+        with reading_checkpoint(self.checkpoint, "cpu") as state:
+            for name in ("network", "average", "optimiser"):
+                getattr(self, name).load_state_dict(state[name])
+            for name in PROGRESS:
+                setattr(self, name, state[name])

@@ -6,6 +6,7 @@ import copy
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,16 @@ HELD_OUT = 100
 PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
 
 
+@dataclass(frozen=True)
+class Variant:
+    """What a training may choose of network and optimiser."""
+
+    stages: int = STAGES
+    width: int = WIDTH
+    rate: float = LEARNING_RATE
+    start: Weights | None = None  # of another policy of the same stages and width, of whatever grid
+
+
 def batch_of(case: Case) -> int:
     """Problems of a step, by the size of a case."""
     return max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
@@ -59,17 +70,15 @@ def train(
     /,
     *,
     epochs: int = EPOCHS,
-    stages: int = STAGES,
-    width: int = WIDTH,
-    rate: float = LEARNING_RATE,
-    start: Weights | None = None,
+    **variant: Any,
 ) -> SharedPolicy:
     """Train a policy; see `training_record.Trainer`. The grid itself is the model: `model` is not used.
 
     Args:
         instances: choose the best weights, and are never trained on.
-        start: weights of another policy to start from, of the same stages and width.
+        variant: fields of `Variant`.
     """
+    chosen = Variant(**variant)
     del model
     if options.device != "cpu":
         raise InputError("--device", options.device, f"{METHOD} is trained on the CPU")
@@ -78,11 +87,11 @@ def train(
     path_model = PathModel(case, case.omega_bound(regime), response)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
-        network = UnrolledNetwork(path_model, stages, width)
-    if start is not None:
-        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
+        network = UnrolledNetwork(path_model, chosen.stages, chosen.width)
+    if chosen.start is not None:
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in chosen.start.items()})
     check = path_model.outset(Problems.of(case, instances[:HELD_OUT], response.fine))
-    run = _Run(network, options.seed, rate, batch_of(case), checkpoint_file(out))
+    run = _Run(network, options.seed, chosen.rate, batch_of(case), checkpoint_file(out))
     if options.resume and run.checkpoint.is_file():
         run.load()
     run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
@@ -98,7 +107,7 @@ def train(
         "held_out": len(check.served),
         "held_out_loss": run.best,
         "parameters": sum(p.numel() for p in network.parameters()),
-        "start": weights_fingerprint(start) if start is not None else "",
+        "start": weights_fingerprint(chosen.start) if chosen.start is not None else "",
         "torch": torch.__version__,
         "device": options.device,
     }

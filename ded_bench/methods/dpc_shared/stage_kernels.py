@@ -102,10 +102,11 @@ def track_rows(targets: Array, low: Array, high: Array, step: Array) -> None:
 class Units(NamedTuple):
     """Limits of a case, and the units in which a stage sees powers; matrices are (n_gen, n_gen)."""
 
-    low: Array  # (n_gen,), pu, as the next three
+    low: Array  # (n_gen,), pu, as the next four
     high: Array
     step: Array  # largest change between knots by ramps
     unit: Array  # the same by ramps and the bound on |ω|
+    pace: Array  # factor of corrections, smaller where swings are faster than knots
     turn: float  # angle that the bound allows between knots, rad
     bound: float  # rad/s
     stiffness: Array
@@ -271,7 +272,7 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
             change += out[2, column] * slack + out[3, column] * (static[j, g] - powers[j, g])
             update[j, g] = powers[j, g]
             if j > 0:
-                powers[j, g] += change
+                powers[j, g] += units.pace[g] * change
     track_rows(powers.reshape(1, n, n_gen), units.low, units.high, units.step)
     for j in range(n):
         for g in range(n_gen):

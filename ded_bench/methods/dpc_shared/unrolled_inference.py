@@ -26,6 +26,8 @@ TIMES = slice(6, 8)
 DECAYS = 12.0
 #: Costs whose mean is smaller are as good as free.
 SMALLEST_COST = 1e-3
+#: Machines that swing further between knots, rad², are corrected less at a time: it would excite them.
+SWING = 3.0
 #: A stage sees so many seconds to either side.
 REACH_S = 11.0
 
@@ -57,11 +59,13 @@ def units_of(model: PathModel) -> Units:
     """Limits of a model's case, and the units of powers in it."""
     case, response = model.case, model.response
     turn, own = model.bound * model.spacing, np.diag(response.stiffness)
+    swing = own / response.network.m * model.spacing**2  # square of a machine's own swing in a knot, rad²
     return Units(
         low=case.p_min,
         high=case.p_max,
         step=model.ramp,
         unit=np.minimum(model.ramp, own * turn),
+        pace=np.minimum(SWING / swing, 1.0) ** 2,
         turn=turn,
         bound=model.bound,
         stiffness=response.stiffness,

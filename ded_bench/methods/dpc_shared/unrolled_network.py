@@ -40,6 +40,7 @@ class Scales:
     high: Tensor
     step: Tensor
     unit: Tensor
+    pace: Tensor
     turn: float
     bound: float
     stiffness: Tensor
@@ -50,11 +51,11 @@ class Scales:
     @staticmethod
     def of(units: Units) -> Scales:
         """Convert to float32."""
-        columns = (units.low, units.high, units.step, units.unit)
+        columns = (units.low, units.high, units.step, units.unit, units.pace)
         matrices = (units.stiffness, units.compliance, units.by_stiffness, units.by_compliance)
-        low, high, step, unit = (torch.tensor(v, dtype=torch.float32)[:, None, None] for v in columns)
+        low, high, step, unit, pace = (torch.tensor(v, dtype=torch.float32)[:, None, None] for v in columns)
         whole = [torch.tensor(values, dtype=torch.float32) for values in matrices]
-        return Scales(low, high, step, unit, units.turn, units.bound, *whole)
+        return Scales(low, high, step, unit, pace, units.turn, units.bound, *whole)
 
 
 def mix(matrix: Tensor, values: Tensor) -> Tensor:
@@ -244,6 +245,7 @@ class UnrolledNetwork(nn.Module):
             out = stage(torch.cat([sequence, memory]), view.constant, s)
             change = 2.0 * s.unit * out[0] + s.turn * mix(s.stiffness, out[1])
             change = change + out[2] * around(p_slack) + out[3] * (view.static - p)
+            change = s.pace * change
             before, memory = p, out[CORRECTIONS:]
             p = FollowTargets.apply(p + change, view.p_initial, *self.limits)  # type: ignore[no-untyped-call]
             update = p - before

@@ -52,10 +52,20 @@ def blocks(page: Path) -> list[Block]:
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the repository's problems and reference run, and `ded-bench` on the path."""
-    (tmp_path / "results").mkdir()
+    """A folder with the repository's problems and reference run, and `ded-bench` on the path.
+
+    Of the schedules only those of one instance are there: to simulate all of them takes more than a minute.
+    """
+    reference, run = (place / "results" / "9bus-reference" for place in (REPOSITORY, tmp_path))
+    run.mkdir(parents=True)
     (tmp_path / "problems").symlink_to(REPOSITORY / "problems")
-    (tmp_path / "results" / "9bus-reference").symlink_to(REPOSITORY / "results" / "9bus-reference")
+    for entry in reference.iterdir():
+        if entry.name != "schedules":
+            (run / entry.name).symlink_to(entry)
+    for schedule in reference.glob("schedules/**/9bus-0001.csv.gz"):
+        kept = run / schedule.relative_to(reference)
+        kept.parent.mkdir(parents=True)
+        kept.symlink_to(schedule)
     program = tmp_path / ".bin" / "ded-bench"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ded_bench "$@"\n')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import json
 import re
 import sys
@@ -291,3 +292,14 @@ def test_nothing_knows_the_nine_buses(module, nine: Particulars):
 def test_the_check_sees_what_is_particular(nine: Particulars, source, found):
     """Keys, comparisons, column names, paths, regimes, numbers and fingerprints; not markers or colours."""
     assert particular(source, nine) == found
+
+
+def test_every_package_is_installed() -> None:
+    """A folder that setup.cfg does not name would be missing from the wheel, but not from a checkout."""
+    setup = configparser.ConfigParser()
+    setup.read(PACKAGE.parent / "setup.cfg", encoding="utf-8")
+    named = set(setup["options"]["packages"].split())
+    ours = {
+        ".".join(("ded_bench", *p.parent.relative_to(PACKAGE).parts)) for p in PACKAGE.rglob("__init__.py")
+    }
+    assert ours <= named

@@ -34,15 +34,25 @@ from ded_bench.problem.case import Case
 if TYPE_CHECKING:
     import pandas as pd
 
+#: Kind of model that only AC trajectories are identified with.
+SWING = "swing"
+
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "train-ko", "identify the Koopman model from simulated trajectories")
-    p.add_argument("--kind", choices=TRAINED, default=TRAINED[0], help="ours, or the paper's recipe")
+    p.add_argument(
+        "--kind",
+        choices=(*TRAINED, SWING),
+        default=TRAINED[0],
+        help="ours, the paper's recipe, or nonlinear swing equations (--truth ac)",
+    )
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
-    p.add_argument("--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac")
+    p.add_argument(
+        "--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac or swing-ac"
+    )
     p.add_argument("--noise", type=positive_number, metavar="HZ", help="of measured frequencies (--truth ac)")
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
@@ -84,8 +94,8 @@ def _train_ko(a: argparse.Namespace) -> int:
     case, is_ac = Case.load(a.case), a.truth == "ac"
     if a.noise and not is_ac:
         raise InputError("--noise", f"{a.noise:g}", "is for --truth ac")
-    if is_ac and a.kind != TRAINED[0]:
-        raise InputError("--kind", a.kind, "is not for --truth ac")
+    if a.kind == (TRAINED[1] if is_ac else SWING):
+        raise InputError("--kind", a.kind, f"is not for --truth {a.truth}")
     out = a.out or model_file(a.results or default_results(case), f"{a.kind}-ac" if is_ac else a.kind)
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
@@ -111,9 +121,11 @@ def _train_ko(a: argparse.Namespace) -> int:
 def _train_ko_ac(a: argparse.Namespace, case: Case, out: Path) -> int:
     from ded_bench.evaluate.ac_rollouts import ac_rollout_table
     from ded_bench.koopman.identify_ac import identify_ac
+    from ded_bench.koopman.identify_swing import identify_swing
 
     data = AcCase.of(case)
-    model = identify_ac(case, data, a.seed, a.count, a.noise or 0.0)
+    identified = identify_swing if a.kind == SWING else identify_ac
+    model = identified(case, data, a.seed, a.count, a.noise or 0.0)
     model.save(out)
     return _told(out, ac_rollout_table(case, data, model, a.seed))
 

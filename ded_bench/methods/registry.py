@@ -122,7 +122,15 @@ METHODS: dict[str, Method] = {
         ),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
-        Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (50 knots)"),
+        Method(
+            "ded-ko-knots",
+            "ded_bench.methods.ded_ko_knots",
+            "DED-KO (50 knots)",
+            elsewhere=(
+                ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
+                ("swing-ac-once", "ded_bench.methods.ded_ko_knots_swing"),
+            ),
+        ),
         Method(
             "ded-dpc-paper",
             "ded_bench.methods.dpc_paper.paper_policy",

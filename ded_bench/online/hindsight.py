@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 from ded_bench.methods import ded_radau
+from ded_bench.methods.ac_sequence import AcSequence
 from ded_bench.methods.ded_slp import SlpSolver
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.online.judgement import Judgement, judge_operation
+from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
-from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.simulate import simulate
+from ded_bench.truth.ac_simulate import simulate_ac
+from ded_bench.truth.simulate import Trajectory, simulate
 
 #: Knots lie so many times as close as the case's: plans that are renewed again and again may bend anywhere.
 FINER = 4
@@ -25,11 +28,17 @@ class Hindsight:
 
     method: str
     judgement: Judgement
-    schedule: Schedule
+    trajectory: Trajectory
 
 
-def hindsight(case: Case, scenario: Scenario, regime: str) -> Hindsight:
+def hindsight(case: Case, scenario: Scenario, regime: str, data: AcCase | None = None) -> Hindsight:
     """Optimise the whole scenario by sequential linear programs, or by collocation where they fail.
+
+    Args:
+        case: the grid.
+        scenario: with its true loads.
+        regime: gives the bound of |ω|.
+        data: optimise on the full AC network, where there is no collocation.
 
     Raises:
         RuntimeError: neither finds a schedule.
@@ -37,6 +46,8 @@ def hindsight(case: Case, scenario: Scenario, regime: str) -> Hindsight:
     """
     instance = whole_instance(case, scenario)
     interval_s = case.sampling.horizon_s / (case.n_knots - 1) / FINER
+    if data is not None:
+        return _on_ac(case, scenario, regime, data)
     solution: Solution = SlpSolver(case, regime, knot_interval_s=interval_s)(instance)
     method = "ded-slp"
     if solution.schedule is None:
@@ -44,7 +55,19 @@ def hindsight(case: Case, scenario: Scenario, regime: str) -> Hindsight:
     if solution.schedule is None:
         raise RuntimeError(f"no schedule for the whole of {scenario.id}: {solution.error}")
     trajectory = simulate(case, instance, solution.schedule)
-    return Hindsight(method, judge_operation(case, scenario, trajectory, regime), solution.schedule)
+    return Hindsight(method, judge_operation(case, scenario, trajectory, regime), trajectory)
+
+
+def _on_ac(case: Case, scenario: Scenario, regime: str, data: AcCase) -> Hindsight:
+    """On the case's knots: the sequence takes many more programs there."""
+    instance = whole_instance(case, scenario)
+    interval_s = case.sampling.horizon_s / (case.n_knots - 1)
+    sequence = functools.partial(AcSequence, data=data)
+    solution = SlpSolver(case, regime, knot_interval_s=interval_s, sequence=sequence)(instance)
+    if solution.schedule is None:
+        raise RuntimeError(f"no schedule for the whole of {scenario.id}: {solution.error}")
+    trajectory = simulate_ac(case, data, instance, solution.schedule)
+    return Hindsight("ded-slp ac", judge_operation(case, scenario, trajectory, regime), trajectory)
 
 
 def whole_instance(case: Case, scenario: Scenario) -> Instance:

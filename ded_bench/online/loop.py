@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.online.planner import Ask, Plan
-from ded_bench.online.plant import Plant, Record
+from ded_bench.online.plant import Grid, Plant, Record
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Initial, Instance
@@ -71,26 +71,35 @@ class _Course:
         return Schedule(times, self.schedule.at(times + (start - self.start) * self.dt))
 
 
-def run_loop(case: Case, scenario: Scenario, ask: Ask, options: LoopOptions) -> Outcome:
+def run_loop(
+    case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Grid | None = None
+) -> Outcome:
     """Operate one scenario with plans of one method.
 
     The first plan is made for the true initial state and is there at t = 0; decisions follow every period,
     or as soon as the last plan is due, if that is later. Where there is none, the last plan goes on; before
     the first one, powers stay.
 
+    Args:
+        case: the grid.
+        scenario: what happens.
+        ask: for plans.
+        options: how the loop runs.
+        plant: what is operated; without it, the lossless network.
+
     Raises:
         SimulationError: the system loses synchronism.
     """
-    return _Loop(case, scenario, ask, options).run()
+    return _Loop(case, scenario, ask, options, plant or Plant(case, scenario)).run()
 
 
 class _Loop:
-    def __init__(self, case: Case, scenario: Scenario, ask: Ask, options: LoopOptions) -> None:
+    def __init__(self, case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Grid) -> None:
         self.case, self.scenario, self.ask, self.options = case, scenario, ask, options
         self.dt, self.horizon = scenario.dt_s, case.sampling.horizon_s
         self.lag = math.ceil(options.latency_s / self.dt - WHOLE)
         self.period = max(round(options.period_s / self.dt), 1)
-        self.record = Record(case, scenario, Plant(case, scenario))
+        self.record = Record(case, scenario, plant)
         power = self.record.p_gen[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
         self.course, self.held = _Course(stay, 0, self.dt), False

@@ -11,6 +11,7 @@ import numpy as np
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table, cell, plain_name
+from ded_bench.problem.ac_case import TRUTHS
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.truth.simulate import Trajectory
 
@@ -30,6 +31,15 @@ class OnlineKey(NamedTuple):
     forecast: str
     predicted: bool
     warm: bool
+    truth: str = TRUTHS[0]
+
+
+class HindsightKey(NamedTuple):
+    """What makes a row of `hindsight.csv` unique."""
+
+    scenario: str
+    regime: str
+    truth: str = TRUTHS[0]
 
 
 def _quality(text: str) -> str:
@@ -38,9 +48,17 @@ def _quality(text: str) -> str:
     return text
 
 
+def _truth(text: str) -> str:
+    if text not in TRUTHS:
+        raise ValueError(text)
+    return text
+
+
 @dataclass(frozen=True)
 class OnlineRow:
     """One scenario operated with one method's plans, judged on the true DAE (see `Judgement`).
+
+    `truth` names the network that was operated: the lossless one, or the full AC network.
 
     `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
@@ -58,6 +76,7 @@ class OnlineRow:
     forecast: str = cell(check=_quality)
     predicted: bool = cell()
     warm: bool = cell()
+    truth: str = cell(default=TRUTHS[0], check=_truth)
     objective: float | None = None
     increase_percent: float | None = None
     max_excess_hz: float | None = cell(default=None, lowest=0)
@@ -98,6 +117,7 @@ class HindsightRow:
 
     scenario: str = cell(check=plain_name)
     regime: str = cell(check=plain_name)
+    truth: str = cell(default=TRUTHS[0], check=_truth)
     method: str = ""
     objective: float | None = None
     max_excess_hz: float | None = None
@@ -111,9 +131,9 @@ class HindsightRow:
     date: str = ""
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> HindsightKey:
         """The row's place in the table."""
-        return self.scenario, self.regime
+        return HindsightKey(self.scenario, self.regime, self.truth)
 
 
 ONLINE, HINDSIGHT = Table(OnlineRow), Table(HindsightRow)
@@ -140,12 +160,18 @@ class OnlineFiles:
         loop = f"{key.period_s:g}s-{key.latency_s:g}s-{key.forecast}"
         loop += "" if key.predicted else "-present"
         loop += "" if key.warm else "-cold"
+        loop += _suffix(key.truth)
         place = self.folder / "online" / key.method / key.settings / key.regime
         return place / loop / f"{key.scenario}.safetensors"
 
-    def hindsight_trajectory(self, scenario: str, regime: str) -> Path:
+    def hindsight_trajectory(self, scenario: str, regime: str, truth: str = TRUTHS[0]) -> Path:
         """The trajectory of a scenario's hindsight."""
-        return self.folder / "online" / "hindsight" / regime / f"{scenario}.safetensors"
+        place = self.folder / "online" / f"hindsight{_suffix(truth)}"
+        return place / regime / f"{scenario}.safetensors"
+
+
+def _suffix(truth: str) -> str:
+    return "" if truth == TRUTHS[0] else f"-{truth}"
 
 
 class OnlineResults:
@@ -158,7 +184,7 @@ class OnlineResults:
     def __init__(self, folder: Path) -> None:
         self.files = OnlineFiles(folder)
         self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
-        self.hindsight = KeyedTable[tuple[str, str], HindsightRow](self.files.hindsight, HINDSIGHT)
+        self.hindsight = KeyedTable[HindsightKey, HindsightRow](self.files.hindsight, HINDSIGHT)
 
 
 def keep_trajectory(path: Path, trajectory: Trajectory) -> None:

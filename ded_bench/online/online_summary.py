@@ -5,6 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from ded_bench.online.online_results import ONLINE, OnlineResults
+from ded_bench.problem.ac_case import TRUTHS
 from ded_bench.problem.forecast import QUALITIES
 
 #: What rows of one line of a table share, besides the scenario.
@@ -18,13 +19,14 @@ SWEPT = 3
 KINDS = (*QUALITIES, "present")
 
 
-def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
-    """Rows of a case in the order of the table; `kind` is the forecast, or `present`.
+def online_rows(results: OnlineResults, case: str, truth: str = TRUTHS[0]) -> pd.DataFrame:
+    """Rows of a case on one network in the order of the table; `kind` is the forecast, or `present`.
 
     `over_known_percent` is the cost over the same method's on the scenario with a perfect forecast and no
     latency, %; `static_objective` and `static_excess_hz` are those of static dispatch of every second.
     """
-    frame = ONLINE.frame(row for row in results.table.rows.values() if row.case == case)
+    rows = (row for row in results.table.rows.values() if row.case == case and row.truth == truth)
+    frame = ONLINE.frame(rows)
     announced = frame["forecast"] == QUALITIES[0]
     frame["kind"] = frame["forecast"].where(frame["predicted"].astype(bool), "present")
     frame = frame[frame["predicted"].astype(bool) | announced].reset_index(drop=True)

@@ -18,11 +18,13 @@ from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.online import hindsight as hindsight_module
 from ded_bench.online import loop as loop_module
-from ded_bench.online.hindsight import hindsight, whole_instance
+from ded_bench.online.ac_plant import AcPlant
+from ded_bench.online.hindsight import hindsight
 from ded_bench.online.judgement import Judgement, judge_operation
 from ded_bench.online.latency import timed_latency
 from ded_bench.online.loop import LoopOptions, run_loop
 from ded_bench.online.online_results import (
+    HindsightKey,
     HindsightRow,
     OnlineFiles,
     OnlineKey,
@@ -31,13 +33,16 @@ from ded_bench.online.online_results import (
     keep_trajectory,
 )
 from ded_bench.online.planner import LIMIT_S, Planner
+from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
 from ded_bench.run.code import code_of, code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import reason_of
-from ded_bench.truth.simulate import simulate
+
+#: Settings and models whose plans start from angles of the AC network: they stand for it.
+AC_ANGLES = {"ac", "trajectory-ac", "swing-ac"}
 
 
 @dataclass(frozen=True)
@@ -54,13 +59,24 @@ class Operation:
     artifacts: tuple[Artifact, ...]
     fingerprint: str
     code: str
+    data: AcCase | None = None  # operate the full AC network
+
+    @property
+    def truth(self) -> str:
+        """Which network is operated."""
+        return TRUTHS[self.data is not None]
+
+    @property
+    def plans_on_ac(self) -> bool:
+        """Whether plans are made with a model in which angles are those of the AC network."""
+        return bool({self.settings.name, *(a.name for a in self.artifacts)} & AC_ANGLES)
 
     @property
     def key(self) -> OnlineKey:
         """The row's place in the table."""
         o = self.options
         name = self.scenario.id, self.regime, self.method, self.settings.slug
-        return OnlineKey(*name, o.period_s, o.latency_s, o.forecast, o.predict, o.warm)
+        return OnlineKey(*name, o.period_s, o.latency_s, o.forecast, o.predict, o.warm, self.truth)
 
 
 def make_operations(
@@ -72,6 +88,7 @@ def make_operations(
     latency: str,
     timing: Sequence[Path],
     limit_s: float = LIMIT_S,
+    data: AcCase | None = None,
 ) -> list[Operation]:
     """List every row of a run, a method's together.
 
@@ -81,12 +98,13 @@ def make_operations(
         latency: `timing`, `zero`, or seconds.
         timing: results folders whose `timing.csv` may tell the latency.
         limit_s: how long a method may take for a plan, s of the clock.
+        data: of the case's AC network, to operate that.
 
     Raises:
         InputError: unknown method, regime or settings, a model or policy that is missing, or no latency.
     """
     case.check_regimes(regimes)
-    operations = []
+    operations, ac = [], () if data is None else (data.fingerprint,)
     for name, settings in methods:
         method = get_method(name)
         for regime in regimes:
@@ -97,10 +115,10 @@ def make_operations(
             shared = own, limit_s, source, artifacts
             for scenario in scenarios:
                 fingerprint = _fingerprint(
-                    case, scenario, *(a.fingerprint for a in artifacts), f"{limit_s:g}"
+                    case, scenario, *(a.fingerprint for a in artifacts), f"{limit_s:g}", *ac
                 )
                 operations.append(
-                    Operation(scenario, regime, method.name, settings, *shared, fingerprint, code)
+                    Operation(scenario, regime, method.name, settings, *shared, fingerprint, code, data)
                 )
     return operations
 
@@ -138,7 +156,8 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     """Operate one scenario in this process, and keep its trajectory."""
     o, started = operation, time.perf_counter()
     planner = Planner(case, o.regime, o.method, o.settings, o.limit_s)
-    outcome = run_loop(case, o.scenario, planner, o.options)
+    plant = None if o.data is None else AcPlant(case, o.scenario, o.data, not o.plans_on_ac)
+    outcome = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, outcome.trajectory, o.regime)
     keep_trajectory(files.trajectory(o.key), outcome.trajectory)
     row = _row(o, judgement, reason_of(outcome.error) if outcome.error else "")
@@ -154,13 +173,14 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     )
 
 
-def look_back(case: Case, scenario: Scenario, regime: str, files: OnlineFiles) -> HindsightRow:
+def look_back(
+    case: Case, scenario: Scenario, regime: str, data: AcCase | None, files: OnlineFiles
+) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
-    found = hindsight(case, scenario, regime)
-    trajectory = simulate(case, whole_instance(case, scenario), found.schedule)
-    keep_trajectory(files.hindsight_trajectory(scenario.id, regime), trajectory)
+    found, row = hindsight(case, scenario, regime, data), _hindsight_row(case, scenario, regime, data)
+    keep_trajectory(files.hindsight_trajectory(scenario.id, regime, row.truth), found.trajectory)
     return dataclasses.replace(
-        _hindsight_row(case, scenario, regime),
+        row,
         method=found.method,
         objective=found.judgement.objective,
         max_excess_hz=found.judgement.max_excess_hz,
@@ -170,25 +190,26 @@ def look_back(case: Case, scenario: Scenario, regime: str, files: OnlineFiles) -
 
 def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:
     """Find the hindsight of every scenario and regime that is not there yet."""
-    wanted = {(o.scenario.id, o.regime): (o.scenario, o.regime) for o in todo}
-    missing = [
-        (scenario, regime)
-        for scenario, regime in wanted.values()
-        if not results.hindsight.made_from((scenario.id, regime), _fingerprint(case, scenario))
-    ]
-    calls = ((look_back, (case, *pair, results.files)) for pair in missing)
-    for (scenario, regime), answer in tqdm(
+    wanted = [_hindsight_row(case, o.scenario, o.regime, o.data) for o in todo]
+    new = {
+        row.key: (o.scenario, o.regime, o.data)
+        for o, row in zip(todo, wanted, strict=True)
+        if not results.hindsight.made_from(row.key, row.fingerprint)
+    }
+    missing = list(new.values())
+    calls = ((look_back, (case, *one, results.files)) for one in missing)
+    for (scenario, regime, data), answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
     ):
         row = answer
         if not isinstance(row, HindsightRow):
-            row = dataclasses.replace(_hindsight_row(case, scenario, regime), error=reason_of(answer))
+            row = dataclasses.replace(_hindsight_row(case, scenario, regime, data), error=reason_of(answer))
         results.hindsight.add([row])
 
 
 def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:
     """A row with its cost over hindsight, where both are known."""
-    best = results.hindsight.rows[row.scenario, row.regime].objective
+    best = results.hindsight.rows[HindsightKey(row.scenario, row.regime, row.truth)].objective
     if row.objective is None or not best:
         return row
     return dataclasses.replace(row, increase_percent=100 * (row.objective / best - 1))
@@ -216,12 +237,14 @@ def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> O
     )
 
 
-def _hindsight_row(case: Case, scenario: Scenario, regime: str) -> HindsightRow:
+def _hindsight_row(case: Case, scenario: Scenario, regime: str, data: AcCase | None) -> HindsightRow:
+    ac = () if data is None else (data.fingerprint,)
     return HindsightRow(
         scenario=scenario.id,
         regime=regime,
+        truth=TRUTHS[data is not None],
         case=case.id,
-        fingerprint=_fingerprint(case, scenario),
+        fingerprint=_fingerprint(case, scenario, *ac),
         online_code=code_of(hindsight_module.__name__),
         version=version(),
         host=host(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -21,6 +22,21 @@ class Piece:
     theta: Array  # (n, n_bus), rad
     omega: Array  # (n, n_gen), rad/s
     p_slack: Array  # (n,), pu
+
+
+class Grid(Protocol):
+    """What advances a scenario: `Plant`, or the same on another network."""
+
+    theta: Array  # at t = 0, of all buses, (n_bus,), rad
+    omega: Array  # likewise, of the generators, (n_gen,), rad/s
+
+    def advance(self, theta: Array, omega: Array, p_gen: Array, p_load: Array) -> Piece:
+        """Integrate over the points of some powers."""
+        ...
+
+    def measured(self, theta: Array, omega: Array, p_gen: Array, p_load: Array) -> State:
+        """What a method is told of a state."""
+        ...
 
 
 class Plant:
@@ -65,11 +81,22 @@ class Plant:
             raise SimulationError("the system cannot follow these powers: the power flow has no solution")
         return Piece(angles, speeds, p_slack)
 
+    def measured(self, theta: Array, omega: Array, p_gen: Array, p_load: Array) -> State:
+        """What a method is told of a state.
+
+        Args:
+            theta: angles of all buses, (n_bus,), rad.
+            omega: (n_gen,), rad/s.
+            p_gen: (n_gen,), pu.
+            p_load: (n_load,), pu.
+        """
+        return State(theta[self.network.generators], omega, p_gen)
+
 
 class Record:
     """What has happened since t = 0; grows piece by piece."""
 
-    def __init__(self, case: Case, scenario: Scenario, plant: Plant) -> None:
+    def __init__(self, case: Case, scenario: Scenario, plant: Grid) -> None:
         n = scenario.steps + 1
         self.case, self.scenario, self.now = case, scenario, 0
         self.p_load = scenario.p_load(case)
@@ -89,13 +116,13 @@ class Record:
 
     def state(self) -> State:
         """What is measured now."""
-        generators = self._plant.network.generators
-        return State(self.theta[self.now][generators], self.omega[self.now], self.p_gen[self.now])
+        k = self.now
+        return self._plant.measured(self.theta[k], self.omega[k], self.p_gen[k], self.p_load[k])
 
     def predicted(self, p_gen: Array, p_load: Array) -> State:
         """The state at the end of some powers and forecast loads from now on; raises as `Plant.advance`."""
         piece = self._plant.advance(self.theta[self.now], self.omega[self.now], p_gen, p_load)
-        return State(piece.theta[-1][self._plant.network.generators], piece.omega[-1], p_gen[-1])
+        return self._plant.measured(piece.theta[-1], piece.omega[-1], p_gen[-1], p_load[-1])
 
     def trajectory(self) -> Trajectory:
         """All of it."""

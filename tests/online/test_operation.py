@@ -54,7 +54,7 @@ def test_rows_hold_all_that_is_judged(threebus, first_run):
     for row in rows:
         assert (row.plans, row.late, row.failed, row.error) == (6, 0, 0, "")
         assert (row.latency_s, row.latency_source, row.period_s) == (0.3, "given", 1.0)
-        best = results.hindsight.rows[row.scenario, "TO"]
+        best = results.hindsight.rows[row.scenario, "TO", "paper"]
         assert best.method == "ded-slp"
         assert best.max_excess_hz < 1e-6
         assert row.increase_percent == pytest.approx(100 * (row.objective / best.objective - 1))

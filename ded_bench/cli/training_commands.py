@@ -54,6 +54,9 @@ def add_commands(commands: Any) -> None:
         "--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac or swing-ac"
     )
     p.add_argument("--noise", type=positive_number, metavar="HZ", help="of measured frequencies (--truth ac)")
+    p.add_argument(
+        "--degree", type=positive, metavar="D", help=f"of the polynomials (--kind {SWING}; default: 4)"
+    )
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
@@ -94,6 +97,8 @@ def _train_ko(a: argparse.Namespace) -> int:
     case, is_ac = Case.load(a.case), a.truth == "ac"
     if a.noise and not is_ac:
         raise InputError("--noise", f"{a.noise:g}", "is for --truth ac")
+    if a.degree and a.kind != SWING:
+        raise InputError("--degree", str(a.degree), f"is for --kind {SWING}")
     if a.kind == (TRAINED[1] if is_ac else SWING):
         raise InputError("--kind", a.kind, f"is not for --truth {a.truth}")
     out = a.out or model_file(a.results or default_results(case), f"{a.kind}-ac" if is_ac else a.kind)
@@ -121,11 +126,11 @@ def _train_ko(a: argparse.Namespace) -> int:
 def _train_ko_ac(a: argparse.Namespace, case: Case, out: Path) -> int:
     from ded_bench.evaluate.ac_rollouts import ac_rollout_table
     from ded_bench.koopman.identify_ac import identify_ac
-    from ded_bench.koopman.identify_swing import identify_swing
+    from ded_bench.koopman.identify_swing import DEGREE, identify_swing
 
     data = AcCase.of(case)
-    identified = identify_swing if a.kind == SWING else identify_ac
-    model = identified(case, data, a.seed, a.count, a.noise or 0.0)
+    drawn = case, data, a.seed, a.count, a.noise or 0.0
+    model = identify_swing(*drawn, a.degree or DEGREE) if a.kind == SWING else identify_ac(*drawn)
     model.save(out)
     return _told(out, ac_rollout_table(case, data, model, a.seed))
 

@@ -47,8 +47,10 @@ SCENARIOS_sweep        ?= 10
 
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
 MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)
-# Policies: on 9bus trained, the paper's too; elsewhere trained if TRAIN asks, or taken from the reference run.
-POLICIES  := $(if $(filter 9bus,$(CASE)),ded-dpc-paper) ded-dpc
+# Policies: on 9bus trained, the paper's too; elsewhere the one with shared weights, trained if TRAIN asks, or
+# taken from the reference run.
+POLICIES  := $(if $(filter 9bus,$(CASE)),ded-dpc-paper ded-dpc,ded-dpc-shared)
+REFINED   := $(if $(filter 9bus,$(CASE)),ded-dpc-refined)
 TRAINED   := $(or $(filter 9bus,$(CASE)),$(TRAIN))
 ANSWERING := $(or $(TRAINED),$(wildcard results/$(CASE)-reference/policies))
 
@@ -111,8 +113,8 @@ train-dpc: train-ko  ## train the policies on the training instances
 	  --results $(RESULTS) --workers $(WORKERS) $(TRAIN)
 
 solve-dpc: $(if $(TRAINED),train-dpc,train-ko)  ## solve and score with the policies
-	$(call SOLVE,$(POLICIES) ded-dpc-refined)
-	$(call SOLVE,ded-dpc-refined, --settings 'steps*')
+	$(call SOLVE,$(POLICIES) $(REFINED))
+	$(if $(REFINED),$(call SOLVE,$(REFINED), --settings 'steps*'))
 
 models: solve-baselines  ## DED-KO on other models of the dynamics, and the errors of each
 	$(DED) train-ko --kind koopman-paper --case $(CASE) --results $(RESULTS)
@@ -121,7 +123,7 @@ models: solve-baselines  ## DED-KO on other models of the dynamics, and the erro
 
 ablation: models  ## short trainings of DED-DPC, each with one thing changed, judged on validation instances
 	$(DED) solve --method ded-ko-knots $(VALIDATION)
-	$(DED) train-dpc --settings 'study*' --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
+	$(DED) train-dpc --method ded-dpc --settings 'study*' --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
 	$(DED) solve --method ded-dpc --settings 'study*' $(VALIDATION)
 	for model in $(MODELS); do \
 	  $(DED) train-dpc --settings study --method ded-dpc --model $$model --case $(CASE) $(ONLY) \
@@ -140,7 +142,7 @@ report: bench  ## everything that is missing, then the tables and the report
 online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency and forecast
 	for s in 1 10; do $(call OPERATE,ed) --settings $${s}s --period $$s || exit 1; done
 	$(call OPERATE,ed) --period 60
-	$(foreach m,ded-slp ded-ko-knots $(if $(ANSWERING),$(POLICIES) ded-dpc-refined) ded,$(if \
+	$(foreach m,ded-slp ded-ko-knots $(if $(ANSWERING),$(POLICIES) $(REFINED)) ded,$(if \
 	  $(filter-out 0,$(call SCENES,$m)),$(call OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
 	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency $(LATENCIES)
 	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency 0,1,7,30 --forecast perfect,worse,persistence

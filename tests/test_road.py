@@ -38,7 +38,7 @@ def test_the_paper_s_case() -> None:
     ]
     methods = solved(road)
     assert set(methods.values()) == {None}
-    assert {name for name, _, _ in methods} == set(METHODS) - {"ded-radau"}
+    assert {name for name, _, _ in methods} == set(METHODS) - {"ded-radau", "ded-dpc-shared"}
     assert {("ded", "accelerated", "koopman"), ("ed", "*", "koopman")} <= set(methods)
 
 
@@ -58,8 +58,9 @@ def test_policies_are_trained_elsewhere_if_asked() -> None:
     road = commands("report", "CASE=two-area", "TRAIN=--seconds 5")
     (training,) = (command for command in road if command[0] == "train-dpc")
     asked = parser().parse_args(training)
-    assert (asked.case, asked.method, asked.seconds) == ("two-area", ("ded-dpc",), 5.0)
-    assert ("ded-dpc", "default", "koopman") in solved(road)
+    assert (asked.case, asked.method, asked.seconds) == ("two-area", ("ded-dpc-shared",), 5.0)
+    assert ("ded-dpc-shared", "default", "koopman") in solved(road)
+    assert not {"ded-dpc", "ded-dpc-refined"} & {name for name, _, _ in solved(road)}
 
 
 def test_limits_of_slow_methods_and_of_the_user() -> None:

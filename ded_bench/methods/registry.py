@@ -141,6 +141,12 @@ METHODS: dict[str, Method] = {
             "ded-dpc", "ded_bench.methods.dpc.policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
         ),
         Method("ded-dpc-refined", "ded_bench.methods.dpc.refined", "DED-DPC (refined)"),
+        Method(
+            "ded-dpc-shared",
+            "ded_bench.methods.dpc_shared.shared_policy",
+            "DED-DPC (shared weights)",
+            trainer="ded_bench.methods.dpc_shared.unrolled_training",
+        ),
     )
 }
 

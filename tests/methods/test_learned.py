@@ -89,7 +89,7 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
 
 
 def test_the_command_names_what_it_trains(out: Path, problem: Path, capsys) -> None:
-    assert trainable() == ["ded-dpc-paper", "ded-dpc", "learned"]
+    assert trainable() == ["ded-dpc-paper", "ded-dpc", "ded-dpc-shared", "learned"]
     with pytest.raises(SystemExit):
         main(["train-dpc", "--help"])
     told = capsys.readouterr().out

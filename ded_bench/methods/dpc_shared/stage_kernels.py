@@ -134,10 +134,10 @@ class Given(NamedTuple):
 class Weights(NamedTuple):
     """Weights of all stages, the stage first."""
 
-    first: Array32  # (n_stages, width, 3 n_sequence)
+    first: Array32  # before, here and after, (n_stages, 3 width, n_sequence)
     constant: Array32  # (n_stages, width, n_constant)
     times: Array32  # what depends on the knot alone, (n_stages, width, n_knots)
-    spread: Array32  # (n_stages, n_blocks, width, 3 width)
+    spread: Array32  # likewise, (n_stages, n_blocks, 3 width, width)
     spread_bias: Array32
     mix: Array32  # (n_stages, n_blocks, width, width + 3 MIXED)
     mix_bias: Array32
@@ -161,7 +161,7 @@ def answer(
     """
     batch, n, n_gen = powers.shape
     n_fine, n_out = given.offset.shape[1], weights.last.shape[1]
-    n_in, columns = weights.first.shape[2] // 3, n_gen * n
+    n_in, columns = weights.first.shape[2], n_gen * n
     omega, p_slack, update = np.empty((n_fine, n_gen)), np.empty(n_fine), np.empty((n, n_gen))
     seen, out = np.empty((n_in, columns), np.float32), np.empty((n_out, columns), np.float32)
     for b in range(batch):
@@ -212,14 +212,13 @@ def _stage(
     out: Array32,
 ) -> None:
     """The network of stage s, from what it sees to its outputs; its memory is seen by the next one."""
-    n_gen, n, width = constant.shape[1], weights.times.shape[2], weights.first.shape[1]
+    n_gen, n, width = constant.shape[1], weights.times.shape[2], weights.times.shape[1]
     n_memory, columns = len(out) - CORRECTIONS, n_gen * n
-    seen_taps = np.empty((3 * len(seen), columns), np.float32)
     hidden, change = np.empty((width, columns), np.float32), np.empty((width, columns), np.float32)
     taps = np.empty((3 * width, columns), np.float32)
     inner, own = np.empty((width + 3 * MIXED, columns), np.float32), np.empty((width, n_gen), np.float32)
-    _gather(seen, n_gen, 1, seen_taps)
-    np.dot(weights.first[s], seen_taps, hidden)
+    np.dot(weights.first[s], seen, taps)
+    _gather(taps, n_gen, 1, hidden)
     np.dot(weights.constant[s], constant, own)
     for o in range(width):
         for g in range(n_gen):
@@ -227,9 +226,9 @@ def _stage(
             for j in range(n):
                 row[j] += own[o, g] + times[j]
     for i in range(len(dilations)):
-        _gather(hidden, n_gen, dilations[i], taps)
         z = inner[:width]
-        np.dot(weights.spread[s, i], taps, z)
+        np.dot(weights.spread[s, i], hidden, taps)
+        _gather(taps, n_gen, dilations[i], z)
         for o in range(width):
             row, bias = z[o], weights.spread_bias[s, i, o]
             for j in range(columns):
@@ -342,21 +341,23 @@ def _squash(value: float) -> float:
 
 
 @compiled
-def _gather(values: Array32, n_gen: int, dilation: int, taps: Array32) -> None:
-    """Each knot's neighbours at a distance, and itself; beyond both ends as at the ends."""
+def _gather(taps: Array32, n_gen: int, dilation: int, values: Array32) -> None:
+    """Add what each knot's neighbours at a distance give it, and itself; beyond both ends as at the ends."""
     n_channels, n = len(values), values.shape[1] // n_gen
     d = min(dilation, n - 1)
     for i in range(n_channels):
         for g in range(n_gen):
-            row = values[i, g * n : (g + 1) * n]
-            before = taps[i, g * n : (g + 1) * n]
-            here = taps[n_channels + i, g * n : (g + 1) * n]
-            after = taps[2 * n_channels + i, g * n : (g + 1) * n]
-            before[:d] = row[0]
-            before[d:] = row[: n - d]
-            here[:] = row
-            after[: n - d] = row[d:]
-            after[n - d :] = row[n - 1]
+            first, last = g * n, (g + 1) * n
+            before, after = taps[i, first:last], taps[2 * n_channels + i, first:last]
+            here, row = taps[n_channels + i, first:last], values[i, first:last]
+            for j in range(d):
+                row[j] = here[j] + before[0]
+            for j in range(d, n):
+                row[j] = here[j] + before[j - d]
+            for j in range(n - d):
+                row[j] += after[j + d]
+            for j in range(n - d, n):
+                row[j] += after[n - 1]
 
 
 @compiled

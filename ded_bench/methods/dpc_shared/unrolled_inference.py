@@ -109,6 +109,13 @@ def times_of(n_knots: int) -> Array:
     return np.stack([t, np.exp(-DECAYS * t)])
 
 
+def _by_tap(weights: Array32) -> Array32:
+    """(..., n_out, 3 n_in) to (..., 3 n_out, n_in): products first, sums over neighbours then."""
+    *stages, n_out, n_taps = weights.shape
+    found = weights.reshape(*stages, n_out, 3, n_taps // 3).swapaxes(-3, -2)
+    return np.ascontiguousarray(found).reshape(*stages, 3 * n_out, n_taps // 3)
+
+
 class CompiledNetwork:
     """The same function as an UnrolledNetwork, with its state dict as arrays; powers in float64."""
 
@@ -120,10 +127,10 @@ class CompiledNetwork:
         }
         times = layer["constant"][:, :, TIMES] @ times_of(len(model.response.knots)).astype(np.float32)
         self._weights = Weights(
-            first=layer["first"],
+            first=_by_tap(layer["first"]),
             constant=layer["constant"],
             times=times + layer["first_bias"][:, :, None],
-            spread=layer["spread"],
+            spread=_by_tap(layer["spread"]),
             spread_bias=layer["spread_bias"],
             mix=layer["mix"],
             mix_bias=layer["mix_bias"],

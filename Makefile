@@ -157,8 +157,8 @@ quick:  ## the same road with 4 instances (2 for full DED) and little training, 
 	  TRAIN="--seconds 8 --limit 40" TIMED=1 BENCH="--repeats 1 --method $(QUICK_BENCH)"
 
 test: $(STAMP)  ## lint, type check and tests
-	$(BIN)/ruff check ded_bench tests
-	$(BIN)/ruff format --check ded_bench tests
+	$(BIN)/ruff check ded_bench tests examples
+	$(BIN)/ruff format --check ded_bench tests examples
 	$(BIN)/mypy
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 

@@ -34,8 +34,10 @@ def solved(road: list[list[str]]) -> dict[tuple[str, str, str], int | None]:
 def test_the_paper_s_case() -> None:
     road = commands("report")
     assert [command[0] for command in road if command[0] != "solve"] == [
-        *("train-ko", "train-dpc", "bench", "report")
+        *("train-ko", "train-dpc", "train-dpc", "bench", "report")
     ]
+    trained = [parser().parse_args(command) for command in road if command[0] == "train-dpc"]
+    assert [(a.method, a.seconds) for a in trained] == [(("ded-dpc-paper",), None), (("ded-dpc",), 420.0)]
     methods = solved(road)
     assert set(methods.values()) == {None}
     assert {name for name, _, _ in methods} == set(METHODS) - {"ded-radau", "ded-dpc-shared"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.methods.dpc_shared.stage_kernels import Array32, Modes
+from ded_bench.methods.dpc_shared.stage_records import Array32, Modes
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 

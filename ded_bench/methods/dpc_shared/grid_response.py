@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ded_bench.methods.dpc_shared.stage_kernels import Indices, Modes
+from ded_bench.methods.dpc_shared.stage_records import Indices, Modes
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 

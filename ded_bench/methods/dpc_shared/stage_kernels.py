@@ -5,32 +5,26 @@ Numba's cache on disk notices that a function's own file changed, not that a fun
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ded_bench.methods.dpc_shared.stage_records import (
+    CORRECTIONS,
+    DOUBLING,
+    MIXED,
+    PRICE,
+    STRAIGHT,
+    Array32,
+    Given,
+    Indices,
+    Modes,
+    Units,
+    Weights,
+)
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
-Array32 = NDArray[np.float32]
-Indices = NDArray[np.int_]
-
-#: Hidden channels of each kind that are averaged over other generators.
-MIXED = 4
-#: Outputs of a stage that are corrections; the others are its memory.
-CORRECTIONS = 4
 #: Largest ratio of |ω| to its bound that the network sees.
 MOST = np.float64(3.0)
-
-
-class Modes(NamedTuple):
-    """The grid in modal coordinates; see `GridResponse`."""
-
-    step: Array  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
-    damping: Array  # what is left of it, (n_modes, n_modes), 1/s
-    half: float  # half the spacing of fine points, s
-    instants: Indices  # fine points at which stiffness changes are given, (n_instants,)
 
 
 @compiled
@@ -99,57 +93,11 @@ def track_rows(targets: Array, low: Array, high: Array, step: Array) -> None:
                 targets[b, j, g] = min(max(target, before - step[g]), before + step[g])
 
 
-class Units(NamedTuple):
-    """Limits of a case, and the units in which a stage sees powers; matrices are (n_gen, n_gen)."""
-
-    low: Array  # (n_gen,), pu, as the next four
-    high: Array
-    step: Array  # largest change between knots by ramps
-    unit: Array  # the same by ramps and the bound on |ω|
-    pace: Array  # factor of corrections, smaller where swings are faster than knots
-    turn: float  # angle that the bound allows between knots, rad
-    bound: float  # rad/s
-    stiffness: Array
-    compliance: Array
-    by_stiffness: Array32
-    by_compliance: Array32
-    gain: Array  # see `GridResponse`, as the next
-    shape: Array
-
-
-class Given(NamedTuple):
-    """What is known of a batch before the first stage."""
-
-    cost: Array  # (slack, generators), in means of all, (batch, 1 + n_gen)
-    static: Array  # (batch, n_knots, n_gen), pu, as the next
-    fixed: Array
-    offset: Array  # see `Linear`: (batch, n_fine, n_gen), pu
-    slack: Array  # (batch, n_fine), pu
-    leverage: Array  # what an angle takes from the slack, (batch, n_fine, n_gen), pu/rad
-    change: Array  # (batch, n_instants, n_modes, n_modes)
-    state: Array  # (batch, 2, n_modes)
-    constant: Array32  # of each generator, (batch, n_constant, n_gen)
-
-
-class Weights(NamedTuple):
-    """Weights of all stages, the stage first."""
-
-    first: Array32  # before, here and after, (n_stages, 3 width, n_sequence)
-    constant: Array32  # (n_stages, width, n_constant)
-    times: Array32  # what depends on the knot alone, (n_stages, width, n_knots)
-    spread: Array32  # likewise, (n_stages, n_blocks, 3 width, width)
-    spread_bias: Array32
-    mix: Array32  # (n_stages, n_blocks, width, width + 3 MIXED)
-    mix_bias: Array32
-    last: Array32  # (n_stages, CORRECTIONS + n_memory, width)
-    last_bias: Array32
-
-
 @compiled
 def answer(
     powers: Array, given: Given, units: Units, modes: Modes, dilations: Indices, weights: Weights
 ) -> None:
-    """Turn first schedules into answers, stage by stage.
+    """Turn first schedules into answers: what is best of them and of what each stage makes of them.
 
     Args:
         powers: (batch, n_knots, n_gen), pu; receives the answers.
@@ -164,14 +112,40 @@ def answer(
     n_in, columns = weights.first.shape[2], n_gen * n
     omega, p_slack, update = np.empty((n_fine, n_gen)), np.empty(n_fine), np.empty((n, n_gen))
     seen, out = np.empty((n_in, columns), np.float32), np.empty((n_out, columns), np.float32)
+    p, n_stages = np.empty((n, n_gen)), len(weights.first)
     for b in range(batch):
         update[:] = 0.0
         seen[n_in - (n_out - CORRECTIONS) :] = 0.0
-        for s in range(len(weights.first)):
-            _respond(powers[b], given, b, units, modes, omega, p_slack)
-            _see(powers[b], update, omega, p_slack, given, b, units, seen)
-            _stage(seen, given.constant[b], s, units, dilations, weights, out)
-            _correct(powers[b], out, p_slack, given.static[b], units, update)
+        p[:] = powers[b]
+        least = np.inf
+        for s in range(n_stages + 1):
+            _respond(p, given, b, units, modes, omega, p_slack)
+            loss = _loss(p, omega, p_slack, given, b, units, modes)
+            if loss < least:
+                least, powers[b] = loss, p
+            if s < n_stages:
+                _see(p, update, omega, p_slack, given, b, units, seen)
+                _stage(seen, given.constant[b], s, units, dilations, weights, out)
+                _correct(p, out, p_slack, given.static[b], units, update)
+
+
+@compiled
+def _loss(p: Array, omega: Array, p_slack: Array, given: Given, b: int, units: Units, modes: Modes) -> float:
+    """Cost as a part of the static dispatch's, and the penalty; see `ScheduleLoss`."""
+    cost, penalty, (n, n_gen), n_fine = 0.0, 0.0, p.shape, len(p_slack)
+    for j in range(n):
+        for g in range(n_gen):
+            share = 0.5 if j == 0 or j == n - 1 else 1.0
+            cost += share * given.cost[b, 1 + g] * p[j, g] / (n - 1)
+    for k in range(n_fine):
+        share = 0.5 if k == 0 or k == n_fine - 1 else 1.0
+        cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_fine - 1)
+        for g in range(n_gen):
+            excess = abs(omega[k, g]) / units.bound - 1.0
+            if excess > 0.0:
+                bent = min(excess, STRAIGHT)
+                penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
+    return cost / given.scale[b] + PRICE * penalty * 2.0 * modes.half
 
 
 @compiled

@@ -8,14 +8,15 @@ import numpy as np
 
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
-from ded_bench.methods.dpc_shared.stage_kernels import (
+from ded_bench.methods.dpc_shared.stage_kernels import answer
+from ded_bench.methods.dpc_shared.stage_records import (
     CORRECTIONS,
     MIXED,
+    SMALLEST_COST,
     Array32,
     Given,
     Units,
     Weights,
-    answer,
 )
 from ded_bench.problem.case import Array
 
@@ -25,7 +26,7 @@ N_SEQUENCE, N_CONSTANT, N_MEMORY = 20, 11, 4
 TIMES = slice(6, 8)
 DECAYS = 12.0
 #: Costs whose mean is smaller are as good as free.
-SMALLEST_COST = 1e-3
+FREE = 1e-3
 #: Machines that swing further between knots, rad², are corrected less at a time: it would excite them.
 SWING = 3.0
 #: A stage sees so many seconds to either side.
@@ -88,11 +89,11 @@ def constants_of(model: PathModel, units: Units, outset: Outset) -> tuple[Array,
     The entries `TIMES` are zero; they depend on the knot.
     """
     problems, (batch, n_gen) = outset.problems, outset.problems.p_initial.shape
-    mean = np.maximum(problems.cost.mean(axis=1, keepdims=True), SMALLEST_COST)
+    mean = np.maximum(problems.cost.mean(axis=1, keepdims=True), FREE)
     cost, dear = problems.cost[:, 1:], problems.cost[:, :1]
     speed = np.clip(problems.omega / units.bound, -3.0, 3.0)
     found = np.zeros((batch, N_CONSTANT, n_gen))
-    found[:, 0] = (cost - dear) / np.maximum(cost + dear, SMALLEST_COST)
+    found[:, 0] = (cost - dear) / np.maximum(cost + dear, FREE)
     found[:, 1], found[:, 2] = cost / mean - 1.0, dear / mean - 1.0
     found[:, 3] = (2.0 * problems.p_initial - units.low - units.high) / (units.high - units.low)
     found[:, 4], found[:, 5] = speed, speed @ units.by_stiffness.T
@@ -101,6 +102,14 @@ def constants_of(model: PathModel, units: Units, outset: Outset) -> tuple[Array,
     found[:, 9] = np.log(own * units.turn / units.step)
     found[:, 10] = np.log(np.sqrt(own / model.network.m) * model.spacing)
     return found, problems.cost / mean
+
+
+def static_cost(outset: Outset) -> Array:
+    """Mean cost of the static dispatch, what costs are relative to, (batch,)."""
+    problems, static = outset.problems, outset.static
+    p_slack = problems.load[:, ::FINE].sum(axis=2) + static.sum(axis=2)
+    cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(p_slack)
+    return np.maximum(cost.mean(axis=1), SMALLEST_COST * max(1.0, static.shape[2] / 2))
 
 
 def times_of(n_knots: int) -> Array:
@@ -153,6 +162,7 @@ class CompiledNetwork:
             change=linear.change,
             state=outset.state,
             constant=constant.astype(np.float32),
+            scale=static_cost(outset) / np.maximum(outset.problems.cost.mean(axis=1), FREE),
         )
         powers = outset.start.copy()
         answer(powers, given, self._units, self._model.modes, self._dilations, self._weights)

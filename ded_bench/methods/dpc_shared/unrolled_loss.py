@@ -11,22 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
+from ded_bench.methods.dpc_shared.stage_records import DOUBLING, STRAIGHT
+from ded_bench.methods.dpc_shared.unrolled_inference import static_cost
 from ded_bench.problem.case import Array
 
 #: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
 MARGIN = 0.015
-#: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
-#: exact penalty, above nearly all of the optimum's multipliers. It grows from the first to the second.
-PRICE = (0.01, 0.08)
-#: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
-DOUBLING = 0.05
-#: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
-STRAIGHT = 0.2
-#: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per pair
-#: of generators.
-SMALLEST_COST = 0.05
+#: The price of the penalty grows from a part of `stage_records.PRICE` to it.
+FIRST_PRICE = 0.125
 #: Part of the loss of each stage before the last.
 EARLIER = 0.1
 
@@ -67,15 +60,8 @@ class ScheduleLoss:
         excess = (omega.abs() / self.model.bound - (1.0 - margin)).relu()
         bent = excess.clamp_max(STRAIGHT)
         penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * self.spacing
-        return Judged(total / self._scale(outset), penalty, excess.amax(dim=(1, 2)))
-
-    def _scale(self, outset: Outset) -> Tensor:
-        """Mean cost of the static dispatch, (batch,)."""
-        problems, static = outset.problems, outset.static
-        p_slack = problems.load[:, ::FINE].sum(axis=2) + static.sum(axis=2)
-        cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(p_slack)
-        least = SMALLEST_COST * max(1.0, static.shape[2] / 2)
-        return torch.as_tensor(np.maximum(cost.mean(axis=1), least), dtype=torch.float32)
+        scale = torch.as_tensor(static_cost(outset), dtype=torch.float32)
+        return Judged(total / scale, penalty, excess.amax(dim=(1, 2)))
 
 
 def total_loss(judged: list[Judged], price: float, used: Tensor) -> Tensor:

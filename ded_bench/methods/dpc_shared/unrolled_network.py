@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import FollowTargets, Respond
-from ded_bench.methods.dpc_shared.stage_kernels import CORRECTIONS, MIXED, Units
+from ded_bench.methods.dpc_shared.stage_records import CORRECTIONS, MIXED, Units
 from ded_bench.methods.dpc_shared.unrolled_inference import (
     N_CONSTANT,
     N_MEMORY,

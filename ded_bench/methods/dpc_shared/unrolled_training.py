@@ -20,7 +20,8 @@ from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw
 from ded_bench.methods.dpc_shared.grid_response import GridResponse
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
 from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy
-from ded_bench.methods.dpc_shared.unrolled_loss import MARGIN, PRICE, ScheduleLoss, total_loss
+from ded_bench.methods.dpc_shared.stage_records import PRICE
+from ded_bench.methods.dpc_shared.unrolled_loss import FIRST_PRICE, MARGIN, ScheduleLoss, total_loss
 from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
 from ded_bench.methods.policy_file import Scope, Weights, weights_fingerprint
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
@@ -166,7 +167,7 @@ class _Run:
         generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, self.step]))
         outset = model.outset(draw(model.case, model.bound, model.response.fine, self.batch, generator))
         outcomes = self.network(outset)
-        price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress
+        price = PRICE * FIRST_PRICE ** (1.0 - progress)
         judged = [self.loss(outset, outcome, MARGIN) for outcome in outcomes]
         self.step += 1
         used = torch.as_tensor(outset.served)
@@ -186,7 +187,7 @@ class _Run:
         with torch.no_grad():
             outcome = self.average(check)[-1]
             tight, own = (self.loss(check, outcome, margin) for margin in (MARGIN, 0.0))
-        value = float((tight.cost + PRICE[1] * tight.penalty).mean())
+        value = float((tight.cost + PRICE * tight.penalty).mean())
         hertz = own.excess * self.loss.model.bound / (2 * math.pi)
         row = {
             "epoch": self.epoch,

@@ -145,7 +145,7 @@ def _loss(p: Array, omega: Array, p_slack: Array, given: Given, b: int, units: U
             if excess > 0.0:
                 bent = min(excess, STRAIGHT)
                 penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
-    return cost / given.scale[b] + PRICE * penalty * 2.0 * modes.half
+    return float(cost / given.scale[b] + PRICE * penalty * 2.0 * modes.half)
 
 
 @compiled

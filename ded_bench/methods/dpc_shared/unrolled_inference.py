@@ -109,7 +109,7 @@ def static_cost(outset: Outset) -> Array:
     problems, static = outset.problems, outset.static
     p_slack = problems.load[:, ::FINE].sum(axis=2) + static.sum(axis=2)
     cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(p_slack)
-    return np.maximum(cost.mean(axis=1), SMALLEST_COST * max(1.0, static.shape[2] / 2))
+    return np.asarray(np.maximum(cost.mean(axis=1), SMALLEST_COST * max(1.0, static.shape[2] / 2)))
 
 
 def times_of(n_knots: int) -> Array:

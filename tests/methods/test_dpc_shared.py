@@ -11,24 +11,27 @@ import pytest
 import torch
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods import ed
 from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw, sampled
 from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import FollowTargets, Respond
-from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy
+from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy, prepare
 from ded_bench.methods.dpc_shared.stage_records import PRICE
 from ded_bench.methods.dpc_shared.unrolled_inference import static_cost, weight_shapes
 from ded_bench.methods.dpc_shared.unrolled_loss import ScheduleLoss, total_loss
 from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
 from ded_bench.methods.dpc_shared.unrolled_training import train
 from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.instance import Initial, Instance, LoadPoints
-from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.network import Network
 from ded_bench.truth.score import score
+from ded_bench.truth.servable import servable
 from ded_bench.truth.simulate import simulate
 
 HORIZON = 12.0
@@ -331,3 +334,20 @@ def test_path_is_averaged_before_the_network_is_asked(ninebus: Case) -> None:
     swing[:, [0, -1]] = 0.0
     calm, swung = model.linearise(outset, x), model.linearise(outset, x + swing)
     np.testing.assert_allclose(swung.offset[:, FINE:-FINE], calm.offset[:, FINE:-FINE], atol=3e-3)
+
+
+def test_committed_weights_are_worth_having() -> None:
+    """On a validation instance of two-area: limits are met, and NO costs less than static dispatch does."""
+    case = Case.load("two-area")
+    instance = sample_instance(case, VALIDATION_SEED, 0, servable)
+    found = {}
+    for regime in case.regimes:
+        settings = Settings(search=(REPOSITORY / "results" / "two-area-reference",))
+        solution = prepare(case, regime, settings)(instance)
+        assert solution.schedule is not None
+        found[regime] = score(case, instance, solution.schedule, regime)
+        assert found[regime].feasible
+    static = ed.prepare(case, "NO", Settings())(instance).schedule
+    assert static is not None
+    assert found["NO"].objective <= 1.0001 * score(case, instance, static, "NO").objective
+    assert found["NO"].objective <= found["TO"].objective

@@ -20,6 +20,7 @@ from ded_bench.report.page import (
     Heading,
     Items,
     Picture,
+    SideBySide,
     Table,
     Text,
     render_html,
@@ -172,6 +173,9 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
         inside = [known[name] for name in names if name in known]
         return [Heading(heading), *inside] if inside else []
 
+    gaps = part("Gaps", "gaps", "gap")
+    if len(gaps) == 3:  # its heading, the table and the figure
+        gaps = [gaps[0], SideBySide((gaps[1],), (gaps[2],))]
     missing = [] if "times" in tables else [Text("No method was timed alone yet; run `ded-bench bench`.")]
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
@@ -180,7 +184,7 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
         Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
         Text(_finding(tables)),
         *part("The grids", "grids"),
-        *part("Gaps", "gaps", "gap"),
+        *gaps,
         Items(EXPLANATION),
         *part("Claimed and verified", "verified", "violations", "ac"),
         *part("Time and memory against size", "growth", "slopes", "times", "memory"),

@@ -28,6 +28,7 @@ from ded_bench.report.figures.style import (
     bounds,
     colour,
     dashes,
+    legend_above,
     legend_below,
     marker,
     new_figure,
@@ -151,14 +152,9 @@ def scenario_figure(case: Case, regime: str, heading: str, shown: Sequence[Opera
         axes = figure.subplots(2 + 2 * n, 1, sharex=True)
         handles: list[Line2D] = []
         for i in loads:
-            axes[0].plot(*thin(first["t"], -first["p_load"][:, i]), color=BUS_COLOURS[i % len(BUS_COLOURS)])
-            axes[0].annotate(
-                f"bus {case.loads[i]}",
-                (first["t"][0], -first["p_load"][0, i]),
-                xytext=(4, 2),
-                textcoords="offset points",
-                fontsize=7,
-            )
+            shade, name = BUS_COLOURS[i % len(BUS_COLOURS)], f"bus {case.loads[i]}"
+            axes[0].plot(*thin(first["t"], -first["p_load"][:, i]), color=shade, label=name)
+        legend_above(axes[0], DRAWN)
         axes[0].set_ylabel("loads (pu)")
         limit = 1e3 * case.regimes[regime].omega_hz
         for power, omega, j in zip(axes[1 : 1 + n], axes[1 + n : -1], generators, strict=True):

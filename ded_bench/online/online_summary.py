@@ -83,7 +83,8 @@ def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method, latency and kind, of methods swept over latencies, their own included.
 
     Only scenarios count that were operated in all of a method's lines, so that these are about the same
-    scenarios; what was operated on fewer than half as many scenarios as another line has none.
+    scenarios; what was operated on fewer than half as many scenarios as another latency that was asked for
+    has none. A method's own latency may have been operated on all scenarios, and asks nothing of the others.
     """
     frame = frame[frame["warm"].astype(bool)]
     parts = []
@@ -92,7 +93,8 @@ def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
         if announced["latency_s"].nunique() < SWEPT:
             continue
         scenarios = [set(line["scenario"]) for _, line in rows.groupby(["latency_s", "kind"])]
-        most = max(map(len, scenarios))
+        asked = rows[rows["latency_source"] == "given"] if "given" in set(rows["latency_source"]) else rows
+        most = asked.groupby(["latency_s", "kind"])["scenario"].nunique().max()
         common = set.intersection(*(some for some in scenarios if 2 * len(some) >= most))
         kept = rows.groupby(["latency_s", "kind"])["scenario"].transform("nunique") * 2 >= most
         parts.append(rows[kept & rows["scenario"].isin(common)])

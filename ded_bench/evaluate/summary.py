@@ -28,6 +28,8 @@ VALIDATION = "validation"
 STUDY = "study"
 #: Settings whose name starts so solve full DED from another starting point.
 START = "start-"
+#: Settings of this name, or whose name ends so, plan on the AC network; the lossless one is not theirs.
+AC = "ac"
 #: Shift of the shifted geometric mean, s: times far below it count as equal.
 TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
@@ -52,13 +54,17 @@ def is_study(slug: str) -> bool:
 
 def in_own_table(slug: str) -> bool:
     """Whether rows with these settings stand in a table of their own, and in no other."""
-    return is_study(slug) or slug.startswith(START)
+    return is_study(slug) or slug.startswith(START) or slug == AC or slug.endswith(f"-{AC}")
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that the tables are about: the test instances if there are any, else all but validation."""
+    """The rows that most tables are about: `benchmark_rows` without those that have a table of their own."""
+    return benchmark_rows(frame[~frame["settings"].map(in_own_table).astype(bool)])
+
+
+def benchmark_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows on test instances if there are any, else all but those on validation instances."""
     frame = scoring_rows(frame)
-    frame = frame[~frame["settings"].map(in_own_table).astype(bool)]
     test = frame[frame["split"] == "test"]
     return test if len(test) else frame
 

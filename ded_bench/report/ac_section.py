@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ded_bench.evaluate.ac_summary import validated, with_ac
-from ded_bench.evaluate.summary import title
+from ded_bench.evaluate.summary import benchmark_rows, title
 from ded_bench.report.columns import Column
 from ded_bench.report.gallery import Gallery
 from ded_bench.report.page import Block, Heading, Items, Table
@@ -38,7 +38,7 @@ def ac_tables(gallery: Gallery) -> dict[str, Table]:
     """The table, if schedules were scored on the AC network."""
     sources = gallery.sources
     rows = [row for row in AcResults(sources.results.folder).rows.values() if row.case == sources.case.id]
-    frame = validated(with_ac(sources.judged, rows)) if rows else None
+    frame = validated(with_ac(benchmark_rows(sources.rows), rows)) if rows else None
     if frame is None or not len(frame):
         return {}
     return {"validated": Table(frame, VALIDATED, "Claimed by solvers, verified here, validated on AC")}
@@ -49,7 +49,8 @@ def ac_blocks(gallery: Gallery) -> list[Block]:
     tables = ac_tables(gallery)
     if not tables:
         return []
-    both = with_ac(gallery.sources.judged, AcResults(gallery.sources.results.folder).rows.values())
+    sources = gallery.sources
+    both = with_ac(benchmark_rows(sources.rows), AcResults(sources.results.folder).rows.values())
     scored, carried = (frame["instance"].nunique() for frame in (both, both[both["carried"]]))
     text = (
         "The same schedules on the full AC network (`ded-bench score --results DIR --truth ac`): lines with "

@@ -11,6 +11,7 @@ import pytest
 
 from ded_bench.evaluate.summary import (
     TIME_SHIFT_S,
+    benchmark_rows,
     claims,
     coverage,
     gaps,
@@ -303,3 +304,11 @@ def test_an_empty_table_has_its_columns() -> None:
         assert len(made) == 0
         assert {"regime", "method", "settings", "title"} <= set(made.columns)
     assert len(performance_profile(empty, "solve_s")) == 0
+
+
+def test_plans_for_the_ac_network_stand_in_its_table_only() -> None:
+    """They solve another problem: here their violations are no failure of theirs."""
+    settings = ["default", "default-trajectory", "ac", "swing-ac", "default-trajectory-ac"]
+    frame = pd.DataFrame({"settings": settings, "split": "test"})
+    assert judged_rows(frame)["settings"].tolist() == settings[:2]
+    assert benchmark_rows(frame)["settings"].tolist() == settings

@@ -13,8 +13,8 @@ from ded_bench.run.results import ROWS, Results, Row
 
 
 def gallery_of(results: Results, case: Case) -> Any:
-    judged = ROWS.frame(results.rows.values())
-    return SimpleNamespace(sources=SimpleNamespace(case=case, results=results, judged=judged))
+    rows = ROWS.frame(results.rows.values())
+    return SimpleNamespace(sources=SimpleNamespace(case=case, results=results, rows=rows))
 
 
 def test_validated_rows(tmp_path):

@@ -152,11 +152,17 @@ def bounds(ax: Axes, *levels: float) -> Line2D:
 
 
 def legend_below(figure: Figure, handles: Sequence[Line2D], columns: int = 4) -> None:
-    """One legend under all panels, each label once, so that it never covers data."""
+    """One legend under all panels, each label once, so that it never covers data.
+
+    Args:
+        columns: at most so many; fewer where the labels are too long for the figure's width.
+    """
     unique = {str(handle.get_label()): handle for handle in handles}
-    figure.legend(
-        unique.values(), unique.keys(), loc="outside lower center", ncols=min(columns, max(len(unique), 1))
-    )
+    for count in range(min(columns, max(len(unique), 1)), 0, -1):
+        legend = figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=count)
+        if count == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def legend_above(ax: Axes, columns: int) -> None:

@@ -15,6 +15,7 @@ import io
 import itertools
 import pickle
 import random
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -131,12 +132,16 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "run", lambda *_: [])
 
 
+#: What a command says that it is about to do, before it finds what is wrong.
+ANNOUNCED = re.compile(r"^ded-bench: \d+ trainings? of .*\n", re.MULTILINE)
+
+
 def end_of(arguments: Sequence[object]) -> tuple[int, str]:
     """Exit code and standard error of a command."""
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
         code = commands.main([str(argument) for argument in arguments])
-    return code, errors.getvalue()
+    return code, ANNOUNCED.sub("", errors.getvalue())
 
 
 def ending(arguments: Sequence[object], path: Path, mutant: Mutant) -> tuple[int | None, str]:

@@ -103,15 +103,15 @@ def _bench(a: argparse.Namespace) -> int:
     results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
     known = {key.method for key in results.rows}
+    if not a.method:
+        for name in sorted(known - set(methods)):
+            say(f"{name}: not timed, since no method has this name")
     if not known & set(methods):
         raise InputError(
             results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
         )
     timed = ", ".join(sorted(known & set(methods)))
     say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
-    if not a.method:
-        for name in sorted(known - set(methods)):
-            say(f"{name}: not timed, since no method has this name")
     from ded_bench.evaluate.bench import bench, choose_sample, runs_of
     from ded_bench.evaluate.timing import timing_summary
 

@@ -145,7 +145,6 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
-    say(f"simulating {a.schedule}")
     from ded_bench.truth.ac_simulate import score_ac
     from ded_bench.truth.score import score
     from ded_bench.truth.simulate import SimulationError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,6 +107,9 @@ def _train_ko(a: argparse.Namespace) -> int:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
+    if a.kind == TRAINED[1]:
+        with _needing_torch():
+            _find_torch()
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
     if is_ac:
         return _train_ko_ac(a, case, out)
@@ -165,6 +169,9 @@ def _train_dpc(a: argparse.Namespace) -> int:
     for method in methods:
         if not method.trainer:
             _ = method.train  # says that it is not trained
+    if any(method.trainer.startswith("ded_bench.") for method in methods):
+        with _needing_torch():
+            _find_torch()
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
     if min(a.workers, len(jobs)) == 1:
         for job in jobs:
@@ -205,6 +212,12 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     facts = train(case, regime, instances, model, out, options, **setting).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
+
+
+def _find_torch() -> None:
+    """Fail as an import would, without the seconds that one takes."""
+    if importlib.util.find_spec("torch") is None:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
 
 @contextlib.contextmanager

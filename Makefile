@@ -126,7 +126,7 @@ ablation: models  ## short trainings of DED-DPC, each with one thing changed, ju
 	$(DED) solve --method ded-ko-knots $(VALIDATION)
 	$(DED) train-dpc --method ded-dpc --settings 'study*' --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
 	$(DED) solve --method ded-dpc --settings 'study*' $(VALIDATION)
-	for model in $(MODELS); do \
+	for model in $(filter-out trajectory,$(MODELS)); do \
 	  $(DED) train-dpc --settings study --method ded-dpc --model $$model --case $(CASE) $(ONLY) \
 	    --results $(RESULTS) --workers $(WORKERS) || exit 1; \
 	  $(DED) solve --method ded-dpc --settings study --model $$model $(VALIDATION) || exit 1; done

@@ -9,7 +9,8 @@ the closed loop calls: it may start from the plan in force, and where no schedul
 may answer `Infeasible` with the schedule that exceeds them least.
 
 A setting whose answers depend on much more than the method's others has a module of its own, which offers
-the same and which the method's line names: the code of a row is that of the module that answers.
+the same and which the method's line names: the code of a row is that of the module that answers. Where a
+setting differs in operation only, `TIMED_AS` of its module names the setting whose times are its own.
 """
 
 from __future__ import annotations
@@ -86,6 +87,11 @@ class Method:
         find = getattr(self._answering(settings.name), "artifacts", None)
         return tuple(find(case, regime, settings)) if find else ()
 
+    def timed_as(self, settings: str) -> str:
+        """Name of the settings whose times stand for these: `TIMED_AS` of the module may name others."""
+        names: Mapping[str, str] = getattr(self._answering(settings), "TIMED_AS", {})
+        return names.get(settings, settings)
+
     @property
     def train(self) -> Trainer:
         """The function that trains this method's policy.
@@ -129,6 +135,8 @@ METHODS: dict[str, Method] = {
             elsewhere=(
                 ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
                 ("swing-ac-once", "ded_bench.methods.ded_ko_knots_swing"),
+                ("receding", "ded_bench.methods.receding_knots"),
+                ("receding-wide", "ded_bench.methods.receding_knots"),
             ),
         ),
         Method(

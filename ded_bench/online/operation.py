@@ -109,7 +109,8 @@ def make_operations(
         method = get_method(name)
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
-            seconds, source = _latency(case, (regime, method.name, settings.slug), latency, timing)
+            timed = dataclasses.replace(settings, name=method.timed_as(settings.name))
+            seconds, source = _latency(case, (regime, method.name, timed.slug), latency, timing)
             own = dataclasses.replace(options, latency_s=seconds)
             code = code_of_method(method, settings.name, artifacts)
             shared = own, limit_s, source, artifacts

@@ -123,6 +123,18 @@ def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_p
     assert found.latency_source == "timing"
 
 
+def test_settings_that_differ_in_operation_only_have_the_time_of_others(threebus, scenarios, tmp_path):
+    """On the same model."""
+    settings = Settings("receding", model="linear")
+    row = TimingRow("r", 1, "TO", "ded-ko-knots", "default-linear", "i", "Optimal", 0.25, 5.0, 0.5)
+    TIMING.write(tmp_path / "timing.csv", [dataclasses.replace(row, case="threebus")])
+    loaded = load_scenarios(scenarios[:1], threebus)
+    (found,) = make_operations(
+        threebus, loaded, [("ded-ko-knots", settings)], ["TO"], LoopOptions(), "timing", [tmp_path]
+    )
+    assert (found.key.settings, found.options.latency_s) == ("receding-linear", pytest.approx(0.75))
+
+
 def test_the_command(scenarios, tmp_path, capsys):
     """Rows are printed as they are made, once."""
     line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--settings", "1s"]

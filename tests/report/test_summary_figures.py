@@ -69,6 +69,19 @@ def test_tradeoff_draws_a_point_per_method_hollow_if_infeasible(tmp_path) -> Non
     check_layout(figure, tmp_path)
 
 
+def test_a_method_that_one_regime_timed_alone_is_named_once(tmp_path) -> None:
+    points = pd.DataFrame(
+        [
+            ("NO", "ded", "default", "DED", 100, 1.0, 0.0, 5.0, True),
+            ("TO", "ded", "default", "DED", 100, 1.0, 0.0, 5.0, False),
+        ],
+        columns=[*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"],
+    )
+    figure = tradeoff_figure(points, "DED", PAPERS[:0])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["DED *"]
+    check_layout(figure, tmp_path)
+
+
 def test_the_papers_points_stand_in_the_tradeoff(tmp_path) -> None:
     points = pd.DataFrame(
         [("TO", "ded", "default", "DED", 100, 1.0, 0.0, 5.0, True)],

@@ -46,7 +46,8 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
     rows = -(-(len(methods) + 2) // 3)
     with new_figure(5.6, 0.2 + 2.35 * max(len(regimes), 1) + 0.19 * rows) as figure:
         panels = figure.subplots(max(len(regimes), 1), 1, sharex=True, squeeze=False)[:, 0]
-        handles: list[Line2D] = []
+        handles: dict[str, Line2D] = {}  # by method: one that only one regime timed alone has one entry
+        alone = points.groupby("method")["alone"].all()
         labels: dict[Axes, list[Label]] = {}
         for ax, regime in zip(panels, regimes, strict=False):
             labels[ax] = _draw_papers(ax, papers[papers["regime"] == regime])
@@ -56,8 +57,8 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
                 labels[ax] += _draw_family(
                     ax, family.sort_values(["seconds", "gap_percent"]), style, sizes[method]
                 )
-                label = plain(title(method) + ("" if family["alone"].all() else " *"))
-                handles.append(Line2D([], [], linestyle="none", markersize=6, label=label, **style))
+                label = plain(title(method) + ("" if alone[method] else " *"))
+                handles[method] = Line2D([], [], linestyle="none", markersize=6, label=label, **style)
             ax.set_xscale("log")
             ax.set_yscale("symlog", linthresh=LINEAR_GAP)
             ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -65,8 +66,8 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
             ax.margins(0.08, 0.12)
             ax.set_ylabel(f"{regime}: gap to {plain(reference)} (%)")
         panels[-1].set_xlabel("time per schedule (s), median")
-        handles += _legend_marks(bool((points["correct_rate"] < 1).any()), len(papers) > 0)
-        legend_below(figure, handles, columns=3)
+        marks = _legend_marks(bool((points["correct_rate"] < 1).any()), len(papers) > 0)
+        legend_below(figure, [*handles.values(), *marks], columns=3)
         for ax, found in labels.items():
             place_labels(figure, ax, found)
     return figure

@@ -58,7 +58,8 @@ def _truth(text: str) -> str:
 class OnlineRow:
     """One scenario operated with one method's plans, judged on the true DAE (see `Judgement`).
 
-    `truth` names the network that was operated: the lossless one, or the full AC network.
+    `truth` names the network that was operated: the lossless one, or the full AC network. `unforeseen_hz`
+    is how far loads that no plan knew of move frequencies (see `unforeseen`); it depends on no method.
 
     `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
@@ -85,6 +86,7 @@ class OnlineRow:
     ramp_violation: float | None = cell(default=None, lowest=0)
     bound_violation: float | None = cell(default=None, lowest=0)
     slack_travel_pu: float | None = cell(default=None, lowest=0)
+    unforeseen_hz: float | None = cell(default=None, lowest=0)
     plans: int = cell(default=0, lowest=0)
     late: int = cell(default=0, lowest=0)
     failed: int = cell(default=0, lowest=0)

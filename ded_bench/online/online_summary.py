@@ -64,6 +64,7 @@ def line(rows: pd.DataFrame) -> dict[str, object]:
         "static_excess_mhz_mean": 1e3 * done["static_excess_hz"].mean(),
         "max_excess_mhz_mean": 1e3 * done["max_excess_hz"].mean(),
         "max_excess_mhz_max": 1e3 * done["max_excess_hz"].max(),
+        "unforeseen_mhz_mean": 1e3 * done["unforeseen_hz"].mean(),
         "mean_excess_mhz": 1e3 * done["mean_excess_hz"].mean(),
         "share_outside": done["share_outside"].mean(),
         "slack_travel_pu": done["slack_travel_pu"].mean(),

@@ -33,6 +33,8 @@ from ded_bench.online.online_results import (
     keep_trajectory,
 )
 from ded_bench.online.planner import LIMIT_S, Planner
+from ded_bench.online.plant import Grid, Plant
+from ded_bench.online.unforeseen import unforeseen_hz
 from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
@@ -157,20 +159,24 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     """Operate one scenario in this process, and keep its trajectory."""
     o, started = operation, time.perf_counter()
     planner = Planner(case, o.regime, o.method, o.settings, o.limit_s)
-    plant = None if o.data is None else AcPlant(case, o.scenario, o.data, not o.plans_on_ac)
+    plant: Grid = Plant(case, o.scenario)
+    if o.data is not None:
+        plant = AcPlant(case, o.scenario, o.data, not o.plans_on_ac)
     outcome = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, outcome.trajectory, o.regime)
     keep_trajectory(files.trajectory(o.key), outcome.trajectory)
     row = _row(o, judgement, reason_of(outcome.error) if outcome.error else "")
+    loop_s = time.perf_counter() - started - outcome.method_s
     return dataclasses.replace(
         row,
+        unforeseen_hz=unforeseen_hz(case, o.scenario, o.options, plant),
         plans=outcome.plans,
         late=outcome.late,
         failed=outcome.failed,
         infeasible=outcome.infeasible,
         warm_used=outcome.warm,
         method_s=outcome.method_s,
-        loop_s=time.perf_counter() - started - outcome.method_s,
+        loop_s=loop_s,
     )
 
 

@@ -44,6 +44,7 @@ OWN = (
     Column("max_excess_mhz_mean", "largest excess, mean", "mHz", ".4f"),
     Column("max_excess_mhz_max", "largest", "mHz", ".4f"),
     Column("static_excess_mhz_mean", "ED every second there, mean", "mHz", ".4f"),
+    Column("unforeseen_mhz_mean", "moved by unforeseen loads, mean", "mHz", ".4f"),
     Column("share_outside", "time outside", form=".2%"),
     Column("slack_travel_pu", "slack travel", "pu", ".2f"),
     Column("late", "plans late", form=".1%"),
@@ -64,6 +65,8 @@ EXPLANATION = (
     "frequency bound: who exceeds it may cost less.",
     "Largest excess: of any generator at any time over the bound, the mean over scenarios. Time outside: "
     "share of grid points with some generator more than 1e-6 Hz beyond the bound. Slack travel: Σ|ΔP_s|.",
+    "Moved by unforeseen loads: how far loads that no plan in force knew of move the frequency of some "
+    "generator, the largest of a scenario. A plan can have room for twice the bound at most.",
     "Late: no answer within the limit of the clock. Failed: an answer without a schedule; the last plan goes "
     "on. Infeasible: by the method's own word no schedule meets every limit, and the one of least excess is "
     "followed.",

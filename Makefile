@@ -36,7 +36,7 @@ TIMED_68bus            ?= 3
 TIMED_140bus           ?= 2
 TIMED                  ?= $(or $(TIMED_$(CASE)),10)
 
-# How many scenarios of the closed loop slow methods operate; the sweeps over latency and forecast take fewer.
+# How many scenarios of the closed loop slow methods operate; the sweeps take fewer.
 SCENARIOS              ?= 20
 SCENARIOS_ded_9bus     ?= 2
 SCENARIOS_ded          ?= 0
@@ -44,6 +44,7 @@ SCENARIOS_ded-radau    ?= 0
 SCENARIOS_ded-ko       ?= 0
 SCENARIOS_ded-slp_9bus ?= 5
 SCENARIOS_sweep        ?= 10
+SCENARIOS_period       ?= 5
 
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
 MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)
@@ -77,6 +78,9 @@ OPERATE  = $(DED) online --method $(1) --case $(CASE) $(ONLY) --scenarios $(call
   --workers $(WORKERS) --out $(RESULTS)
 LATENCIES  := 0,0.03,0.1,0.3,1,3,7,15,30
 SURROGATE  := $(if $(filter 9bus,$(CASE)),,--model trajectory)
+# What is swept: knots that keep their places from plan to plan; the margin depends on the grid (docs/online.md).
+KNOTS      := --settings $(if $(filter 9bus,$(CASE)),receding,receding-wide) $(SURROGATE)
+OPERATED   := $(if $(ANSWERING),$(POLICIES) $(REFINED))
 VALIDATION = $(subst --split $(SPLIT),--split validation,$(CHOICE))
 
 help:  ## show this list
@@ -140,14 +144,17 @@ bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),
 report: bench  ## everything that is missing, then the tables and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
-online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency and forecast
+online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency, forecast and period
 	for s in 1 10; do $(call OPERATE,ed) --settings $${s}s --period $$s || exit 1; done
 	$(call OPERATE,ed) --period 60
-	$(foreach m,ded-slp ded-ko-knots $(if $(ANSWERING),$(POLICIES) $(REFINED)) ded,$(if \
-	  $(filter-out 0,$(call SCENES,$m)),$(call OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
-	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency $(LATENCIES)
-	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency 0,1,7,30 --forecast perfect,worse,persistence
-	$(call OPERATE,ded-ko-knots,sweep) $(SURROGATE) --latency 1,7,30 --state present
+	$(foreach m,ded-slp ded-ko-knots $(OPERATED) ded,$(if $(filter-out 0,$(call SCENES,$m)),$(call \
+	  OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
+	$(call OPERATE,ded-ko-knots) $(KNOTS)
+	$(foreach m,$(OPERATED),$(call OPERATE,$m,period) --period 0.1$(NEWLINE))
+	$(call OPERATE,ded-ko-knots,period) $(KNOTS) --period 0.1
+	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency $(LATENCIES)
+	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency 0,1,7,30 --forecast perfect,worse,persistence
+	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency 1,7,30 --state present
 
 suite:  ## the reports of all cases, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done

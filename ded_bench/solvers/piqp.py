@@ -21,6 +21,8 @@ from ded_bench.solvers.status import Status
 MAX_ITERATIONS = 150
 #: Relative duality gap that is small enough: round-off lets some programs stall at 5e-9.
 GAP = 1e-7
+#: What keeps factors of singular matrices finite: PIQP's own value.
+REGULARISATION = 1e-10
 
 
 class Piqp:
@@ -70,7 +72,9 @@ class Piqp:
         )
 
 
-def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = False) -> FormAnswer:
+def solve_form(
+    form: FreeForm, time_limit_s: float = np.inf, staged: bool = False, regularisation: float = REGULARISATION
+) -> FormAnswer:
     """Solve a linear program.
 
     PIQP knows no clock: a time limit is turned into a number of iterations that fit into it.
@@ -81,6 +85,8 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = Fals
         staged: columns are ordered by stages, as in optimal control, and rows join neighbouring ones only.
             Dense blocks along the diagonal are then factorised instead of a sparse matrix; that pays where
             stages have tens of columns.
+        regularisation: least one of the factorised matrix. A smaller one gives more accurate steps; a sparse
+            factorisation does not stand it.
 
     Returns:
         `Optimal`, `TimeLimit` or `Failed`: what is infeasible and what is hard PIQP does not tell apart well.
@@ -96,6 +102,7 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = Fals
     solver.settings.max_iter = MAX_ITERATIONS
     solver.settings.preconditioner_scale_cost = True
     solver.settings.eps_duality_gap_rel = GAP
+    solver.settings.reg_lower_limit = regularisation
     n = len(form.cost)
     solver.setup(
         sp.csc_matrix((n, n)),

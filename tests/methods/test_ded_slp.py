@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ded_bench.koopman.trajectory import linearise_along
-from ded_bench.methods import ded_slp, ed
+from ded_bench.methods import ded_slp, ed, knot_program
 from ded_bench.methods.ded_slp import MARGIN, prepare
 from ded_bench.methods.ded_slp_model import build_ded_slp
 from ded_bench.methods.knot_program import PIECE, KnotProgram, knot_weights, piece_starts
@@ -31,12 +33,12 @@ def short(case: Case, index: int, **changes) -> Instance:
     return instance.model_copy(update={"horizon_s": HORIZON, "load": load, **changes})
 
 
-def program(case: Case, instance: Instance, bound: float) -> KnotProgram:
+def program(case: Case, instance: Instance, bound: float, points=POINTS) -> KnotProgram:
     """The program around the static dispatch."""
-    times = instance.grid[POINTS]
+    times = instance.grid[points]
     schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
     return KnotProgram(
-        case, instance, bound, linearise_along(case, simulate(case, instance, schedule), POINTS)
+        case, instance, bound, linearise_along(case, simulate(case, instance, schedule), points)
     )
 
 
@@ -59,6 +61,29 @@ def test_program_is_the_model_with_every_point(case, index):
     assert outcome.objective <= prediction.objective * (1 + 1e-8)
     assert prediction.objective == pytest.approx(outcome.objective, rel=2e-4)
     assert np.abs(prediction.omega[1:]).max() <= bound + 1e-7
+
+
+@pytest.mark.parametrize("message", ["PIQP_MAX_ITER_REACHED", "PIQP_PRIMAL_INFEASIBLE"])
+def test_dense_blocks_follow_where_a_sparse_factorisation_stalled(case, monkeypatch, message):
+    """With a knot at every point. What is shown to be infeasible is not tried again."""
+    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(401))
+    none, solve, attempts = np.empty((0, 2), dtype=int), knot_program.solve_form, []
+    direct = made.solve(none, np.inf)
+
+    def stalling(form, time_limit_s, staged=False, **settings):
+        answer = solve(form, time_limit_s, staged=staged, **settings)
+        attempts.append(answer)
+        return answer if staged else replace(answer, status=Status.FAILED, message=message)
+
+    monkeypatch.setattr(knot_program, "solve_form", stalling)
+    answer = made.solve(none, np.inf)
+    if "INFEASIBLE" in message:
+        assert (answer.status, len(attempts)) == (Status.FAILED, 1)
+        return
+    assert answer.status == direct.status == Status.OPTIMAL
+    assert made.predict(answer.x).objective == pytest.approx(made.predict(direct.x).objective, rel=1e-6)
+    assert answer.iterations == sum(a.iterations for a in attempts)
+    assert len(attempts) == 2
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

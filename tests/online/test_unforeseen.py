@@ -53,7 +53,8 @@ def test_it_is_what_happens_when_powers_stay(case: Case, options: LoopOptions) -
 def test_what_is_foreseen_moves_nothing_and_what_comes_late_moves_more(case: Case) -> None:
     scenario = surprising(case, -1e-3)
     plant = Plant(case, scenario)
-    assert unforeseen_hz(case, scenario, LoopOptions(forecast="perfect"), plant) == pytest.approx(0.0, abs=1e-12)
+    foreseen = unforeseen_hz(case, scenario, LoopOptions(forecast="perfect"), plant)
+    assert foreseen == pytest.approx(0.0, abs=1e-12)
     moved = [unforeseen_hz(case, scenario, LoopOptions(period_s=s), plant) for s in (0.1, 1.0, 2.0)]
     assert 0 < moved[0] < moved[1] < moved[2]
     twice = unforeseen_hz(case, surprising(case, -2e-3), LoopOptions(period_s=1.0), plant)

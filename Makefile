@@ -150,6 +150,7 @@ online: train-ko  ## the closed loop: all methods at their own latency, then swe
 	$(foreach m,ded-slp ded-ko-knots $(OPERATED) ded,$(if $(filter-out 0,$(call SCENES,$m)),$(call \
 	  OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
 	$(call OPERATE,ded-ko-knots) $(KNOTS)
+	$(call OPERATE,ded-ko-knots) $(KNOTS) --latency 0 --forecast perfect
 	$(foreach m,$(OPERATED),$(call OPERATE,$m,period) --period 0.1$(NEWLINE))
 	$(call OPERATE,ded-ko-knots,period) $(KNOTS) --period 0.1
 	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency $(LATENCIES)

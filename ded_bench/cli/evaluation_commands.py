@@ -165,6 +165,8 @@ def _certify(a: argparse.Namespace) -> int:
 
 
 def _compare(a: argparse.Namespace) -> int:
+    if all(ResultsFolder(folder).results.is_file() for folder in (a.a, a.b)):
+        say(f"comparing {a.a} with {a.b}")
     from ded_bench.evaluate.compare import Tolerance, compare
     from ded_bench.report.comparison import to_json, to_text
 

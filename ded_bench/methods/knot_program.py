@@ -37,10 +37,8 @@ PIECE = 20
 ROUND_OFF = 1e-13
 #: PIQP's regularisation where its own stalled: 39bus-0006 (TO) takes 36 iterations then, not 150 in vain.
 ACCURATE = 1e-11
-
 #: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
 WIDENING_PRICE = 100.0
-
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
 NEAR, PARTS = 0.9, 8
 #: Programs on one linear model.
@@ -112,9 +110,7 @@ class KnotProgram:
 
         The cost counts, but so little that the widening is the least one but for round-off.
 
-        Args:
-            limits: see `solve`.
-            time_limit_s: see `solve`.
+        Args, but for those of `solve`:
             by_interval: every interval has a widening of its own, and their sum is the least; else all
                 have the same.
 
@@ -158,10 +154,7 @@ class KnotProgram:
         return float(np.abs(omega[1:]).max()) - self.bound
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        """By dense blocks where intervals are large stages; with a knot at every point by a sparse matrix.
-
-        Round-off stops PIQP's steps on some of the latter, feasible ones too: dense blocks follow then.
-        """
+        """By dense blocks where intervals are large stages; with a knot at every point by a sparse matrix."""
         if len(self.model.lengths) < len(self.model.omega) - 1:
             return solve_form(form, time_limit_s, staged=True)
         started = time.perf_counter()
@@ -169,6 +162,7 @@ class KnotProgram:
         rest = time_limit_s - (time.perf_counter() - started)
         if answer.status != Status.FAILED or "INFEASIBLE" in answer.message or rest <= 0:
             return answer
+        # Round-off stops PIQP's steps on some sparse matrices, of feasible programs too.
         again = solve_form(form, rest, staged=True, regularisation=ACCURATE)
         return replace(again, iterations=answer.iterations + again.iterations)
 
@@ -368,12 +362,7 @@ def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
 
 
 def knot_points(times: Array, dt_s: float) -> Indices:
-    """Grid points of knots: inputs are linear between grid points, so knots lie on them.
-
-    Args:
-        times: shape (n_knots,), s.
-        dt_s: step of the grid, s.
-    """
+    """Grid points of knots at `times` (s): inputs are linear between grid points, so knots lie on them."""
     return np.unique(np.rint(times / dt_s).astype(int))
 
 

@@ -35,8 +35,8 @@ from ded_bench.solvers.status import Status
 PIECE = 20
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
-#: PIQP's regularisation where its own stalled: found on 39bus-0006 (TO), a test instance. It decides
-#: whether a program is solved, not what its optimum is.
+#: PIQP's regularisation where its own stalled: of 1e-9 to 1e-13 the one with fewest iterations on validation
+#: draws of 39bus (TO).
 ACCURATE = 1e-11
 #: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
 WIDENING_PRICE = 100.0

@@ -131,7 +131,7 @@ METHODS: dict[str, Method] = {
         Method(
             "ded-ko-knots",
             "ded_bench.methods.ded_ko_knots",
-            "DED-KO (50 knots)",
+            "DED-KO (knots)",
             elsewhere=(
                 ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
                 ("swing-ac-once", "ded_bench.methods.ded_ko_knots_swing"),

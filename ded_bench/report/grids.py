@@ -12,6 +12,7 @@ import pandas as pd
 
 from ded_bench.evaluate.ablation import main_rows, split_slug, training_table
 from ded_bench.evaluate.paper_numbers import read_paper
+from ded_bench.evaluate.payoff import payoff
 from ded_bench.evaluate.reference import DEFAULT, Reference, choose_reference
 from ded_bench.evaluate.summary import gaps, groups, judged_rows, summary
 from ded_bench.evaluate.timing import read_timing, timing_summary
@@ -35,6 +36,7 @@ class Grid:
 
     Attributes:
         judged: rows with their gaps that the tables are about, default settings only.
+        every: the same with all settings and models.
         timing: see `timing.timing_summary`.
         ac: rows on the AC network, of the same schedules.
     """
@@ -43,6 +45,7 @@ class Grid:
     folder: Path
     reference: Reference
     judged: pd.DataFrame
+    every: pd.DataFrame
     timing: pd.DataFrame
     ac: pd.DataFrame
 
@@ -63,11 +66,12 @@ def read_grid(folder: Path) -> Grid:
     case = Case.load(names[0])
     problems = SHIPPED_CASES / case.id
     reference = choose_reference(frame, read_paper(problems), reference_objectives(case))
-    rows = main_rows(judged_rows(gaps(frame, reference.objectives)))
+    every = judged_rows(gaps(frame, reference.objectives))
+    rows = main_rows(every)
     usual = [split_slug(slug)[0] == DEFAULT for slug in rows["settings"]]
     timing = timing_summary([row for row in read_timing(paths.timing) if row.case == case.id])
     ac = AC_ROWS.frame(AcResults(folder).rows.values())
-    return Grid(case, folder, reference, rows[usual], timing, ac)
+    return Grid(case, folder, reference, rows[usual], every, timing, ac)
 
 
 def sizes(grids: Sequence[Grid]) -> pd.DataFrame:
@@ -183,6 +187,17 @@ def trainings(grids: Sequence[Grid]) -> pd.DataFrame:
             for path in ResultsFolder(grid.folder).models
         ]
         parts.append(pd.concat([pd.DataFrame(models, columns=["name", *shown]), policies[["name", *shown]]]))
+        parts[-1].insert(0, "case", grid.case.id)
+    return pd.concat(parts, ignore_index=True)
+
+
+def payoffs(grids: Sequence[Grid]) -> pd.DataFrame:
+    """What the trained policies of all grids are worth: see `payoff`."""
+    parts = []
+    for grid in grids:
+        seconds = training_table(grid.folder, ["seconds"]).set_index("policy")["seconds"].dropna()
+        by_file = {str(name): float(value) for name, value in seconds.items()}
+        parts.append(payoff(grid.every, grid.timing, by_file))
         parts[-1].insert(0, "case", grid.case.id)
     return pd.concat(parts, ignore_index=True)
 

@@ -83,8 +83,8 @@ def draw_online(gallery: Gallery) -> Iterator[Call]:
         name = title(str(method), str(settings))
         caption = (
             f"{name} in the closed loop against its latency, by what its plans know; the mean over "
-            f"{counted(lines)} scenarios. Markers: methods at their own latency, over their own scenarios. "
-            "Axes are linear near zero."
+            f"{counted(lines)} scenarios. Markers: methods at their own latency, over all scenarios that "
+            "they operated. Axes are linear near zero."
         )
         drawn = (latency_figure, lines, own, f"{case.id}: {name}")
         yield gallery.add("online", f"online_latency_{method}_{settings}", caption, *drawn)
@@ -167,9 +167,9 @@ def _keys(rows: pd.DataFrame) -> list[OnlineKey]:
 
 
 def _chosen(rows: pd.DataFrame) -> pd.DataFrame:
-    """Static dispatch, and of the others those of least excess."""
+    """Static dispatch, and of the other methods those of least excess, each with its best settings."""
     static = (rows["method"] == STATIC[0]) & (rows["settings"] == STATIC[1])
-    others = rows[~static].sort_values("max_excess_hz", kind="stable")
+    others = rows[~static].sort_values("max_excess_hz", kind="stable").drop_duplicates("method")
     return pd.concat([rows[static], others])[:SHOWN]
 
 

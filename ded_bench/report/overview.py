@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ded_bench.evaluate.payoff import MANY
 from ded_bench.files.strict import write_atomically
 from ded_bench.report.columns import Column
 from ded_bench.report.figures.growth import gap_figure, growth_figure
 from ded_bench.report.figures.style import save_figure
-from ded_bench.report.grids import Grid, across, points, read_grid, sizes, slopes, trainings
+from ded_bench.report.grids import Grid, across, payoffs, points, read_grid, sizes, slopes, trainings
 from ded_bench.report.online_section import OWN, own_lines
 from ded_bench.report.page import (
     Block,
@@ -60,6 +61,24 @@ TRAININGS = (
     Column("trajectories", "trajectories"),
     Column("parameters", "parameters"),
     Column("device", "device"),
+)
+PAYOFF = (
+    Column("case", "Grid"),
+    *_HEAD,
+    Column("rival", "other"),
+    *(
+        Column(name, text, unit, form)
+        for own, what, unit, form in (
+            ("gap_percent_mean", "gap", "%", ".3g"),
+            ("freq_violation_hz_mean", "mean excess", "Hz", ".2g"),
+            ("correct_rate", "feasible", "", ".0%"),
+            ("solve_s", "one schedule", "s", ".2g"),
+            ("many_s", f"training and {MANY}", "s", ".3g"),
+        )
+        for name, text in ((own, what), (f"rival_{own}", "other's"))
+    ),
+    Column("training_s", "training", "s", ".3g"),
+    Column("paid_after", "paid after", "schedules", ".0f"),
 )
 EXPLANATION = (
     "Methods stand with their default settings on their default surrogate. Gaps are means over `n` instances "
@@ -125,6 +144,12 @@ def _tables(grids: Sequence[Grid], found: pd.DataFrame) -> dict[str, Table]:
     trained = trainings(grids)
     if len(trained):
         tables["trainings"] = Table(trained, TRAININGS, "What was trained")
+    worth = payoffs(grids)
+    if len(worth):
+        caption = (
+            f"Trained policies against programs that need no training ({MANY} schedules: with the training)"
+        )
+        tables["payoff"] = Table(worth, PAYOFF, caption)
     operated = pd.concat([own_lines(grid.folder, grid.case).assign(case=grid.case.id) for grid in grids])
     if len(operated):
         caption = "The closed loop: methods at their own latency, forecasts as announced"
@@ -190,7 +215,7 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
         *part("Time and memory against size", "growth", "slopes", "times", "memory"),
         *missing,
         *part("The closed loop", "online"),
-        *part("Trainings", "trainings"),
+        *part("Trainings", "payoff", "trainings"),
         Heading("Where the rows come from"),
         Items((*items, f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}.")),
     ]

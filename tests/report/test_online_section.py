@@ -85,7 +85,7 @@ def test_figures_show_the_numbers(threebus, folder):
     assert list(swept.get_xdata()) == [0.0, 0.5, 2.0]
     assert own.get_xdata()[0] == 0.0
     assert own.get_ydata()[0] == swept.get_ydata()[0]
-    assert [line.get_label()[-8:] for line in (swept, own)] == [" (n = 1)"] * 2
+    assert swept.get_label() == "forecast as announced"
     scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
     (ax,) = forecast_figure(threebus, scenario, "").axes
     truth, *seen = (line for line in ax.get_lines() if len(line.get_xdata()) > 1)

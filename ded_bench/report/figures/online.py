@@ -109,7 +109,7 @@ def _sweep(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
                 color=shade,
                 dashes=dash or (None, None),
                 marker=".",
-                label=f"{KIND_NAMES[kind]} (n = {counted(chosen)})",
+                label=KIND_NAMES[kind],
             )
     return handles
 
@@ -118,7 +118,7 @@ def _own(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
     handles = []
     for _, one in lines.iterrows():
         of_period = f", every {one['period_s']:g} s" if one["period_s"] != 1.0 else ""
-        label = f"{plain(title(one['method'], one['settings']))}{of_period} (n = {one['n']})"
+        label = f"{plain(title(one['method'], one['settings']))}{of_period}"
         handles += ax.plot(
             [one["latency_s"]],
             [one[name]],

@@ -23,6 +23,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.state import State
 from ded_bench.truth.integrator import Inputs
+from ded_bench.truth.network import Network, PowerFlowError
 from ded_bench.truth.simulate import METHOD, STEP_BY_MODE, SimulationError, Trajectory
 
 if TYPE_CHECKING:
@@ -69,17 +70,28 @@ class IdentifiedSwing:
         return monomial @ law.weight, by_angle
 
     def initial_state(self, instance: Instance) -> State:
-        """Angles as given, or so that every generator delivers P_0.
+        """Angles so that every generator delivers P_0, or what it delivers at the angles that are given.
+
+        These are angles of the lossless network, and say which electrical powers were measured: at the same
+        angles this model would deliver others, and start far from what was measured.
 
         Raises:
-            SimulationError: there are no such angles near the data.
+            SimulationError: there are no such angles near the data, or none of the lossless network.
         """
-        theta, p_gen = instance.theta_initial(self.case), instance.p_initial(self.case)
-        if theta is None:
-            theta = self._equilibrium(p_gen, instance.p_load(self.case, np.zeros(1))[0])
-        return State(theta, instance.omega_initial(self.case), p_gen)
+        theta, omega = instance.theta_initial(self.case), instance.omega_initial(self.case)
+        p_gen, p_load = instance.p_initial(self.case), instance.p_load(self.case, np.zeros(1))[0]
+        electrical = p_gen
+        if theta is not None:
+            network = Network(self.case)
+            try:
+                angles = network.angles(State(theta, omega, p_gen), p_load)
+            except PowerFlowError as error:
+                raise SimulationError(f"the lossless network has no such state: {error}") from None
+            electrical = network.injections(angles)[network.generators]
+        return State(self._angles(electrical, p_load), omega, p_gen)
 
-    def _equilibrium(self, p_gen: Array, p_load: Array) -> Array:
+    def _angles(self, p_gen: Array, p_load: Array) -> Array:
+        """Where the generators deliver these powers, rad."""
         n_gen = len(p_gen)
         theta, middle = self.law.centre[:n_gen].copy(), self.law.centre[n_gen:]
         first = self.power(theta[None], middle[None])[0][0, :n_gen]
@@ -91,7 +103,7 @@ class IdentifiedSwing:
                     break
                 theta = theta + np.linalg.solve(slope, wanted - power)
             else:
-                raise SimulationError("the identified swing equations have no equilibrium at P_0")
+                raise SimulationError("the identified swing equations have no angles for these powers")
         return theta
 
     def simulate(self, instance: Instance, schedule: Schedule) -> Trajectory:

@@ -4,7 +4,7 @@ A schedule is simulated on the true DAE; the linear program around its trajector
 gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
 costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
 surrogate. It takes one to three programs, since the linear models differ only by the second order
-of what one schedule changes. Setting `ac` does the same on the full AC network (see `ac_sequence`).
+of what one schedule changes. Setting `ac` does the same on the full AC network (see `ded_slp_ac`).
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ METHODS: dict[str, Method] = {
             "ded-slp",
             "ded_bench.methods.ded_slp",
             "DED (SLP)",
-            elsewhere=(("ac", "ded_bench.methods.ac_sequence"),),
+            elsewhere=(("ac", "ded_bench.methods.ded_slp_ac"),),
         ),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
@@ -134,7 +134,6 @@ METHODS: dict[str, Method] = {
             "DED-KO (knots)",
             elsewhere=(
                 ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
-                ("swing-ac-once", "ded_bench.methods.ded_ko_knots_swing"),
                 ("receding", "ded_bench.methods.receding_knots"),
                 ("receding-wide", "ded_bench.methods.receding_knots"),
             ),

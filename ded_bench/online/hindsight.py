@@ -6,9 +6,10 @@ import functools
 from dataclasses import dataclass
 
 from ded_bench.methods import ded_radau
-from ded_bench.methods.ac_sequence import AcSequence
 from ded_bench.methods.ded_slp import SlpSolver
+from ded_bench.methods.ded_slp_ac import AcDynamics
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.trust_region import TrustRegionSequence
 from ded_bench.online.judgement import Judgement, judge_operation
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
@@ -62,7 +63,7 @@ def _on_ac(case: Case, scenario: Scenario, regime: str, data: AcCase) -> Hindsig
     """On the case's knots: the sequence takes many more programs there."""
     instance = whole_instance(case, scenario)
     interval_s = case.sampling.horizon_s / (case.n_knots - 1)
-    sequence = functools.partial(AcSequence, data=data)
+    sequence = functools.partial(TrustRegionSequence, dynamics=AcDynamics(case, data))
     solution = SlpSolver(case, regime, knot_interval_s=interval_s, sequence=sequence)(instance)
     if solution.schedule is None:
         raise RuntimeError(f"no schedule for the whole of {scenario.id}: {solution.error}")

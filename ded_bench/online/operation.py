@@ -44,7 +44,7 @@ from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import reason_of
 
 #: Settings and models whose plans start from angles of the AC network: they stand for it.
-AC_ANGLES = {"ac", "trajectory-ac", "swing-ac"}
+AC_ANGLES = {"ac", "trajectory-ac"}
 
 
 @dataclass(frozen=True)

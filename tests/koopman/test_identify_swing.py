@@ -23,6 +23,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
+from ded_bench.truth.network import Network
 from ded_bench.truth.simulate import SimulationError, Trajectory
 
 TWO_AREA = Case.load("two-area")
@@ -97,6 +98,20 @@ def test_equilibria_rest():
     quiet = instance.model_copy(update={"horizon_s": 1.0, "load": load, "initial": initial})
     still = Schedule(np.array([0.0, 1.0]), np.tile(quiet.p_initial(TWO_AREA), (2, 1)))
     assert np.abs(model.simulate(quiet, still).omega).max() < 1e-9
+
+
+def test_given_angles_say_what_was_measured():
+    """The model starts with the electrical powers of the lossless network, not with its angles."""
+    instance = validation_instances(TWO_AREA, 1)[0]
+    network, p_load = Network(TWO_AREA), instance.p_load(TWO_AREA, np.zeros(1))
+    measured = instance.p_initial(TWO_AREA) + np.array([0.02, -0.03, 0.01])
+    theta = network.power_flow(measured, p_load[0])[network.generators]
+    initial = instance.initial.model_copy(
+        update={"theta": dict(zip(TWO_AREA.generators, theta.tolist(), strict=True))}
+    )
+    state = made_up().initial_state(instance.model_copy(update={"initial": initial}))
+    assert made_up().power(state.theta[None], p_load)[0][0, :-1] == pytest.approx(measured, abs=1e-9)
+    assert np.abs(state.theta - theta).max() > 1e-3
 
 
 def test_linear_model_is_the_derivative(runs):
@@ -174,7 +189,7 @@ def test_method_without_a_model(tmp_path):
 
 @pytest.mark.parametrize("in_operation", [False, True])
 def test_answers_keep_the_bound_of_their_model(tmp_path, in_operation):
-    """Three linearisations: the identified model's own simulation of the answer keeps the bound."""
+    """The identified model's own simulation of the answer keeps the bound, and costs what was claimed."""
     path = tmp_path / "swing-ac.safetensors"
     made_up().save(path)
     solver = ded_ko_knots_swing.prepare(TWO_AREA, "NO", Settings("swing-ac", str(path)))
@@ -185,6 +200,9 @@ def test_answers_keep_the_bound_of_their_model(tmp_path, in_operation):
         solution = solver.solve(instance, solution)
     assert solution.status == Status.OPTIMAL
     assert solution.schedule is not None
-    run = solver.model.simulate(instance, solution.schedule)
-    assert np.abs(run.omega).max() < TWO_AREA.omega_bound("NO") + 2 * np.pi * 1e-5
+    run = made_up().simulate(instance, solution.schedule)
+    assert np.abs(run.omega).max() <= TWO_AREA.omega_bound("NO") + 2 * np.pi * 1e-6
+    cost = float((run.p_gen @ instance.cost_gen(TWO_AREA)).sum())
+    cost += instance.cost_slack(TWO_AREA) * float(np.abs(run.p_slack).sum())
+    assert cost == pytest.approx(solution.solver_objective, rel=1e-6)
     assert machines_of(TWO_AREA).shape == (2, N_GEN)

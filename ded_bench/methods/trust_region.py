@@ -1,39 +1,31 @@
-"""The sequence of `ded-slp` on the full AC network (its setting `ac`): steps have a limited length.
+"""The sequence of `ded-slp` where linear models are right only nearby: steps keep within a trust region.
 
-With constant-power loads and fixed E' many optima lie near the end of what the network can carry. There
-linear models are right only nearby: a full step may raise the excess, or lead to where there is no solution.
-So progress is measured by cost + price · excess of |ω|. A step that brings less than a part of what its
-program promises is not taken, and the radius of the next program is a part of it (Fletcher and Sainz de la
-Maza, Nonlinear programming and nonsmooth optimization by successive linear programming, 1989).
+On the full AC network, with constant-power loads and fixed E', many optima lie near the end of what the
+network can carry. There a full step may raise the excess, or lead to where there is no solution. Equations
+identified from data have none beyond these. So progress is measured by cost + price · excess of |ω|. A step
+that brings less than a part of what its program promises is not taken, and the radius of the next program
+is a part of it (Fletcher and Sainz de la Maza, Nonlinear programming and nonsmooth optimization by successive
+linear programming, 1989).
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+import dataclasses
+from dataclasses import field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ded_bench.koopman.ac_trajectory import linearise_along_ac
-from ded_bench.koopman.trajectory import Indices
-from ded_bench.methods.ded_slp import SlpSolver
+from ded_bench.koopman.trajectory import Indices, TrajectoryModel
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, is_reachable, solve_with_rows_added
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
-from ded_bench.methods.solution import Settings
-from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.ac_network import AcNetwork
-from ded_bench.truth.ac_simulate import simulate_ac
 from ded_bench.truth.simulate import SimulationError, Trajectory
 
-#: This setting has no options.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {"ac": {}}
 #: A step that brings less than the first part of what its program promises is not taken; below the second
 #: part the radius shrinks, above the third it grows if it limited the step.
 TAKEN, POOR, GOOD = 0.1, 0.3, 0.7
@@ -47,15 +39,20 @@ SMALLEST = 1e-5
 MAX_PROGRAMS, SETTLING = 40, 20
 
 
-def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
-    """Return a solver of single instances, which may start from an earlier solution.
+class Dynamics(Protocol):
+    """Equations that can be simulated, and linearised along what they say."""
 
-    Raises:
-        InputError: the case has no AC data.
-    """
-    case.check_regimes([regime])
-    sequence = functools.partial(AcSequence, data=AcCase.of(case))
-    return SlpSolver(case, regime, settings.time_limit_s, sequence=sequence, **SETTINGS[settings.name])
+    def simulate(self, instance: Instance, schedule: Schedule) -> Trajectory:
+        """What they say about one schedule.
+
+        Raises:
+            SimulationError: they have no solution.
+        """
+        ...
+
+    def linearise_along(self, trajectory: Trajectory, points: Indices) -> TrajectoryModel:
+        """See `trajectory.linearise_along`."""
+        ...
 
 
 class _Iterate(NamedTuple):
@@ -67,9 +64,9 @@ class _Iterate(NamedTuple):
     over: float  # by how much |ω| exceeds the bound and what is accepted, rad/s
 
 
-@dataclass
-class AcSequence:
-    """One instance's sequence of trajectories on the AC network, and programs around them."""
+@dataclasses.dataclass
+class TrustRegionSequence:
+    """One instance's sequence of trajectories, and programs around them (see `ded_slp.Sequence`)."""
 
     case: Case
     instance: Instance
@@ -77,7 +74,7 @@ class AcSequence:
     points: Indices  # grid points of the knots
     deadline: float  # on the clock of `time.perf_counter`
     soft: bool = False  # without a feasible schedule there is one, too: that of least excess
-    data: AcCase = field(kw_only=True)
+    dynamics: Dynamics = field(kw_only=True)
     limits: set[Limit] = field(default_factory=set)
     iterations: int = 0
     claimed: float = np.inf  # cost that the last program predicts
@@ -89,7 +86,7 @@ class AcSequence:
         """Go on until a simulated schedule confirms its program, or no step brings anything.
 
         Args:
-            start: the first schedule to simulate, if the network can carry it; its power at t = 0 is
+            start: the first schedule to simulate, if the equations have a solution; its power at t = 0 is
                 replaced by P_0.
             is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
         """
@@ -97,7 +94,7 @@ class AcSequence:
             return Status.INFEASIBLE, None
         now = self._first(start)
         if now is None:
-            self.message = "the AC network can carry none of the schedules that are tried first"
+            self.message = "the equations have no solution under any schedule that is tried first"
             return Status.FAILED, None
         program = self._program(now)
         if is_near:
@@ -141,7 +138,7 @@ class AcSequence:
         return self._end(Status.FAILED)
 
     def _first(self, start: Schedule) -> _Iterate | None:
-        """The first of some schedules that the network can carry."""
+        """The first of some schedules under which the equations have a solution."""
         wanted = start.at(self.instance.grid[self.points])
         wanted[0] = self.instance.p_initial(self.case)
         for p_gen in first_schedules(self.case, self.instance, wanted, self.points):
@@ -151,7 +148,7 @@ class AcSequence:
         return None
 
     def _program(self, around: _Iterate) -> KnotProgram:
-        model = linearise_along_ac(_network(self.case, self.data), around.trajectory, self.points)
+        model = self.dynamics.linearise_along(around.trajectory, self.points)
         return KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
 
     def _solved(self, program: KnotProgram, enough: float) -> Attempt:
@@ -163,10 +160,10 @@ class AcSequence:
         return attempt
 
     def _simulated(self, p_gen: Array) -> _Iterate | None:
-        """What powers at the knots lead to; None: the network cannot carry them."""
+        """What powers at the knots lead to; None: there is no solution."""
         schedule = Schedule(t=self.instance.grid[self.points], p=p_gen)
         try:
-            trajectory = simulate_ac(self.case, self.data, self.instance, schedule)
+            trajectory = self.dynamics.simulate(self.instance, schedule)
         except SimulationError:
             return None
         instance = self.instance
@@ -190,8 +187,3 @@ class AcSequence:
 
     def _schedule(self, iterate: _Iterate) -> Schedule:
         return Schedule(t=self.instance.grid[self.points], p=iterate.p_gen)
-
-
-@functools.lru_cache(maxsize=4)
-def _network(case: Case, data: AcCase) -> AcNetwork:
-    return AcNetwork(case, data)

@@ -1,6 +1,6 @@
 # Every target calls idempotent commands: what the results folder holds already is not done again.
 .DEFAULT_GOAL := help
-.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report online suite quick radau starts models ablation certify test clean
+.PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report ac online suite quick radau starts models ablation certify test clean
 
 PYTHON  ?= python3
 CASE    ?= 9bus
@@ -142,6 +142,15 @@ bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),
 	$(DED) bench --case $(CASE) --results $(RESULTS) --instances $(TIMED) $(BENCH)
 
 report: bench  ## everything that is missing, then the tables and the report
+	$(DED) report --case $(CASE) --results $(RESULTS)
+
+ac: solve-baselines  ## the full AC network: methods that know it, then all kept schedules judged on it
+	$(DED) train-ko --truth ac --case $(CASE) --results $(RESULTS)
+	$(call SOLVE,ded-slp, --settings ac)
+	$(call SOLVE,ded-ko-knots, --model trajectory-ac)
+	$(if $(filter two-area,$(CASE)),$(DED) train-ko --truth ac --kind swing --case $(CASE) --results $(RESULTS))
+	$(if $(filter two-area,$(CASE)),$(call SOLVE,ded-ko-knots, --settings swing-ac))
+	$(DED) score --results $(RESULTS) --truth ac
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
 online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency, forecast and period

@@ -80,6 +80,11 @@ def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
     return _lines(own, LOOP)
 
 
+def operated(frame: pd.DataFrame) -> pd.DataFrame:
+    """One line per way of operating: regime, method, settings and the options of the loop."""
+    return _lines(frame, LOOP)
+
+
 def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method, latency and kind, of methods swept over latencies, their own included.
 

@@ -9,7 +9,16 @@ import pandas as pd
 
 from ded_bench.evaluate.summary import title
 from ded_bench.online.online_results import OnlineKey, OnlineResults, read_trajectory
-from ded_bench.online.online_summary import KINDS, RUN, STATIC, crossed, online_rows, own_latency, sweeps
+from ded_bench.online.online_summary import (
+    KINDS,
+    RUN,
+    STATIC,
+    crossed,
+    online_rows,
+    operated,
+    own_latency,
+    sweeps,
+)
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
@@ -50,6 +59,19 @@ OWN = (
     Column("late", "plans late", form=".1%"),
     Column("failed", "failed", form=".1%"),
     Column("infeasible", "infeasible", form=".1%"),
+)
+_NAMED = {column.name: column for column in OWN} | {
+    "forecast": Column("forecast", "forecast"),
+    "mean_excess_mhz": Column("mean_excess_mhz", "mean excess", "mHz", ".4f"),
+}
+#: Columns of the loop on the AC network, where every way of operating has a line.
+ON_AC = tuple(
+    _NAMED[name]
+    for name in (
+        *("regime", "title", "period_s", "latency_s", "forecast", "n", "failures", "increase_percent_mean"),
+        *("max_excess_mhz_mean", "max_excess_mhz_max", "mean_excess_mhz", "unforeseen_mhz_mean"),
+        *("share_outside", "late", "failed", "infeasible"),
+    )
 )
 CROSSED = (
     *_HEAD,
@@ -108,6 +130,10 @@ def online_tables(gallery: Gallery) -> dict[str, Table]:
         known = tuple(c for c in CROSSED if c.name in table or c.name == "title")
         caption = "What latency costs, by what is known: means over the same scenarios"
         tables["online_latency"] = Table(_titled(table), known, caption)
+    on_ac = operated(online_rows(OnlineResults(folder), case.id, "ac"))
+    if len(on_ac):
+        caption = "The closed loop on the full AC network, hindsight there too"
+        tables["online_ac"] = Table(_titled(on_ac), ON_AC, caption)
     return tables
 
 

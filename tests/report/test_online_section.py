@@ -11,8 +11,8 @@ import pytest
 from ded_bench.methods import ed
 from ded_bench.online.judgement import judge_operation
 from ded_bench.online.loop import LoopOptions, run_loop
-from ded_bench.online.online_results import OnlineResults, OnlineRow, keep_trajectory
-from ded_bench.online.online_summary import online_rows, own_latency, sweeps
+from ded_bench.online.online_results import OnlineKey, OnlineResults, OnlineRow, keep_trajectory
+from ded_bench.online.online_summary import online_rows, operated, own_latency, sweeps
 from ded_bench.online.planner import Plan
 from ded_bench.problem.scenario_sampling import sample_scenario
 from ded_bench.report.figures.online import forecast_figure, latency_figure
@@ -74,6 +74,20 @@ def test_the_overview_sets_grids_side_by_side(tmp_path):
     assert lines[["case", "title", "increase_percent_mean"]].to_numpy().tolist() == [
         ["two-area", "ED [1s]", 0.25]
     ]
+
+
+def test_the_loop_on_ac_has_a_table_of_its_own(tmp_path):
+    """Means over scenarios of each way of operating; rows on the lossless network stay in theirs."""
+    key = OnlineKey("s0", "TO", "ded-slp", "ac", 1.0, 0.3, "announced", True, True, "ac")
+    row = OnlineRow(*key, objective=2.0, case="two-area")
+    rows = [
+        dataclasses.replace(row, max_excess_hz=1e-3),
+        dataclasses.replace(row, scenario="s1", max_excess_hz=3e-3),
+        dataclasses.replace(row, truth="paper", max_excess_hz=9e-3),
+    ]
+    OnlineResults(tmp_path).table.add(rows)
+    (line,) = operated(online_rows(OnlineResults(tmp_path), "two-area", "ac")).to_dict("records")
+    assert (line["n"], line["max_excess_mhz_mean"]) == (2, pytest.approx(2.0))
 
 
 def test_figures_show_the_numbers(threebus, folder):

@@ -135,6 +135,7 @@ class TrustRegionSequence:
                 now, program = new, self._program(new)
             elif radius < SMALLEST:
                 break
+        self.message = "no step brings the schedule closer to one that is feasible"
         return self._end(Status.FAILED)
 
     def _first(self, start: Schedule) -> _Iterate | None:
@@ -178,12 +179,14 @@ class TrustRegionSequence:
         return max(float(np.abs(omega[1:]).max()) - self.bound - ACCEPTED, 0.0)
 
     def _end(self, status: Status) -> tuple[Status, Schedule | None]:
-        """The best feasible schedule, or the status that says why there is none."""
-        if self._best is None:
+        """The best feasible schedule, or why there is none; in operation then that of least excess."""
+        best = self._best
+        if best is None:
             return status, None
-        return (Status.TIME_LIMIT if status == Status.TIME_LIMIT else Status.FEASIBLE), self._schedule(
-            self._best
-        )
+        if best.over > 0.0:
+            return (Status.INFEASIBLE, self._schedule(best)) if self.soft else (status, None)
+        kept = status if status == Status.TIME_LIMIT else Status.FEASIBLE
+        return kept, self._schedule(best)
 
     def _schedule(self, iterate: _Iterate) -> Schedule:
         return Schedule(t=self.instance.grid[self.points], p=iterate.p_gen)

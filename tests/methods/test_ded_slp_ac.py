@@ -97,3 +97,18 @@ def test_surrogate_along_an_ac_simulation():
 def test_cases_without_ac_data():
     with pytest.raises(InputError, match="no AC data"):
         ded_slp_ac.prepare(Case.load("9bus"), "TO", Settings("ac"))
+
+
+def test_no_claim_of_what_is_not_feasible():
+    """Deviations beyond the bound at t = 0: no schedule; in operation one, which is called infeasible."""
+    instance = short(28)
+    started = {bus: 1.5 * TWO_AREA.omega_bound("TO") for bus in TWO_AREA.generators}
+    moving = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": started})})
+    solver = ded_slp_ac.prepare(TWO_AREA, "TO", Settings("ac"))
+    alone = solver(moving)
+    assert alone.status in (Status.FAILED, Status.INFEASIBLE)
+    assert alone.schedule is None
+    assert alone.error
+    operated = solver.solve(moving)
+    assert operated.status == Status.INFEASIBLE
+    assert operated.schedule is not None

@@ -181,7 +181,8 @@ class _Sequence:
                 nearest = Schedule(t=schedule.t, p=prediction.p_gen)
                 return Status.INFEASIBLE, nearest if self.soft else None
             p_before, p_gen, self.claimed = p_gen, prediction.p_gen, prediction.objective
-        self.message = self.message or f"no convergence in {MAX_ROUNDS} trajectories"
+        else:
+            self.message = f"no convergence in {MAX_ROUNDS} trajectories"
         return (Status.FAILED if self._best is None else Status.FEASIBLE), self._best
 
     def _follow(self, p_before: Array, p_gen: Array) -> tuple[Array, Trajectory]:

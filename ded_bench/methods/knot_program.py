@@ -35,9 +35,10 @@ from ded_bench.solvers.status import Status
 PIECE = 20
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
-#: PIQP's regularisation where its own stalled: of 1e-9 to 1e-13 the one with fewest iterations on validation
-#: draws of 39bus (TO).
-ACCURATE = 1e-11
+#: Whether PIQP factorises dense blocks, and its regularisation; the next where one stalls. A sparse matrix is
+#: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
+SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
+LONG = 20
 #: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
 WIDENING_PRICE = 100.0
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
@@ -155,17 +156,16 @@ class KnotProgram:
         return float(np.abs(omega[1:]).max()) - self.bound
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        """By dense blocks where intervals are large stages; with a knot at every point by a sparse matrix."""
-        if len(self.model.lengths) < len(self.model.omega) - 1:
-            return solve_form(form, time_limit_s, staged=True)
-        started = time.perf_counter()
-        answer = solve_form(form, time_limit_s)
-        rest = time_limit_s - (time.perf_counter() - started)
-        if answer.status != Status.FAILED or "INFEASIBLE" in answer.message or rest <= 0:
-            return answer
-        # Round-off stops PIQP's steps on some sparse matrices, of feasible programs too.
-        again = solve_form(form, rest, staged=True, regularisation=ACCURATE)
-        return replace(again, iterations=answer.iterations + again.iterations)
+        deadline, iterations = time.perf_counter() + time_limit_s, 0
+        n_stages = len(self.model.lengths)
+        is_short = n_stages == len(self.model.omega) - 1 and self._n_columns < LONG * n_stages
+        for staged, regularisation in SPARSE if is_short else DENSE:
+            answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
+            iterations += answer.iterations
+            stalled = answer.status == Status.FAILED and "INFEASIBLE" not in answer.message
+            if not stalled or time.perf_counter() > deadline:
+                break
+        return replace(answer, iterations=iterations)
 
     def _relaxed_form(self, limits: Indices, by_interval: bool) -> tuple[FreeForm, Indices]:
         """The program with columns for widenings, and where its columns stand among the program's own."""

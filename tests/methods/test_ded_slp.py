@@ -64,16 +64,18 @@ def test_program_is_the_model_with_every_point(case, index):
 
 
 @pytest.mark.parametrize("message", ["PIQP_MAX_ITER_REACHED", "PIQP_PRIMAL_INFEASIBLE"])
-def test_dense_blocks_follow_where_a_sparse_factorisation_stalled(case, monkeypatch, message):
-    """With a knot at every point. What is shown to be infeasible is not tried again."""
-    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(401))
+@pytest.mark.parametrize("interval", [1, 20])
+def test_another_factorisation_follows_where_one_stalled(case, monkeypatch, message, interval):
+    """With a knot at every point, or at some. What is shown to be infeasible is not tried again."""
+    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(0, 401, interval))
     none, solve, attempts = np.empty((0, 2), dtype=int), knot_program.solve_form, []
     direct = made.solve(none, np.inf)
 
-    def stalling(form, time_limit_s, staged=False, **settings):
-        answer = solve(form, time_limit_s, staged=staged, **settings)
-        attempts.append(answer)
-        return answer if staged else replace(answer, status=Status.FAILED, message=message)
+    def stalling(*arguments):
+        attempts.append(solve(*arguments))
+        return (
+            attempts[-1] if len(attempts) > 1 else replace(attempts[0], status=Status.FAILED, message=message)
+        )
 
     monkeypatch.setattr(knot_program, "solve_form", stalling)
     answer = made.solve(none, np.inf)
@@ -96,6 +98,15 @@ def test_claims_are_what_the_scorer_finds(case, regime, index):
     found = score(case, instance, solution.schedule, regime)
     assert found.feasible_strict
     assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)
+
+
+def test_what_does_not_converge_says_so(case, monkeypatch):
+    """No trajectory counts as one that keeps the bound."""
+    monkeypatch.setattr(ded_slp, "ACCEPTED", -np.inf)
+    monkeypatch.setattr(ded_slp, "MAX_ROUNDS", 2)
+    solution = prepare(case, "NO", Settings())(short(case, 1))
+    assert (solution.status, solution.schedule) == (Status.FAILED, None)
+    assert solution.error == "no convergence in 2 trajectories"
 
 
 def test_no_schedule_on_the_knots_nearby_is_cheaper(case):

@@ -11,17 +11,18 @@ import numpy as np
 import pandas as pd
 
 from ded_bench.evaluate.ablation import main_rows, split_slug, training_table
+from ded_bench.evaluate.ac_summary import validated, with_ac
 from ded_bench.evaluate.paper_numbers import read_paper
 from ded_bench.evaluate.payoff import payoff
 from ded_bench.evaluate.reference import DEFAULT, Reference, choose_reference
-from ded_bench.evaluate.summary import gaps, groups, judged_rows, summary
+from ded_bench.evaluate.summary import benchmark_rows, gaps, groups, judged_rows, summary
 from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.sampling import load_split
-from ded_bench.run.ac_scoring import AC_ROWS, AcResults
+from ded_bench.run.ac_scoring import AcResults
 from ded_bench.run.objectives import reference_objectives
 from ded_bench.run.results import Results
 from ded_bench.truth.network import Network
@@ -38,7 +39,7 @@ class Grid:
         judged: rows with their gaps that the tables are about, default settings only.
         every: the same with all settings and models.
         timing: see `timing.timing_summary`.
-        ac: rows on the AC network, of the same schedules.
+        ac: what the AC network says of the same schedules, all settings: see `ac_summary.validated`.
     """
 
     case: Case
@@ -70,7 +71,7 @@ def read_grid(folder: Path) -> Grid:
     rows = main_rows(every)
     usual = [split_slug(slug)[0] == DEFAULT for slug in rows["settings"]]
     timing = timing_summary([row for row in read_timing(paths.timing) if row.case == case.id])
-    ac = AC_ROWS.frame(AcResults(folder).rows.values())
+    ac = validated(with_ac(benchmark_rows(frame), AcResults(folder).rows.values()))
     return Grid(case, folder, reference, rows[usual], every, timing, ac)
 
 
@@ -103,7 +104,7 @@ def sizes(grids: Sequence[Grid]) -> pd.DataFrame:
 
 
 def points(grids: Sequence[Grid]) -> pd.DataFrame:
-    """One row per (grid, regime, method): gaps, rates, violations, times, memory, and the same on AC."""
+    """One row per (grid, regime, method): gaps, rates, violations, times, memory."""
     parts = []
     for grid in grids:
         found = summary(grid.judged)
@@ -111,35 +112,23 @@ def points(grids: Sequence[Grid]) -> pd.DataFrame:
         keys = list(found[["regime", "method", "settings"]].itertuples(index=False, name=None))
         for name in ("solve_s", "build_s", "peak_memory_mib"):
             found[name] = [float(timing[name].get(key, np.nan)) for key in keys]
-        found = found.merge(_on_ac(grid), on=["regime", "method", "settings"], how="left")
         found["is_reference"] = found["method"] == grid.reference.method
         named = [title.split(" [")[0] for title in found["title"]]
         parts.append(found.assign(case=grid.case.id, generators=len(grid.case.generators), title=named))
     return pd.concat(parts, ignore_index=True)
 
 
-def _on_ac(grid: Grid) -> pd.DataFrame:
-    """Violations on the AC network; no rows if nothing was scored there."""
-    rows = [
-        {
-            "regime": regime,
-            "method": method,
-            "settings": settings,
-            "ac_rows": len(part),
-            "ac_feasible": float((part["feasible"] == True).mean()),  # noqa: E712  (empty is not True)
-            "ac_violation_hz": float(part["freq_violation_hz"].mean()),
-        }
-        for regime, method, settings, part in groups(grid.ac)
-    ]
-    columns = ["regime", "method", "settings", "ac_rows", "ac_feasible", "ac_violation_hz"]
-    return pd.DataFrame(rows, columns=columns)
+def on_ac(grids: Sequence[Grid]) -> pd.DataFrame:
+    """One row per (grid, regime, method, settings): claimed, verified, validated on the AC network."""
+    parts = [grid.ac.assign(case=grid.case.id, generators=len(grid.case.generators)) for grid in grids]
+    return pd.concat(parts, ignore_index=True)
 
 
 def across(table: pd.DataFrame, cell: Callable[[dict[str, Any]], str]) -> pd.DataFrame:
     """One row per regime and method, one column per grid, from the smallest to the largest.
 
     Args:
-        table: see `points`.
+        table: see `points` and `on_ac`.
         cell: what to print of a row; empty where there is nothing.
     """
     order = table.drop_duplicates("case").sort_values("generators")["case"].tolist()

@@ -50,8 +50,10 @@ def results_of(folder: Path, case: str) -> Path:
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("results")
     made = [results_of(folder / case, case) for case in GENERATORS]
-    scored = AcRow("a", "TO", "ded-slp", "default", freq_violation_hz=2e-3, feasible=False, case="two-area")
-    AcResults(folder / "two-area").add([scored])
+    scored = AcRow("a", "TO", "ded-slp", "default", objective=101.0, case="two-area")
+    scored = dataclasses.replace(scored, freq_violation_hz=2e-3, feasible=False)
+    nothing = AcRow("b", "TO", "ded-slp", "default", error="no equilibrium", case="two-area")
+    AcResults(folder / "two-area").add([scored, nothing])
     header = {"training": {"seconds": 12.5, "trajectories": 120}}
     write_arrays(ResultsFolder(folder / "39bus").model("koopman"), {"k": np.zeros(1)}, header)
     return made
@@ -72,7 +74,7 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert gaps.loc[("TO", "DED (Radau)")].to_list() == ["–", "reference", "reference"]
     assert table("verified").loc[("TO", "DED (SLP)"), "39bus"] == "100% → 50%"
     assert table("violations").loc[("TO", "DED (SLP)"), "39bus"] == "0.001"
-    assert table("ac").loc[("TO", "DED (SLP)")].to_list() == ["–", "0%, 0.002", "–"]
+    assert dict(table("ac").loc[("TO", "DED (SLP)")]) == {"two-area": "100% → 100% → 0% (1), 2 mHz"}
     fitted = table("slopes").loc[("TO", "DED (SLP)")]
     assert fitted["solve_s"] == pytest.approx(2.0)
     assert fitted["peak_memory_mib"] == pytest.approx(0.0, abs=1e-9)

@@ -44,6 +44,8 @@ SIZES = (
     Column("knots", "knots"),
     Column("reference", "gaps are to"),
 )
+#: A table of so many grids leaves room for a figure beside it.
+BESIDE = 3
 #: Values that grow with the grid, and what their axes say.
 VALUES = (("solve_s", "time per schedule (s)"), ("peak_memory_mib", "peak memory (MiB)"))
 SLOPES = (
@@ -66,6 +68,8 @@ PAYOFF = (
     Column("case", "Grid"),
     *_HEAD,
     Column("rival", "other"),
+    Column("training_s", "training", "s", ".3g"),
+    Column("paid_after", "paid after", "schedules", ".0f"),
     *(
         Column(name, text, unit, form)
         for own, what, unit, form in (
@@ -77,8 +81,6 @@ PAYOFF = (
         )
         for name, text in ((own, what), (f"rival_{own}", "other's"))
     ),
-    Column("training_s", "training", "s", ".3g"),
-    Column("paid_after", "paid after", "schedules", ".0f"),
 )
 EXPLANATION = (
     "Methods stand with their default settings on their default surrogate. Gaps are means over `n` instances "
@@ -150,9 +152,7 @@ def _tables(grids: Sequence[Grid], found: pd.DataFrame) -> dict[str, Table]:
         tables["trainings"] = Table(trained, TRAININGS, "What was trained")
     worth = payoffs(grids)
     if len(worth):
-        caption = (
-            f"Trained policies against programs that need no training ({MANY} schedules: with the training)"
-        )
+        caption = "Trained policies beside linear programs, which need no training"
         tables["payoff"] = Table(worth, PAYOFF, caption)
     operated = pd.concat([own_lines(grid.folder, grid.case).assign(case=grid.case.id) for grid in grids])
     if len(operated):
@@ -205,7 +205,7 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
         return [Heading(heading), *inside] if inside else []
 
     gaps = part("Gaps", "gaps", "gap")
-    if len(gaps) == 3:  # its heading, the table and the figure
+    if len(gaps) == 3 and len(grids) <= BESIDE:  # its heading, the table and the figure
         gaps = [gaps[0], SideBySide((gaps[1],), (gaps[2],))]
     missing = [] if "times" in tables else [Text("No method was timed alone yet; run `ded-bench bench`.")]
     here = "; ".join(f"{name} {value}" for name, value in environment().items())

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 #: Kind of model that only AC trajectories are identified with.
 SWING = "swing"
+#: The method whose weights fit every grid, so that a training can start from another's.
+STARTS_ANYWHERE = "ded-dpc-shared"
 
 
 def add_commands(commands: Any) -> None:
@@ -74,6 +76,7 @@ def add_commands(commands: Any) -> None:
     budget.add_argument("--seconds", type=positive_number, metavar="S", help="train for so long")
     budget.add_argument("--epochs", type=positive, metavar="N", help="train for so many")
     p.add_argument("--limit", type=positive, help="only the first so many training instances")
+    p.add_argument("--start", type=Path, metavar="FILE", help="policy whose weights training starts from")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train")
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
@@ -164,6 +167,8 @@ def _train_dpc(a: argparse.Namespace) -> int:
     ]
     if not jobs:
         raise InputError("--settings", a.settings, "matches no settings of a method that is trained")
+    if a.start and {name for name, _, _ in jobs} != {STARTS_ANYWHERE}:
+        raise InputError("--start", str(a.start), f"is for {STARTS_ANYWHERE} alone")
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method, settings and regime with --out")
     for method in methods:
@@ -208,7 +213,7 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)
     code = code_of(method.trainer) if method.trainer.startswith("ded_bench.") else ""
-    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume, code)
+    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume, code, a.start)
     facts = train(case, regime, instances, model, out, options, **setting).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"

@@ -37,6 +37,7 @@ class TrainingOptions:
     device: str = "cpu"  # or "cuda"
     resume: bool = False  # go on from the checkpoint, if there is one
     code: str = ""  # hash of the sources that train, a fact that the policy's file tells
+    start: Path | None = None  # policy file, perhaps of another grid, whose weights training starts from
 
 
 class TrainedPolicy(Protocol):
@@ -68,7 +69,8 @@ class Trainer(Protocol):
             setting: options that the method's setting names, and perhaps `epochs`.
 
         Raises:
-            InputError: the checkpoint to go on from belongs to another training.
+            InputError: the checkpoint to go on from belongs to another training, or the weights to
+                start from do not fit.
         """
 
 

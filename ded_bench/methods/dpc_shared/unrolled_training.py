@@ -14,16 +14,19 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw
 from ded_bench.methods.dpc_shared.grid_response import GridResponse
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
+from ded_bench.methods.dpc_shared.shared_margin import with_margin
 from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy
 from ded_bench.methods.dpc_shared.stage_records import PRICE
+from ded_bench.methods.dpc_shared.unrolled_inference import weight_shapes
 from ded_bench.methods.dpc_shared.unrolled_loss import FIRST_PRICE, MARGIN, ScheduleLoss, total_loss
 from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
-from ded_bench.methods.policy_file import Scope, Weights, weights_fingerprint
+from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.problem.case import Case
@@ -52,7 +55,7 @@ class Variant:
     stages: int = STAGES
     width: int = WIDTH
     rate: float = LEARNING_RATE
-    start: Weights | None = None  # of another policy of the same stages and width, of whatever grid
+    price: float = PRICE  # of the penalty, at the end of the training
 
 
 def batch_of(case: Case) -> int:
@@ -89,10 +92,11 @@ def train(
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
         network = UnrolledNetwork(path_model, chosen.stages, chosen.width)
-    if chosen.start is not None:
-        network.load_state_dict({name: torch.as_tensor(value) for name, value in chosen.start.items()})
+    start = read_start(options.start, chosen) if options.start else None
+    if start is not None:
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
     check = path_model.outset(Problems.of(case, instances[:HELD_OUT], response.fine))
-    run = _Run(network, options.seed, chosen.rate, batch_of(case), checkpoint_file(out))
+    run = _Run(network, options.seed, chosen, batch_of(case), checkpoint_file(out))
     if options.resume and run.checkpoint.is_file():
         run.load()
     run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
@@ -108,33 +112,42 @@ def train(
         "held_out": len(check.served),
         "held_out_loss": run.best,
         "parameters": sum(p.numel() for p in network.parameters()),
-        "start": weights_fingerprint(chosen.start) if chosen.start is not None else "",
+        "price": chosen.price,
+        "start": weights_fingerprint(start) if start is not None else "",
         "torch": torch.__version__,
+        "code": options.code,
         "device": options.device,
     }
-    policy = SharedPolicy.of(Scope(case, regime, horizon), network, training)
+    policy = with_margin(SharedPolicy.of(Scope(case, regime, horizon), network, training), instances)
     policy.save(out)
     write_history(out, run.history)
     return policy
+
+
+def read_start(path: Path, chosen: Variant) -> Weights:
+    """Weights of a policy of whatever grid and regime, to start from.
+
+    Raises:
+        InputError: the file is wrong, or holds another network.
+    """
+    arrays, header = read_arrays(path)
+    if header.get("method") != METHOD:
+        raise InputError(path, "method", f"is no {METHOD} policy")
+    return checked_weights(arrays, weight_shapes(chosen.stages, chosen.width), path)
 
 
 class _Run:
     """The state of one training: network, average of its weights, optimiser, progress."""
 
     def __init__(
-        self, network: UnrolledNetwork, seed: int, rate: float, batch: int, checkpoint: Path
+        self, network: UnrolledNetwork, seed: int, chosen: Variant, batch: int, checkpoint: Path
     ) -> None:
-        self.network, self.seed, self.rate, self.batch, self.checkpoint = (
-            network,
-            seed,
-            rate,
-            batch,
-            checkpoint,
-        )
+        self.network, self.seed, self.batch, self.checkpoint = network, seed, batch, checkpoint
+        self.rate, self.price = chosen.rate, chosen.price
         self.loss = ScheduleLoss(network.model)
         self.average = copy.deepcopy(network)
         self.optimiser = torch.optim.AdamW(
-            network.parameters(), lr=rate, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99)
+            network.parameters(), lr=chosen.rate, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99)
         )
         self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
         self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
@@ -167,7 +180,7 @@ class _Run:
         generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, self.step]))
         outset = model.outset(draw(model.case, model.bound, model.response.fine, self.batch, generator))
         outcomes = self.network(outset)
-        price = PRICE * FIRST_PRICE ** (1.0 - progress)
+        price = self.price * FIRST_PRICE ** (1.0 - progress)
         judged = [self.loss(outset, outcome, MARGIN) for outcome in outcomes]
         self.step += 1
         used = torch.as_tensor(outset.served)
@@ -187,7 +200,7 @@ class _Run:
         with torch.no_grad():
             outcome = self.average(check)[-1]
             tight, own = (self.loss(check, outcome, margin) for margin in (MARGIN, 0.0))
-        value = float((tight.cost + PRICE * tight.penalty).mean())
+        value = float((tight.cost + self.price * tight.penalty).mean())
         hertz = own.excess * self.loss.model.bound / (2 * math.pi)
         row = {
             "epoch": self.epoch,

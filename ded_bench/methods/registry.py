@@ -154,6 +154,11 @@ METHODS: dict[str, Method] = {
             "DED-DPC (shared weights)",
             trainer="ded_bench.methods.dpc_shared.unrolled_training",
         ),
+        Method(
+            "ded-dpc-shared-refined",
+            "ded_bench.methods.dpc_shared.shared_refined",
+            "DED-DPC (shared weights, refined)",
+        ),
     )
 }
 

@@ -18,7 +18,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_shared.drawn_problems import Problems
 from ded_bench.methods.dpc_shared.grid_response import GridResponse
-from ded_bench.methods.dpc_shared.path_model import PathModel
+from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.unrolled_inference import CompiledNetwork, weight_shapes
 from ded_bench.methods.policy_file import (
     Scope,
@@ -99,7 +99,11 @@ class SharedPolicy:
             return np.concatenate([self.powers(problems[i : i + CHUNK]) for i in starts])
         outset = self.model.outset(problems)
         path = self.model.respond(outset.start, outset, self.model.nominal(outset))[0]
-        return self._compiled(outset, self.model.linearise(outset, path))
+        return self.answer(outset, self.model.linearise(outset, path))
+
+    def answer(self, outset: Outset, linear: Linear) -> Array:
+        """As `powers`, where the grid along the path of the first schedule is known."""
+        return self._compiled(outset, linear)
 
     def save(self, path: Path) -> None:
         """Write weights and header."""

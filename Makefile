@@ -51,7 +51,7 @@ MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,tra
 # Policies: on 9bus trained, the paper's too; elsewhere the one with shared weights, trained if TRAIN asks, or
 # taken from the reference run.
 POLICIES  := $(if $(filter 9bus,$(CASE)),ded-dpc-paper ded-dpc,ded-dpc-shared)
-REFINED   := $(if $(filter 9bus,$(CASE)),ded-dpc-refined)
+REFINED   := $(if $(filter 9bus,$(CASE)),ded-dpc-refined,ded-dpc-shared-refined)
 TRAINED   := $(or $(filter 9bus,$(CASE)),$(TRAIN))
 # How long our policy trains unless TRAIN says so; docs/results.md tells what more brings.
 TRAIN_ded-dpc_9bus ?= --seconds 420
@@ -118,8 +118,8 @@ train-dpc: train-ko  ## train the policies on the training instances
 	  --workers $(WORKERS) $(or $(TRAIN),$(TRAIN_$m_$(CASE)))$(NEWLINE))
 
 solve-dpc: $(if $(TRAINED),train-dpc,train-ko)  ## solve and score with the policies
-	$(call SOLVE,$(POLICIES) $(REFINED))
-	$(if $(REFINED),$(call SOLVE,$(REFINED), --settings 'steps*'))
+	$(call SOLVE,$(POLICIES))
+	$(call SOLVE,$(REFINED), --settings '*')
 
 models: solve-baselines  ## DED-KO on other models of the dynamics, and the errors of each
 	$(DED) train-ko --kind koopman-paper --case $(CASE) --results $(RESULTS)

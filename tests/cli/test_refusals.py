@@ -161,6 +161,7 @@ def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp
         (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method, settings and regime"),
         (("--settings", "nope*"), "matches no settings"),
         (("--method", "ded", "--regime", "TO"), "is not trained"),
+        (("--method", "ded-dpc", "--start", "p.safetensors"), "is for ded-dpc-shared alone"),
     ],
 )
 def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:

@@ -16,13 +16,14 @@ from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw, sampled
 from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import FollowTargets, Respond
+from ded_bench.methods.dpc_shared.shared_margin import with_margin
 from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy, prepare
 from ded_bench.methods.dpc_shared.stage_records import PRICE
 from ded_bench.methods.dpc_shared.unrolled_inference import static_cost, weight_shapes
 from ded_bench.methods.dpc_shared.unrolled_loss import ScheduleLoss, total_loss
 from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
-from ded_bench.methods.dpc_shared.unrolled_training import train
-from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.dpc_shared.unrolled_training import Variant, read_start, train
+from ded_bench.methods.policy_file import Scope, write_policy
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file
 from ded_bench.problem.case import REPOSITORY, Case
@@ -351,3 +352,43 @@ def test_committed_weights_are_worth_having() -> None:
     assert static is not None
     assert found["NO"].objective <= 1.0001 * score(case, instance, static, "NO").objective
     assert found["NO"].objective <= found["TO"].objective
+
+
+def test_training_starts_from_weights_of_another_grid(ninebus: Case, threebus: Case, tmp_path: Path) -> None:
+    start, out = tmp_path / "start.safetensors", tmp_path / "p.safetensors"
+    known = random_policy(threebus)
+    known.save(start)
+    found = read_start(start, Variant(stages=2, width=12))
+    assert all(np.array_equal(found[name], value) for name, value in known.weights.items())
+    instances = [short_instance(ninebus, i) for i in range(4)]
+    options = TrainingOptions(seconds=1e-3, start=start)
+    trained = train(ninebus, "TO", instances, None, out, options, epochs=1, stages=2, width=12)
+    assert trained.training["start"] == known.fingerprint
+    assert trained.fingerprint != known.fingerprint
+    with pytest.raises(InputError, match="wrong shape"):
+        read_start(start, Variant(stages=3, width=12))
+    other = tmp_path / "other.safetensors"
+    write_policy(other, "ded-dpc", known.scope, known.weights, {})
+    with pytest.raises(InputError, match=METHOD):
+        read_start(other, Variant())
+
+
+def test_margin_is_the_least_that_makes_enough_schedules_feasible(
+    ninebus: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = random_policy(ninebus, 0.3)
+    instances = [short_instance(ninebus, i) for i in range(4)]
+    margins = (0.0, 0.3, 0.6)
+    shares = []
+    for margin in margins:
+        tried = dataclasses.replace(policy, training=policy.training | {"margin": margin})
+        pairs = zip(instances, tried(instances), strict=True)
+        shares.append(np.mean([score(ninebus, i, s, policy.scope.regime).feasible for i, s in pairs]))
+    monkeypatch.setattr("ded_bench.methods.dpc_shared.shared_margin.MARGINS", margins)
+    for wanted in (0.0, *shares, 2.0):
+        monkeypatch.setattr("ded_bench.methods.dpc_shared.shared_margin.WANTED", wanted)
+        chosen = with_margin(policy, instances).training
+        enough = [margin for margin, share in zip(margins, shares, strict=True) if share >= wanted]
+        best = margins[int(np.argmax(shares))]
+        assert chosen["margin"] == (enough[0] if enough else best)
+        assert chosen["margin_feasible"] == shares[margins.index(chosen["margin"])]

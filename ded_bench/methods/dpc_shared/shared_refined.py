@@ -15,6 +15,8 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_shared import shared_policy
 from ded_bench.methods.dpc_shared.drawn_problems import Problems
+from ded_bench.methods.dpc_shared.grid_response import GridResponse
+from ded_bench.methods.dpc_shared.path_model import Linear, Outset
 from ded_bench.methods.dpc_shared.path_program import PathProgram
 from ded_bench.methods.dpc_shared.shared_policy import SharedPolicy
 from ded_bench.methods.dpc_shared.stage_kernels import track_rows
@@ -34,8 +36,8 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {"learned": True}, "unle
 PATHS, PROGRAMS = 4, 2
 #: Time from one correction to the next, at most, s.
 SPACING_S = 1.25
-#: The bound is tightened by this fraction: about what the linearised grid leaves out.
-MARGIN = 0.05
+#: By what part the bound is tightened, of what the fastest mode can rise between two fine points.
+MARGIN = 0.45
 #: |ω| is limited where it exceeds these parts of the bound: under the first schedule, under others.
 FIRST, NEAR = 0.5, 0.8
 #: Relative excess of |ω| that needs no further program, nor a further path.
@@ -65,8 +67,18 @@ class Refiner:
             raise InputError(f"instance {instance.id}", "initial", str(error)) from None
         outset = model.outset(problems)
         linear = model.linearise(outset, model.respond(outset.start, outset, model.nominal(outset))[0])
-        powers = policy.answer(outset, linear) if self.learned else outset.start
-        knots, iterations = knots_between(policy.knots), 0
+        answer = policy.answer(outset, linear) if self.learned else outset.start
+        iterations = 0
+        for start in (answer, outset.start) if self.learned else (answer,):
+            powers, needed = self._corrected(outset, linear, start)
+            iterations += needed
+            if powers is not None:
+                return Schedule(policy.knots, powers[0]), iterations
+        return Schedule(policy.knots, answer[0]), iterations
+
+    def _corrected(self, outset: Outset, linear: Linear, powers: Array) -> tuple[Array | None, int]:
+        """Corrected powers and iterations; None: a program has no solution that is found."""
+        model, knots, iterations = self.policy.model, knots_between(self.policy.knots), 0
         limited: NDArray[np.bool_] | bool = False
         for number in range(PATHS + 1):
             linear = model.linearise(outset, model.respond(powers, outset, linear)[0])
@@ -78,13 +90,13 @@ class Refiner:
                 found, needed = self._solved(program, limited)
                 iterations += needed
                 if found is None:
-                    return Schedule(policy.knots, powers[0]), iterations
+                    return None, iterations
                 corrected = found
                 if not (program.near(1.0 + OPEN, found) & ~limited).any():
                     break
                 limited = limited | program.near(NEAR, found)
-            powers = self._within_limits(corrected, problems)
-        return Schedule(policy.knots, powers[0]), iterations
+            powers = self._within_limits(corrected, outset.problems)
+        return powers, iterations
 
     @staticmethod
     def _solved(program: PathProgram, limited: NDArray[np.bool_]) -> tuple[Array | None, int]:
@@ -112,6 +124,13 @@ def knots_between(knots: Array) -> int:
     return max(n for n in range(1, max(most, 1) + 1) if count % n == 0)
 
 
+def margin_of(response: GridResponse) -> float:
+    """By what part the bound is tightened on a grid."""
+    network = response.network
+    squares = np.linalg.eigvalsh(response.stiffness / np.sqrt(np.outer(network.m, network.m)))
+    return float(MARGIN * (1.0 - np.cos(0.5 * np.sqrt(squares.max()) * response.fine[1])))
+
+
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The policy that `prepare` would use."""
     return shared_policy.artifacts(case, regime, _plain(settings))
@@ -120,7 +139,7 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return the refined policy as a method."""
     policy = shared_policy.find_policy(case, regime, _plain(settings))
-    bound = (1.0 - MARGIN) * case.omega_bound(regime)
+    bound = (1.0 - margin_of(policy.model.response)) * case.omega_bound(regime)
     refiner = Refiner(policy, SETTINGS[settings.name]["learned"], bound)
 
     def solve(instance: Instance) -> Solution:

@@ -8,6 +8,7 @@ intervals between them are variables, so that all blocks are small, and rows joi
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,10 +93,12 @@ class PathProgram:
         self._model, self._outset, self._linear = model, outset, linear
         self._powers, self._knots, self._bound = powers, knots, bound
         _, (omega,), (p_slack,) = model.respond(powers, outset, linear)
-        self._maps = maps = IntervalMaps.make(model, linear, knots)
-        self._omega = omega[1:].reshape(maps.omega.shape[:3])
-        self._means = maps.p_slack.reshape(-1, FINE, maps.p_slack.shape[2]).mean(axis=1)
+        self._omega = omega[1:].reshape(-1, knots * FINE, omega.shape[1])
         self._slack = p_slack[1:].reshape(-1, FINE).mean(axis=1)
+
+    @functools.cached_property
+    def _maps(self) -> IntervalMaps:
+        return IntervalMaps.make(self._model, self._linear, self._knots)
 
     def near(self, part: float, powers: Array | None = None) -> NDArray[np.bool_]:
         """Where |ω| exceeds a part of the bound, (n_intervals, n_points, n_gen).
@@ -141,13 +144,14 @@ class PathProgram:
         slope = np.diff(self._powers[0], axis=0).reshape(count, knots, -1) / self._model.spacing
         lowest, highest = case.ramp + slope.min(axis=1), case.ramp - slope.max(axis=1)
         interval, omega = limited.nonzero()[0], self._omega[limited]
+        means = maps.p_slack.reshape(-1, FINE, n_columns).mean(axis=1)
         reach, wide = maps.omega[limited], one(widening[interval], -1.0)
         at_piece, at_limit, below = place.repeat(knots, axis=0), place[interval], one(piece, -1.0)
         none = np.full(piece.size, -np.inf)
         parts: list[tuple[sp.csc_matrix, Array, Array]] = [
             (rows(one(u, rate), one(before, -rate)), -lowest.ravel(), highest.ravel()),
-            (rows((self._means, at_piece), below), none, -self._slack),
-            (rows((-self._means, at_piece), below), none, self._slack),
+            (rows((means, at_piece), below), none, -self._slack),
+            (rows((-means, at_piece), below), none, self._slack),
         ]
         if widened:
             none = np.full(omega.size, -np.inf)

@@ -83,14 +83,15 @@ class SharedPolicy:
             InputError: an instance belongs to another case or horizon, or its loads cannot be served.
         """
         batch = [instances] if isinstance(instances, Instance) else list(instances)
-        self.scope.check(batch)
-        if not batch:
-            return []
+        return [Schedule(self.knots, p) for p in self.powers(self.problems(batch))] if batch else []
+
+    def problems(self, instances: Sequence[Instance]) -> Problems:
+        """Instances as arrays; raises as a call does."""
+        self.scope.check(instances)
         try:
-            problems = Problems.of(self.scope.case, batch, self.model.response.fine)
+            return Problems.of(self.scope.case, instances, self.model.response.fine)
         except PowerFlowError as error:
-            raise InputError(f"instance {batch[0].id}", "initial", str(error)) from None
-        return [Schedule(self.knots, p) for p in self.powers(problems)]
+            raise InputError(f"instance {instances[0].id}", "initial", str(error)) from None
 
     def powers(self, problems: Problems) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""

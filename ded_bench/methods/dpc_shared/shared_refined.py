@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_shared import shared_policy
 from ded_bench.methods.dpc_shared.drawn_problems import Problems
@@ -27,7 +26,6 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import PowerFlowError
 
 METHOD = "ded-dpc-shared-refined"
 #: Whether the policy gives the schedule to start from; else it is the one that the policy starts from.
@@ -60,12 +58,7 @@ class Refiner:
             InputError: the instance belongs to another case or horizon, or its loads cannot be served.
         """
         policy, model = self.policy, self.policy.model
-        policy.scope.check([instance])
-        try:
-            problems = Problems.of(policy.scope.case, [instance], model.response.fine)
-        except PowerFlowError as error:
-            raise InputError(f"instance {instance.id}", "initial", str(error)) from None
-        outset = model.outset(problems)
+        outset = model.outset(policy.problems([instance]))
         linear = model.linearise(outset, model.respond(outset.start, outset, model.nominal(outset))[0])
         answer = policy.answer(outset, linear) if self.learned else outset.start
         iterations = 0
@@ -80,10 +73,10 @@ class Refiner:
         """Corrected powers and iterations; None: a program has no solution that is found."""
         model, knots, iterations = self.policy.model, knots_between(self.policy.knots), 0
         limited: NDArray[np.bool_] | bool = False
-        for number in range(PATHS + 1):
+        for number in range(PATHS):
             linear = model.linearise(outset, model.respond(powers, outset, linear)[0])
             program = PathProgram(model, outset, linear, powers, knots, self.bound)
-            if number == PATHS or (number and not program.near(1.0 + OFF).any()):
+            if number and not program.near(1.0 + OFF).any():
                 break
             limited = limited | program.near(NEAR if number else FIRST)
             for _ in range(PROGRAMS):

@@ -33,7 +33,7 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {"learned": True}, "unle
 #: Most paths along which the grid is linearised, and most programs around each.
 PATHS, PROGRAMS = 4, 2
 #: Time from one correction to the next, at most, s.
-SPACING_S = 1.25
+SPACING_S = 1.3
 #: By what part the bound is tightened, of what the fastest mode can rise between two fine points.
 MARGIN = 0.45
 #: |ω| is limited where it exceeds these parts of the bound: under the first schedule, under others.

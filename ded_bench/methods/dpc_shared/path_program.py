@@ -27,6 +27,9 @@ ROUND_OFF = 1e-13
 #: of what the schedule costs in that time.
 WIDENING_PRICE = 2.0
 
+#: Rows, and the limits between which they are kept.
+Limited = tuple[sp.csc_matrix, Array, Array]
+
 
 @dataclass(frozen=True, eq=False)
 class IntervalMaps:
@@ -119,63 +122,24 @@ class PathProgram:
             limited: where |ω| is limited, as `near` returns it.
             widened: every interval has a column by which its limits of |ω| are widened, for a price.
         """
-        case, maps, knots = self._model.case, self._maps, self._knots
+        maps, (piece, widening, u, x) = self._maps, self.columns(widened)
         count, n_state, n_columns = maps.end.shape
-        piece, widening, u, x = self.columns(widened)
         size = int(x[-1, -1]) + 1
         # of the columns of an interval's maps; the state and the correction at t = 0 are none
         place = np.full((count, n_columns), -1)
         place[1:, :n_state], place[1:, n_state : n_state + u.shape[1]] = x[:-1], u[:-1]
         place[:, n_state + u.shape[1] :] = u
-
-        def rows(*parts: tuple[Array, Indices]) -> sp.csc_matrix:
-            """Rows from their coefficients and columns, each (n_rows, any number)."""
-            row = [np.broadcast_to(np.arange(len(v))[:, None], v.shape).ravel() for v, _ in parts]
-            value, column = (np.concatenate([part[i].ravel() for part in parts]) for i in (0, 1))
-            kept = (column >= 0) & (np.abs(value) > ROUND_OFF)
-            at = np.concatenate(row)[kept], column[kept]
-            return sp.csc_matrix((value[kept], at), (len(parts[0][0]), size))
-
-        def one(columns: Indices, value: float = 1.0) -> tuple[Array, Indices]:
-            return np.full((columns.size, 1), value), columns.reshape(-1, 1)
-
-        before = np.vstack([np.full((1, u.shape[1]), -1), u[:-1]])
-        rate = 1.0 / (knots * self._model.spacing)
-        slope = np.diff(self._powers[0], axis=0).reshape(count, knots, -1) / self._model.spacing
-        lowest, highest = case.ramp + slope.min(axis=1), case.ramp - slope.max(axis=1)
-        interval, omega = limited.nonzero()[0], self._omega[limited]
-        means = maps.p_slack.reshape(-1, FINE, n_columns).mean(axis=1)
-        reach, wide = maps.omega[limited], one(widening[interval], -1.0)
-        at_piece, at_limit, below = place.repeat(knots, axis=0), place[interval], one(piece, -1.0)
-        none = np.full(piece.size, -np.inf)
-        parts: list[tuple[sp.csc_matrix, Array, Array]] = [
-            (rows(one(u, rate), one(before, -rate)), -lowest.ravel(), highest.ravel()),
-            (rows((means, at_piece), below), none, -self._slack),
-            (rows((-means, at_piece), below), none, self._slack),
-        ]
-        if widened:
-            none = np.full(omega.size, -np.inf)
-            parts += [
-                (rows((reach, at_limit), wide), none, self._bound - omega),
-                (rows((-reach, at_limit), wide), none, self._bound + omega),
-            ]
-        else:
-            parts.append((rows((reach, at_limit)), -self._bound - omega, self._bound - omega))
-        cost, lower, upper = np.zeros(size), np.full(size, -np.inf), np.full(size, np.inf)
-        prices = self._outset.problems.cost[0]
-        hat = np.full((count, 1), float(knots))
-        hat[-1] *= 0.5
-        cost[u], cost[piece] = hat * prices[1:], prices[0]
-        spent = self._powers[0].mean(axis=0) @ prices[1:] + prices[0] * np.abs(self._slack).mean()
-        cost[widening] = WIDENING_PRICE * knots * max(float(spent), ROUND_OFF) / self._bound
-        lower[piece] = lower[widening] = 0.0
-        at = self._powers[0, knots::knots]
-        lower[u], upper[u] = case.p_min - at, case.p_max - at
-        between, low, high = zip(*parts, strict=True)
         states = maps.end.reshape(-1, n_columns), place.repeat(n_state, axis=0)
+        between, low, high = zip(
+            self._ramp_rows(u, size),
+            *self._slack_rows(place, piece, size),
+            *self._frequency_rows(limited, place, widening, size),
+            strict=True,
+        )
+        lower, upper = self._column_limits(piece, widening, u, size)
         return FreeForm(
-            cost=cost,
-            equal=rows(states, one(x, -1.0)),
+            cost=self._cost(piece, widening, u, size),
+            equal=_rows(size, states, _one(x, -1.0)),
             right=np.zeros(x.size),
             between=sp.csc_matrix(sp.vstack(between)),
             low=np.concatenate(low),
@@ -183,6 +147,54 @@ class PathProgram:
             lower=lower,
             upper=upper,
         )
+
+    def _ramp_rows(self, u: Indices, size: int) -> Limited:
+        """What the schedule leaves of the ramps, in the steepest of each interval's knots."""
+        before = np.vstack([np.full((1, u.shape[1]), -1), u[:-1]])
+        rate = 1.0 / (self._knots * self._model.spacing)
+        slope = np.diff(self._powers[0], axis=0).reshape(len(u), self._knots, -1) / self._model.spacing
+        ramp = self._model.case.ramp
+        lowest, highest = ramp + slope.min(axis=1), ramp - slope.max(axis=1)
+        return _rows(size, _one(u, rate), _one(before, -rate)), -lowest.ravel(), highest.ravel()
+
+    def _slack_rows(self, place: Indices, piece: Indices, size: int) -> list[Limited]:
+        """The column of a piece is no less than |P_s| there, in the mean."""
+        means = self._maps.p_slack.reshape(-1, FINE, place.shape[1]).mean(axis=1)
+        at, below, none = place.repeat(self._knots, axis=0), _one(piece, -1.0), np.full(piece.size, -np.inf)
+        return [
+            (_rows(size, (means, at), below), none, -self._slack),
+            (_rows(size, (-means, at), below), none, self._slack),
+        ]
+
+    def _frequency_rows(
+        self, limited: NDArray[np.bool_], place: Indices, widening: Indices, size: int
+    ) -> list[Limited]:
+        interval, omega = limited.nonzero()[0], self._omega[limited]
+        reach, at = self._maps.omega[limited], place[interval]
+        if not widening.size:
+            return [(_rows(size, (reach, at)), -self._bound - omega, self._bound - omega)]
+        wide, none = _one(widening[interval], -1.0), np.full(omega.size, -np.inf)
+        return [
+            (_rows(size, (reach, at), wide), none, self._bound - omega),
+            (_rows(size, (-reach, at), wide), none, self._bound + omega),
+        ]
+
+    def _cost(self, piece: Indices, widening: Indices, u: Indices, size: int) -> Array:
+        """Sums over knots; a correction counts at all knots to both sides that it moves."""
+        cost, prices = np.zeros(size), self._outset.problems.cost[0]
+        hat = np.full((len(u), 1), float(self._knots))
+        hat[-1] *= 0.5
+        cost[u], cost[piece] = hat * prices[1:], prices[0]
+        spent = self._powers[0].mean(axis=0) @ prices[1:] + prices[0] * np.abs(self._slack).mean()
+        cost[widening] = WIDENING_PRICE * self._knots * max(float(spent), ROUND_OFF) / self._bound
+        return cost
+
+    def _column_limits(self, piece: Indices, widening: Indices, u: Indices, size: int) -> tuple[Array, Array]:
+        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        lower[piece] = lower[widening] = 0.0
+        at, case = self._powers[0, self._knots :: self._knots], self._model.case
+        lower[u], upper[u] = case.p_min - at, case.p_max - at
+        return lower, upper
 
     def corrected(self, solution: Array, widened: bool = False) -> Array:
         """Powers with the corrections of a solution, (1, n_knots, n_gen), pu; limits hold nearly."""
@@ -201,3 +213,17 @@ class PathProgram:
         ends = sizes.cumsum()
         piece, widening, u, x = (first + np.arange(end - n, end) for n, end in zip(sizes, ends, strict=True))
         return piece, widening, u, x
+
+
+def _rows(size: int, *parts: tuple[Array, Indices]) -> sp.csc_matrix:
+    """Rows of so many columns from coefficients and their columns, each (n_rows, any number); -1 is none."""
+    row = [np.broadcast_to(np.arange(len(v))[:, None], v.shape).ravel() for v, _ in parts]
+    value, column = (np.concatenate([part[i].ravel() for part in parts]) for i in (0, 1))
+    kept = (column >= 0) & (np.abs(value) > ROUND_OFF)
+    at = np.concatenate(row)[kept], column[kept]
+    return sp.csc_matrix((value[kept], at), (len(parts[0][0]), size))
+
+
+def _one(columns: Indices, value: float) -> tuple[Array, Indices]:
+    """One coefficient in each row."""
+    return np.full((columns.size, 1), value), columns.reshape(-1, 1)

@@ -36,9 +36,9 @@ PIECE = 20
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
 #: Whether PIQP factorises dense blocks, and its regularisation; the next where one stalls. A sparse matrix is
-#: better with fewer than LONG columns for each point, all of them knots, or with a COMMON column in all rows.
-SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9))
-COMMON, LONG = ((False, 1e-9), *DENSE), 20
+#: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
+SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
+LONG = 20
 #: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
 WIDENING_PRICE = 100.0
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
@@ -121,7 +121,7 @@ class KnotProgram:
         """
         started = time.perf_counter()
         form, order = self._relaxed_form(limits, by_interval)
-        answer = self._answer(form, time_limit_s, not by_interval)
+        answer = self._answer(form, time_limit_s)
         if answer.status == Status.FAILED:
             other = solve_by_highs(form, max(time_limit_s - (time.perf_counter() - started), 0.0))
             version = f"{answer.version}, {other.version}"
@@ -155,10 +155,11 @@ class KnotProgram:
         """Largest excess of |ω| over the bound after t_0: x_0 is given, wherever it lies; rad/s."""
         return float(np.abs(omega[1:]).max()) - self.bound
 
-    def _answer(self, form: FreeForm, time_limit_s: float, common: bool = False) -> FormAnswer:
+    def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         deadline, iterations = time.perf_counter() + time_limit_s, 0
-        is_short = self._n == len(self.model.omega) - 1 and self._n_columns < LONG * self._n
-        for staged, regularisation in COMMON if common else SPARSE if is_short else DENSE:
+        n_stages = len(self.model.lengths)
+        is_short = n_stages == len(self.model.omega) - 1 and self._n_columns < LONG * n_stages
+        for staged, regularisation in SPARSE if is_short else DENSE:
             answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
             iterations += answer.iterations
             stalled = answer.status == Status.FAILED and "INFEASIBLE" not in answer.message

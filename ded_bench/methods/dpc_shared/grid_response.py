@@ -22,6 +22,8 @@ from ded_bench.truth.network import Network
 
 #: Fine points per interval between knots.
 FINE = 4
+#: Damping rates that differ by less than this part are the same in all but the digits of the data.
+ROUND_OFF = 1e-6
 #: Instants at which the stiffness along a path is taken; linear between them.
 INSTANTS = 5
 
@@ -53,6 +55,8 @@ class GridResponse:
         root = np.sqrt(linear.m)
         squares, u = np.linalg.eigh(linear.stiffness / np.outer(root, root))
         rate = float(linear.d.sum() / linear.m.sum())
+        other = linear.d / linear.m - rate
+        other[np.abs(other) < ROUND_OFF * rate] = 0.0
         fine = np.linspace(knots[0], knots[-1], FINE * (len(knots) - 1) + 1)
         weights = network.coupling * np.cos(theta @ network.incidence.T)
         full = network.incidence.T @ (weights[:, None] * network.incidence)
@@ -65,7 +69,7 @@ class GridResponse:
             gain=u / root[:, None],
             shape=(u / root[:, None]).T.copy(),
             step=np.stack([_oscillator(square, rate, fine[1]) for square in squares]),
-            damping=u.T @ np.diag(linear.d / linear.m - rate) @ u,
+            damping=u.T @ np.diag(other) @ u,
             instants=np.linspace(0, len(knots) - 1, min(INSTANTS, len(knots))).round().astype(np.int64),
             network=network,
             theta=theta,

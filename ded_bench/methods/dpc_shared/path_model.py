@@ -119,7 +119,7 @@ class PathModel:
         f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
         change = stiffness - response.stiffness
         rest = f - slow @ response.stiffness - outset.fixed[:, ::FINE]
-        along = np.einsum("ns,bsgh,bnh->bng", self.between[::FINE], change, slow, optimize=True)
+        along = np.einsum("ns,bsng->bng", self.between[::FINE], slow[:, None] @ change)
         taken = outset.fixed + self.to_fine(rest - along)
         modal = response.gain.T @ change @ response.shape.T
         return Linear(-taken, modal, self._slack(outset, taken), change)

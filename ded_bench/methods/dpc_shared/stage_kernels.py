@@ -31,7 +31,8 @@ MOST = np.float64(3.0)
 def swing(modes: Modes, change: Array, v: Array, q: Array, speed: Array) -> None:
     """Advance problems from one fine point to the next: q̈ + γ q̇ + λ q + δD q̇ + C(t) q = v.
 
-    Strang's splitting: half a kick by δD and C, the exact map of the rest, half a kick.
+    Strang's splitting: half a kick by δD and C, the exact map of the rest, half a kick. Both are symmetric,
+    so that products add up rows.
 
     Args:
         modes: the grid.
@@ -41,7 +42,7 @@ def swing(modes: Modes, change: Array, v: Array, q: Array, speed: Array) -> None
         speed: their derivatives, likewise.
     """
     n = v.shape[2]
-    kicked, kick = np.empty(n), np.empty(n)
+    kicked, kick, damped = np.empty(n), np.empty(n), np.any(modes.damping != 0.0)
     for b in range(len(v)):
         part = 0
         for k in range(v.shape[1]):
@@ -63,13 +64,18 @@ def swing(modes: Modes, change: Array, v: Array, q: Array, speed: Array) -> None
                         + a[1, 2] * before
                         + a[1, 3] * v[b, k, i]
                     )
-            for i in range(n):
-                left, right, loss = 0.0, 0.0, 0.0
+            kick[:] = 0.0
+            for j in range(n):
+                later = modes.half * share * q[b, k, j]
+                now = modes.half * q[b, k, j] - later
+                left, right = change[b, part, j], change[b, part + 1, j]
+                for i in range(n):
+                    kick[i] += now * left[i] + later * right[i]
+            if damped:
                 for j in range(n):
-                    left += change[b, part, i, j] * q[b, k, j]
-                    right += change[b, part + 1, i, j] * q[b, k, j]
-                    loss += modes.damping[i, j] * speed[b, k, j]
-                kick[i] = modes.half * (left + share * (right - left) + loss)
+                    loss, row = modes.half * speed[b, k, j], modes.damping[j]
+                    for i in range(n):
+                        kick[i] += loss * row[i]
             for i in range(n):
                 if k > 0:
                     speed[b, k, i] -= kick[i]
@@ -108,14 +114,16 @@ def answer(
         weights: of the network.
     """
     batch, n, n_gen = powers.shape
-    n_fine, n_out = given.offset.shape[1], weights.last.shape[1]
-    n_in, columns = weights.first.shape[2], n_gen * n
+    n_fine, n_out = given.offset.shape[1], weights.last.shape[2]
+    n_in, width = weights.first.shape[1] // 3, weights.times.shape[2]
     omega, p_slack, update = np.empty((n_fine, n_gen)), np.empty(n_fine), np.empty((n, n_gen))
-    seen, out = np.empty((n_in, columns), np.float32), np.empty((n_out, columns), np.float32)
+    seen, out = np.empty((n_gen, n, n_in), np.float32), np.empty((n_gen, n, n_out), np.float32)
+    hidden = np.empty((n_gen, n, width), np.float32)
+    inner = np.empty((n_gen, n, width + 3 * MIXED), np.float32)
     p, n_stages = np.empty((n, n_gen)), len(weights.first)
     for b in range(batch):
         update[:] = 0.0
-        seen[n_in - (n_out - CORRECTIONS) :] = 0.0
+        seen[:, :, n_in - (n_out - CORRECTIONS) :] = 0.0
         p[:] = powers[b]
         least = np.inf
         for s in range(n_stages + 1):
@@ -125,7 +133,7 @@ def answer(
                 least, powers[b] = loss, p
             if s < n_stages:
                 _see(p, update, omega, p_slack, given, b, units, seen)
-                _stage(seen, given.constant[b], s, units, dilations, weights, out)
+                _stage(seen, given.constant[b], s, units, dilations, weights, hidden, inner, out)
                 _correct(p, out, p_slack, given.static[b], units, update)
 
 
@@ -183,46 +191,46 @@ def _stage(
     units: Units,
     dilations: Indices,
     weights: Weights,
+    hidden: Array32,
+    inner: Array32,
     out: Array32,
 ) -> None:
-    """The network of stage s, from what it sees to its outputs; its memory is seen by the next one."""
-    n_gen, n, width = constant.shape[1], weights.times.shape[2], weights.times.shape[1]
-    n_memory, columns = len(out) - CORRECTIONS, n_gen * n
-    hidden, change = np.empty((width, columns), np.float32), np.empty((width, columns), np.float32)
-    taps = np.empty((3 * width, columns), np.float32)
-    inner, own = np.empty((width + 3 * MIXED, columns), np.float32), np.empty((width, n_gen), np.float32)
-    np.dot(weights.first[s], seen, taps)
-    _gather(taps, n_gen, 1, hidden)
-    np.dot(weights.constant[s], constant, own)
-    for o in range(width):
-        for g in range(n_gen):
-            row, times = hidden[o, g * n : (g + 1) * n], weights.times[s, o]
-            for j in range(n):
-                row[j] += own[o, g] + times[j]
+    """The network of stage s, from what it sees to its outputs; its memory is seen by the next one.
+
+    All arrays are (n_gen, n_knots, n_channels): those of one generator stay in the cache.
+    """
+    n_gen, n, n_in = seen.shape
+    width, n_memory, zero = hidden.shape[2], out.shape[2] - CORRECTIONS, np.float32(0.0)
+    near_seen, near = np.empty((n, 3 * n_in), np.float32), np.empty((n, 3 * width), np.float32)
+    own, change = np.dot(constant, weights.constant[s]), np.empty((n, width), np.float32)
+    for g in range(n_gen):
+        _gather(seen[g], 1, near_seen)
+        np.dot(near_seen, weights.first[s], hidden[g])
+        for j in range(n):
+            for o in range(width):
+                hidden[g, j, o] += own[g, o] + weights.times[s, j, o]
     for i in range(len(dilations)):
-        z = inner[:width]
-        np.dot(weights.spread[s, i], hidden, taps)
-        _gather(taps, n_gen, dilations[i], z)
-        for o in range(width):
-            row, bias = z[o], weights.spread_bias[s, i, o]
-            for j in range(columns):
-                row[j] = max(row[j] + bias, np.float32(0.0))
-        _mix(inner, width, n_gen, units)
-        np.dot(weights.mix[s, i], inner, change)
-        for o in range(width):
-            row, more, bias = hidden[o], change[o], weights.mix_bias[s, i, o]
-            for j in range(columns):
-                row[j] += more[j] + bias
-    for o in range(width):
-        row = hidden[o]
-        for j in range(columns):
-            row[j] = max(row[j], np.float32(0.0))
-    np.dot(weights.last[s], hidden, out)
-    for o in range(len(out)):
-        row, bias = out[o], weights.last_bias[s, o]
-        for j in range(columns):
-            row[j] += bias
-    seen[len(seen) - n_memory :] = out[CORRECTIONS:]
+        for g in range(n_gen):
+            _gather(hidden[g], dilations[i], near)
+            np.dot(near, weights.spread[s, i], change)
+            for j in range(n):
+                for o in range(width):
+                    inner[g, j, o] = max(change[j, o] + weights.spread_bias[s, i, o], zero)
+        _mix(inner, width, units)
+        for g in range(n_gen):
+            np.dot(inner[g], weights.mix[s, i], change)
+            for j in range(n):
+                for o in range(width):
+                    hidden[g, j, o] += change[j, o] + weights.mix_bias[s, i, o]
+    for g in range(n_gen):
+        for j in range(n):
+            for o in range(width):
+                hidden[g, j, o] = max(hidden[g, j, o], zero)
+        np.dot(hidden[g], weights.last[s], out[g])
+        for j in range(n):
+            for o in range(out.shape[2]):
+                out[g, j, o] += weights.last_bias[s, o]
+        seen[g, :, n_in - n_memory :] = out[g, :, CORRECTIONS:]
 
 
 @compiled
@@ -232,7 +240,7 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
     fine, turned = (len(p_slack) - 1) // (n - 1), np.empty((n, n_gen))
     for j in range(n):
         for g in range(n_gen):
-            turned[j, g] = units.turn * out[1, g * n + j]
+            turned[j, g] = units.turn * out[g, j, 1]
     by_angle = np.dot(turned, units.stiffness)
     for j in range(n):
         slack = 0.0
@@ -240,9 +248,8 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
             for k in range(start * fine + 1, (start + 1) * fine + 1):
                 slack += 0.5 * p_slack[k] / fine
         for g in range(n_gen):
-            column = g * n + j
-            change = 2.0 * units.unit[g] * out[0, column] + by_angle[j, g]
-            change += out[2, column] * slack + out[3, column] * (static[j, g] - powers[j, g])
+            change = 2.0 * units.unit[g] * out[g, j, 0] + by_angle[j, g]
+            change += out[g, j, 2] * slack + out[g, j, 3] * (static[j, g] - powers[j, g])
             update[j, g] = powers[j, g]
             if j > 0:
                 powers[j, g] += units.pace[g] * change
@@ -267,22 +274,24 @@ def _see(
     n, n_gen = p.shape
     fine, cost, static, fixed = (len(omega) - 1) // (n - 1), given.cost[b], given.static[b], given.fixed[b]
     missing, price = np.dot(static - p, units.compliance), np.empty((n, n_gen))
-    for j in range(n):
-        for g in range(n_gen):
-            unit, column = units.unit[g], g * n + j
-            before = max(j - 1, 0)
+    relative = np.empty((n_gen, n), np.float32)
+    for g in range(n_gen):
+        unit = units.unit[g]
+        for j in range(n):
+            before, channels = max(j - 1, 0), seen[g, j]
             moved = p[j, g] - p[before, g]
             away = static[j, g] - p[j, g]
-            seen[0, column] = (2.0 * p[j, g] - units.low[g] - units.high[g]) / (units.high[g] - units.low[g])
-            seen[1, column] = _squash(0.5 * (p[j, g] - units.low[g]) / unit)
-            seen[2, column] = _squash(0.5 * (units.high[g] - p[j, g]) / unit)
-            seen[3, column] = _squash(away / (2.0 * unit))
-            seen[4, column] = _squash(away / (20.0 * unit))
-            seen[5, column] = moved / units.step[g]
-            seen[6, column] = _squash(moved / unit)
-            seen[7, column] = _squash((static[j, g] - static[before, g]) / unit)
-            seen[8, column] = _squash(missing[j, g] / units.turn / 2.0)
-            seen[9, column] = _squash(missing[j, g] / units.turn / 20.0)
+            relative[g, j] = moved / unit
+            channels[0] = (2.0 * p[j, g] - units.low[g] - units.high[g]) / (units.high[g] - units.low[g])
+            channels[1] = _squash(0.5 * (p[j, g] - units.low[g]) / unit)
+            channels[2] = _squash(0.5 * (units.high[g] - p[j, g]) / unit)
+            channels[3] = _squash(away / (2.0 * unit))
+            channels[4] = _squash(away / (20.0 * unit))
+            channels[5] = moved / units.step[g]
+            channels[6] = _squash(moved / unit)
+            channels[7] = _squash((static[j, g] - static[before, g]) / unit)
+            channels[8] = _squash(missing[j, g] / units.turn / 2.0)
+            channels[9] = _squash(missing[j, g] / units.turn / 20.0)
             first = j * fine if j == 0 else (j - 1) * fine + 1
             most, least, slack = -MOST, MOST, 0.0
             for k in range(first, j * fine + 1):
@@ -290,22 +299,19 @@ def _see(
                 most, least = max(most, ratio), min(least, ratio)
                 slack += p_slack[k]
             slack /= j * fine + 1 - first
-            seen[10, column], seen[11, column] = most, least
-            seen[12, column] = _squash(slack / unit)
-            seen[13, column] = _squash(slack / (10.0 * unit))
-            seen[14, column] = _squash(p_slack[j * fine] / unit)
+            channels[10], channels[11] = most, least
+            channels[12] = _squash(slack / unit)
+            channels[13] = _squash(slack / (10.0 * unit))
+            channels[14] = _squash(p_slack[j * fine] / unit)
             price[j, g] = cost[1 + g] - cost[0] * _squash(4.0 * slack / unit)
-            seen[15, column] = price[j, g]
-            seen[17, column] = _squash(2.0 * update[j, g] / unit)
-            seen[18, column] = _squash(4.0 * (fixed[j, g] - fixed[before, g]) / unit)
-    by_angle = np.dot(price, units.stiffness)
+            channels[15] = price[j, g]
+            channels[17] = _squash(2.0 * update[j, g] / unit)
+            channels[18] = _squash(4.0 * (fixed[j, g] - fixed[before, g]) / unit)
+    by_angle, others = np.dot(price, units.stiffness), np.dot(units.by_stiffness, relative)
     for g in range(n_gen):
         for j in range(n):
-            seen[16, g * n + j] = by_angle[j, g] / units.stiffness[g, g]
-            others, before = 0.0, max(j - 1, 0)
-            for i in range(n_gen):
-                others += units.by_stiffness[g, i] * (p[j, i] - p[before, i]) / units.unit[i]
-            seen[19, g * n + j] = _squash(2.0 * others)
+            seen[g, j, 16] = by_angle[j, g] / units.stiffness[g, g]
+            seen[g, j, 19] = _squash(2.0 * others[g, j])
 
 
 @compiled
@@ -315,46 +321,31 @@ def _squash(value: float) -> float:
 
 
 @compiled
-def _gather(taps: Array32, n_gen: int, dilation: int, values: Array32) -> None:
-    """Add what each knot's neighbours at a distance give it, and itself; beyond both ends as at the ends."""
-    n_channels, n = len(values), values.shape[1] // n_gen
-    d = min(dilation, n - 1)
-    for i in range(n_channels):
-        for g in range(n_gen):
-            first, last = g * n, (g + 1) * n
-            before, after = taps[i, first:last], taps[2 * n_channels + i, first:last]
-            here, row = taps[n_channels + i, first:last], values[i, first:last]
-            for j in range(d):
-                row[j] = here[j] + before[0]
-            for j in range(d, n):
-                row[j] = here[j] + before[j - d]
-            for j in range(n - d):
-                row[j] += after[j + d]
-            for j in range(n - d, n):
-                row[j] += after[n - 1]
+def _gather(values: Array32, dilation: int, near: Array32) -> None:
+    """Beside each other what knots before, here and after have; beyond both ends as at the ends."""
+    n, width = values.shape
+    for j in range(n):
+        before, after = max(j - dilation, 0), min(j + dilation, n - 1)
+        for o in range(width):
+            near[j, o] = values[before, o]
+            near[j, width + o] = values[j, o]
+            near[j, 2 * width + o] = values[after, o]
 
 
 @compiled
-def _mix(inner: Array32, width: int, n_gen: int, units: Units) -> None:
+def _mix(inner: Array32, width: int, units: Units) -> None:
     """Weighted means of hidden channels over the other generators, after the channels themselves."""
-    n = inner.shape[1] // n_gen
-    for i in range(MIXED):
-        for kind in range(3):
-            target = inner[width + kind * MIXED + i]
-            target[:] = 0.0
+    n_gen, n, _ = inner.shape
+    source, mean = np.empty((n_gen, n, MIXED), np.float32), np.zeros((n, MIXED), np.float32)
+    for kind in range(3):
+        source[:] = inner[:, :, kind * MIXED : (kind + 1) * MIXED]
+        first = width + kind * MIXED
+        target, flat = inner[:, :, first : first + MIXED], source.reshape(n_gen, -1)
+        if kind == 0:
+            target[:] = np.dot(units.by_stiffness, flat).reshape(n_gen, n, MIXED)
+        elif kind == 1:
+            target[:] = np.dot(units.by_compliance, flat).reshape(n_gen, n, MIXED)
+        else:
             for g in range(n_gen):
-                mixed = target[g * n : (g + 1) * n]
-                for other in range(n_gen):
-                    weight = np.float32(1.0 / n_gen)
-                    if kind == 0:
-                        weight = units.by_stiffness[g, other]
-                    elif kind == 1:
-                        weight = units.by_compliance[g, other]
-                    if kind == 2 and g > 0:
-                        break
-                    source = inner[kind * MIXED + i, other * n : (other + 1) * n]
-                    if weight != 0.0:
-                        for j in range(n):
-                            mixed[j] += weight * source[j]
-                if kind == 2 and g > 0:
-                    mixed[:] = target[:n]
+                mean += source[g] / np.float32(n_gen)
+            target[:] = mean

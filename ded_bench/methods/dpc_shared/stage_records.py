@@ -66,19 +66,19 @@ class Given(NamedTuple):
     leverage: Array  # what an angle takes from the slack, (batch, n_fine, n_gen), pu/rad
     change: Array  # (batch, n_instants, n_modes, n_modes)
     state: Array  # (batch, 2, n_modes)
-    constant: Array32  # of each generator, (batch, n_constant, n_gen)
+    constant: Array32  # of each generator, (batch, n_gen, n_constant)
     scale: Array  # mean cost of the static dispatch, in means of all costs, (batch,)
 
 
 class Weights(NamedTuple):
-    """Weights of all stages, the stage first."""
+    """Weights of all stages, the stage first, then blocks; matrices map rows to rows."""
 
-    first: Array32  # before, here and after, (n_stages, 3 width, n_sequence)
-    constant: Array32  # (n_stages, width, n_constant)
-    times: Array32  # what depends on the knot alone, (n_stages, width, n_knots)
-    spread: Array32  # likewise, (n_stages, n_blocks, 3 width, width)
-    spread_bias: Array32
-    mix: Array32  # (n_stages, n_blocks, width, width + 3 MIXED)
-    mix_bias: Array32
-    last: Array32  # (n_stages, CORRECTIONS + n_memory, width)
-    last_bias: Array32
+    first: Array32  # of knots before, here and after, (n_stages, 3 n_sequence, width)
+    constant: Array32  # (n_stages, n_constant, width)
+    times: Array32  # what depends on the knot alone, (n_stages, n_knots, width)
+    spread: Array32  # as `first`, (n_stages, n_blocks, 3 width, width)
+    spread_bias: Array32  # (n_stages, n_blocks, width)
+    mix: Array32  # (n_stages, n_blocks, width + 3 MIXED, width)
+    mix_bias: Array32  # (n_stages, n_blocks, width)
+    last: Array32  # (n_stages, width, CORRECTIONS + n_memory)
+    last_bias: Array32  # (n_stages, CORRECTIONS + n_memory)

@@ -25,6 +25,8 @@ N_SEQUENCE, N_CONSTANT, N_MEMORY = 20, 11, 4
 #: Channels among the constants that depend on the knot: time, and a decay after t = 0.
 TIMES = slice(6, 8)
 DECAYS = 12.0
+#: Weights that are matrices.
+MATRICES = "first", "constant", "spread", "mix", "last"
 #: Costs whose mean is smaller are as good as free.
 FREE = 1e-3
 #: Machines that swing further between knots, rad², are corrected less at a time: it would excite them.
@@ -118,13 +120,6 @@ def times_of(n_knots: int) -> Array:
     return np.stack([t, np.exp(-DECAYS * t)])
 
 
-def _by_tap(weights: Array32) -> Array32:
-    """(..., n_out, 3 n_in) to (..., 3 n_out, n_in): products first, sums over neighbours then."""
-    *stages, n_out, n_taps = weights.shape
-    found = weights.reshape(*stages, n_out, 3, n_taps // 3).swapaxes(-3, -2)
-    return np.ascontiguousarray(found).reshape(*stages, 3 * n_out, n_taps // 3)
-
-
 class CompiledNetwork:
     """The same function as an UnrolledNetwork, with its state dict as arrays; powers in float64."""
 
@@ -134,16 +129,13 @@ class CompiledNetwork:
             name: np.stack([state[f"stages.{i}.{name}"] for i in range(n_stages)]).astype(np.float32)
             for name in (key.removeprefix("stages.0.") for key in state if key.startswith("stages.0."))
         }
-        times = layer["constant"][:, :, TIMES] @ times_of(len(model.response.knots)).astype(np.float32)
+        times = times_of(len(model.response.knots)).T.astype(np.float32)
+        by_row = {name: np.ascontiguousarray(layer[name].swapaxes(-1, -2)) for name in MATRICES}
         self._weights = Weights(
-            first=_by_tap(layer["first"]),
-            constant=layer["constant"],
-            times=times + layer["first_bias"][:, :, None],
-            spread=_by_tap(layer["spread"]),
+            **by_row,
+            times=times @ by_row["constant"][:, TIMES] + layer["first_bias"][:, None],
             spread_bias=layer["spread_bias"],
-            mix=layer["mix"],
             mix_bias=layer["mix_bias"],
-            last=layer["last"],
             last_bias=layer["last_bias"],
         )
         self._model, self._units = model, units_of(model)
@@ -161,7 +153,7 @@ class CompiledNetwork:
             leverage=self._model.slack_stiffness(linear),
             change=linear.change,
             state=outset.state,
-            constant=constant.astype(np.float32),
+            constant=np.ascontiguousarray(constant.swapaxes(1, 2), np.float32),
             scale=static_cost(outset) / np.maximum(outset.problems.cost.mean(axis=1), FREE),
         )
         powers = outset.start.copy()

@@ -17,7 +17,7 @@ from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import AlongTrajectory, Surrogate
 from ded_bench.methods import ed
-from ded_bench.methods.knot_program import knot_points
+from ded_bench.methods.knots import knot_points
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.run.results import Key, Results

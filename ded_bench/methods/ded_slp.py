@@ -18,13 +18,8 @@ import numpy as np
 
 from ded_bench.koopman.trajectory import Indices, linearise_along
 from ded_bench.methods import ed
-from ded_bench.methods.knot_program import (
-    KnotProgram,
-    Limit,
-    is_reachable,
-    knot_points,
-    solve_with_rows_added,
-)
+from ded_bench.methods.knot_program import KnotProgram, Limit, solve_with_rows_added
+from ded_bench.methods.knots import is_reachable, knot_points
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Array, Case

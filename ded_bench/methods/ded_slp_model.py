@@ -11,7 +11,7 @@ import numpy as np
 import pyomo.environ as pyo
 
 from ded_bench.koopman.trajectory import TrajectoryModel
-from ded_bench.methods.knot_program import power_limits
+from ded_bench.methods.knots import power_limits
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 

@@ -14,7 +14,6 @@ Few of the limits between knots bind: they get rows as solutions ask for them (`
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.koopman.trajectory import Indices, LocalRows, TrajectoryModel
+from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.highs import solve_form as solve_by_highs
@@ -30,17 +30,15 @@ from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 
-#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
-#: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
-PIECE = 20
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
 #: Whether PIQP factorises dense blocks, and its regularisation; the next where one stalls. A sparse matrix is
 #: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
 SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
 LONG = 20
-#: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs.
-WIDENING_PRICE = 100.0
+#: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs. Where
+#: PIQP stalls within a radius the next is tried. Chosen on validation draws (39bus on AC).
+WIDENING_PRICES = 100.0, 10.0, 1.0
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
 NEAR, PARTS = 0.9, 8
 #: Programs on one linear model.
@@ -110,7 +108,8 @@ class KnotProgram:
     ) -> tuple[FormAnswer, float]:
         """Solve with the limits of |ω| widened as little as possible; what PIQP does not solve HiGHS does.
 
-        The cost counts, but so little that the widening is the least one but for round-off.
+        The cost counts, but so little that the widening is the least one but for round-off. Within a radius
+        the cost may count more, and HiGHS is not asked: a smaller radius may follow.
 
         Args, but for those of `solve`:
             by_interval: every interval has a widening of its own, and their sum is the least; else all
@@ -119,10 +118,15 @@ class KnotProgram:
         Returns:
             The answer, and the largest widening in rad/s.
         """
-        started = time.perf_counter()
-        form, order = self._relaxed_form(limits, by_interval)
-        answer = self._answer(form, time_limit_s)
-        if answer.status == Status.FAILED:
+        started, is_free, iterations = time.perf_counter(), self.radius == np.inf, 0
+        for price in WIDENING_PRICES[:1] if is_free else WIDENING_PRICES:
+            form, order = self._relaxed_form(limits, by_interval, price)
+            answer = self._answer(form, time_limit_s - (time.perf_counter() - started))
+            iterations += answer.iterations
+            answer = replace(answer, iterations=iterations)
+            if answer.status != Status.FAILED:
+                break
+        if answer.status == Status.FAILED and is_free:
             other = solve_by_highs(form, max(time_limit_s - (time.perf_counter() - started), 0.0))
             version = f"{answer.version}, {other.version}"
             answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
@@ -167,7 +171,7 @@ class KnotProgram:
                 break
         return replace(answer, iterations=iterations)
 
-    def _relaxed_form(self, limits: Indices, by_interval: bool) -> tuple[FreeForm, Indices]:
+    def _relaxed_form(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices]:
         """The program with columns for widenings, and where its columns stand among the program's own."""
         form = self._form(limits)
         n, speed = self._n_columns, self._speed.ravel()
@@ -191,7 +195,7 @@ class KnotProgram:
         equal = sp.hstack([form.equal, sp.csc_matrix((form.equal.shape[0], len(stage)))])
         order = np.argsort(np.append(np.arange(n), stage + 0.5))
         relaxed = FreeForm(
-            cost=np.append(form.cost, none + WIDENING_PRICE * max(form.cost.sum(), 1.0))[order],
+            cost=np.append(form.cost, none + price * max(form.cost.sum(), 1.0))[order],
             equal=sp.csc_matrix(equal)[:, order],
             right=form.right,
             between=sp.csc_matrix(sp.bmat(rows))[:, order],
@@ -349,52 +353,3 @@ def solve_with_rows_added(
             break
     status = Status.INFEASIBLE if infeasible else Status.OPTIMAL
     return Attempt(status, prediction, iterations, answer.version, answer.message)
-
-
-def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
-    """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides.
-
-    Args:
-        points: grid points of the knots.
-    """
-    p_min, p_max = power_limits(case, instance, np.diff(points))
-    reach, p_initial = case.ramp * instance.grid[points[1]], instance.p_initial(case)
-    return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
-
-
-def knot_points(times: Array, dt_s: float) -> Indices:
-    """Grid points of knots at `times` (s): inputs are linear between grid points, so knots lie on them."""
-    return np.unique(np.rint(times / dt_s).astype(int))
-
-
-def knot_weights(lengths: Indices) -> Array:
-    """How much power at a knot counts in the sum over all grid points, shape (n_knots,)."""
-    half = (lengths - 1) / 2
-    weight = np.ones(len(lengths) + 1)
-    weight[:-1] += half
-    weight[1:] += half
-    return weight
-
-
-def piece_starts(points: Indices) -> Indices:
-    """First grid points of the pieces of Σ |P_s|; every interval between knots has its own."""
-    return divided(points, -(-np.diff(points) // PIECE))
-
-
-def divided(points: Indices, parts: Indices) -> Indices:
-    """First grid points of so many nearly equal parts of every interval between knots."""
-    ends = zip(itertools.pairwise(points), parts, strict=True)
-    return np.concatenate([np.linspace(*pair, count, endpoint=False).astype(int) for pair, count in ends])
-
-
-def power_limits(case: Case, instance: Instance, lengths: Indices) -> tuple[Array, Array]:
-    """Lowest and highest power at all knots but the first, shape (n_intervals, n_gen), pu.
-
-    P_0 is given, wherever it lies, but the limits hold from t_1 on, before the next knot.
-    """
-    p_initial = instance.p_initial(case)
-    p_min, p_max = np.tile(case.p_min, (len(lengths), 1)), np.tile(case.p_max, (len(lengths), 1))
-    part = 1.0 / lengths[0]
-    p_min[0] = np.maximum(case.p_min, (case.p_min - (1 - part) * p_initial) / part)
-    p_max[0] = np.minimum(case.p_max, (case.p_max - (1 - part) * p_initial) / part)
-    return p_min, p_max

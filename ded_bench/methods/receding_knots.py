@@ -22,7 +22,7 @@ import numpy as np
 from ded_bench.koopman.surrogates import Surrogate, find_surrogate
 from ded_bench.koopman.trajectory import Indices
 from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.knot_program import knot_points
+from ded_bench.methods.knots import knot_points
 from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import solve_on_surrogate

@@ -15,7 +15,8 @@ from ded_bench.koopman.surrogates import Surrogate
 from ded_bench.koopman.trajectory import Indices, TrajectoryModel
 from ded_bench.methods import ed
 from ded_bench.methods.first_schedules import first_schedules
-from ded_bench.methods.knot_program import KnotProgram, is_reachable, solve_with_rows_added
+from ded_bench.methods.knot_program import KnotProgram, solve_with_rows_added
+from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.solution import Solution
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

@@ -18,7 +18,8 @@ import numpy as np
 
 from ded_bench.koopman.trajectory import Indices, TrajectoryModel
 from ded_bench.methods.first_schedules import first_schedules
-from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, is_reachable, solve_with_rows_added
+from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, solve_with_rows_added
+from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

@@ -73,7 +73,12 @@ class Piqp:
 
 
 def solve_form(
-    form: FreeForm, time_limit_s: float = np.inf, staged: bool = False, regularisation: float = REGULARISATION
+    form: FreeForm,
+    time_limit_s: float = np.inf,
+    staged: bool = False,
+    regularisation: float = REGULARISATION,
+    gap: float = GAP,
+    residual: float | None = None,
 ) -> FormAnswer:
     """Solve a linear program.
 
@@ -87,6 +92,8 @@ def solve_form(
             stages have tens of columns.
         regularisation: least one of the factorised matrix. A smaller one gives more accurate steps; a sparse
             factorisation does not stand it.
+        gap: relative duality gap that is small enough.
+        residual: of rows, likewise, absolute and relative; PIQP's own values if not given.
 
     Returns:
         `Optimal`, `TimeLimit` or `Failed`: what is infeasible and what is hard PIQP does not tell apart well.
@@ -101,7 +108,9 @@ def solve_form(
         solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
     solver.settings.max_iter = MAX_ITERATIONS
     solver.settings.preconditioner_scale_cost = True
-    solver.settings.eps_duality_gap_rel = GAP
+    solver.settings.eps_duality_gap_rel = gap
+    if residual is not None:
+        solver.settings.eps_abs = solver.settings.eps_rel = residual
     solver.settings.reg_lower_limit = regularisation
     n = len(form.cost)
     solver.setup(

@@ -13,7 +13,7 @@ from ded_bench.koopman.energy_form import injection_lift
 from ded_bench.koopman.linear import linear_model
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots, knot_program
-from ded_bench.methods.knot_program import knot_points
+from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

@@ -11,7 +11,8 @@ from ded_bench.koopman.trajectory import linearise_along
 from ded_bench.methods import ded_slp, ed, knot_program
 from ded_bench.methods.ded_slp import MARGIN, prepare
 from ded_bench.methods.ded_slp_model import build_ded_slp
-from ded_bench.methods.knot_program import PIECE, KnotProgram, knot_weights, piece_starts
+from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knots import PIECE, knot_weights, piece_starts
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -86,6 +87,31 @@ def test_another_factorisation_follows_where_one_stalled(case, monkeypatch, mess
     assert made.predict(answer.x).objective == pytest.approx(made.predict(direct.x).objective, rel=1e-6)
     assert answer.iterations == sum(a.iterations for a in attempts)
     assert len(attempts) == 2
+
+
+@pytest.mark.parametrize("radius", [np.inf, 1.0])
+def test_within_a_radius_a_lower_price_of_widening_follows_where_a_program_stalled(case, monkeypatch, radius):
+    """Without one HiGHS decides. A wide radius and prices above all multipliers change no answer."""
+    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(0, 401, 20))
+    made.radius = radius
+    none, solve, costs = np.empty((0, 2), dtype=int), knot_program.solve_form, []
+
+    def stalling(form, *arguments):
+        costs.append(form.cost.max())
+        answer = solve(form, *arguments)
+        if costs[-1] > 0.5 * max(costs):
+            return replace(answer, status=Status.FAILED, message="PIQP_MAX_ITER_REACHED")
+        return answer
+
+    expected = made.solve_relaxed(none, np.inf)[0]
+    monkeypatch.setattr(knot_program, "solve_form", stalling)
+    answer, widening = made.solve_relaxed(none, np.inf)
+    assert answer.status == Status.OPTIMAL
+    assert ("highs" in answer.version) == (radius == np.inf)
+    assert len(set(costs)) == (1 if radius == np.inf else 2)
+    assert widening == pytest.approx(0.0, abs=1e-7)
+    objectives = (made.predict(a.x).objective for a in (answer, expected))
+    assert next(objectives) == pytest.approx(next(objectives), rel=1e-6)
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ded_bench.methods import ded_ko_knots, receding_knots
-from ded_bench.methods.knot_program import knot_points
+from ded_bench.methods.knots import knot_points
 from ded_bench.methods.receding_knots import RecedingSolver, receding_points
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution

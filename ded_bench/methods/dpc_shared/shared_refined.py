@@ -41,6 +41,8 @@ FIRST, NEAR = 0.5, 0.8
 #: Relative excess of |ω| that needs no further program, nor a further path.
 OPEN, OFF = 2e-3, 0.04
 REGULARISATION = 1e-9
+#: Relative duality gap and residuals of a program that are small enough (docs/model.md).
+GAP, RESIDUAL = 1e-3, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,8 @@ class Refiner:
         """Corrected powers or None, and iterations; where limits of |ω| cannot hold they are widened."""
         iterations = 0
         for widened in (False, True):
-            answer = solve_form(program.form(limited, widened), staged=True, regularisation=REGULARISATION)
+            form = program.form(limited, widened)
+            answer = solve_form(form, staged=True, regularisation=REGULARISATION, gap=GAP, residual=RESIDUAL)
             iterations += answer.iterations
             if answer.status == Status.OPTIMAL:
                 return program.corrected(answer.x, widened), iterations

@@ -1,0 +1,64 @@
+"""Knots on the grid of time: where they lie, what they weigh, what limits powers at them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from ded_bench.koopman.trajectory import Indices
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+
+#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
+#: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
+PIECE = 20
+
+
+def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
+    """Whether ramps reach the generator bounds in time: these are constant, so t_1 decides.
+
+    Args:
+        points: grid points of the knots.
+    """
+    p_min, p_max = power_limits(case, instance, np.diff(points))
+    reach, p_initial = case.ramp * instance.grid[points[1]], instance.p_initial(case)
+    return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
+
+
+def knot_points(times: Array, dt_s: float) -> Indices:
+    """Grid points of knots at `times` (s): inputs are linear between grid points, so knots lie on them."""
+    return np.unique(np.rint(times / dt_s).astype(int))
+
+
+def knot_weights(lengths: Indices) -> Array:
+    """How much power at a knot counts in the sum over all grid points, shape (n_knots,)."""
+    half = (lengths - 1) / 2
+    weight = np.ones(len(lengths) + 1)
+    weight[:-1] += half
+    weight[1:] += half
+    return weight
+
+
+def piece_starts(points: Indices) -> Indices:
+    """First grid points of the pieces of Σ |P_s|; every interval between knots has its own."""
+    return divided(points, -(-np.diff(points) // PIECE))
+
+
+def divided(points: Indices, parts: Indices) -> Indices:
+    """First grid points of so many nearly equal parts of every interval between knots."""
+    ends = zip(itertools.pairwise(points), parts, strict=True)
+    return np.concatenate([np.linspace(*pair, count, endpoint=False).astype(int) for pair, count in ends])
+
+
+def power_limits(case: Case, instance: Instance, lengths: Indices) -> tuple[Array, Array]:
+    """Lowest and highest power at all knots but the first, shape (n_intervals, n_gen), pu.
+
+    P_0 is given, wherever it lies, but the limits hold from t_1 on, before the next knot.
+    """
+    p_initial = instance.p_initial(case)
+    p_min, p_max = np.tile(case.p_min, (len(lengths), 1)), np.tile(case.p_max, (len(lengths), 1))
+    part = 1.0 / lengths[0]
+    p_min[0] = np.maximum(case.p_min, (case.p_min - (1 - part) * p_initial) / part)
+    p_max[0] = np.minimum(case.p_max, (case.p_max - (1 - part) * p_initial) / part)
+    return p_min, p_max

@@ -151,8 +151,8 @@ def scenario_figure(case: Case, regime: str, heading: str, shown: Sequence[Opera
     with new_figure(7.2, 1.4 + 1.35 * (2 + 2 * n)) as figure:
         axes = figure.subplots(2 + 2 * n, 1, sharex=True)
         handles: list[Line2D] = []
-        for i in loads:
-            shade, name = BUS_COLOURS[i % len(BUS_COLOURS)], f"bus {case.loads[i]}"
+        for i, shade in zip(loads, BUS_COLOURS, strict=False):
+            name = f"bus {case.loads[i]}"
             axes[0].plot(*thin(first["t"], -first["p_load"][:, i]), color=shade, label=name)
         legend_above(axes[0], DRAWN)
         axes[0].set_ylabel("loads (pu)")

@@ -114,16 +114,16 @@ def answer(
         weights: of the network.
     """
     batch, n, n_gen = powers.shape
-    n_fine, n_out = given.offset.shape[1], weights.last.shape[2]
-    n_in, width = weights.first.shape[1] // 3, weights.times.shape[2]
+    n_fine, n_out = given.offset.shape[1], weights.last.shape[1]
+    n_in, width = weights.first.shape[2], weights.first.shape[1] // 3
     omega, p_slack, update = np.empty((n_fine, n_gen)), np.empty(n_fine), np.empty((n, n_gen))
-    seen, out = np.empty((n_gen, n, n_in), np.float32), np.empty((n_gen, n, n_out), np.float32)
-    hidden = np.empty((n_gen, n, width), np.float32)
-    inner = np.empty((n_gen, n, width + 3 * MIXED), np.float32)
+    seen, out = np.empty((n_gen, n_in, n), np.float32), np.empty((n_gen, n_out, n), np.float32)
+    hidden = np.empty((n_gen, width, n), np.float32)
+    inner = np.empty((n_gen, width + 3 * MIXED, n), np.float32)
     p, n_stages = np.empty((n, n_gen)), len(weights.first)
     for b in range(batch):
         update[:] = 0.0
-        seen[:, :, n_in - (n_out - CORRECTIONS) :] = 0.0
+        seen[:, n_in - (n_out - CORRECTIONS) :] = 0.0
         p[:] = powers[b]
         least = np.inf
         for s in range(n_stages + 1):
@@ -175,12 +175,9 @@ def _respond(
     np.dot(p_fine, units.gain, force[0])
     q[0, 0], speed[0, 0] = given.state[b, 0], given.state[b, 1]
     swing(modes, given.change[b : b + 1], force, q, speed)
-    np.dot(q[0], units.shape, p_fine)
     np.dot(speed[0], units.shape, omega)
     for k in range(n_fine):
-        p_slack[k] = given.slack[b, k]
-        for g in range(n_gen):
-            p_slack[k] -= given.leverage[b, k, g] * p_fine[k, g]
+        p_slack[k] = given.slack[b, k] - np.dot(given.leverage[b, k], q[0, k])
 
 
 @compiled
@@ -197,40 +194,45 @@ def _stage(
 ) -> None:
     """The network of stage s, from what it sees to its outputs; its memory is seen by the next one.
 
-    All arrays are (n_gen, n_knots, n_channels): those of one generator stay in the cache.
+    All arrays are (n_gen, n_channels, n_knots): those of one generator stay in the cache, and loops over
+    knots are the inner ones.
     """
-    n_gen, n, n_in = seen.shape
-    width, n_memory, zero = hidden.shape[2], out.shape[2] - CORRECTIONS, np.float32(0.0)
-    near_seen, near = np.empty((n, 3 * n_in), np.float32), np.empty((n, 3 * width), np.float32)
-    own, change = np.dot(constant, weights.constant[s]), np.empty((n, width), np.float32)
+    n_gen, n_in, n = seen.shape
+    width, n_memory, zero = hidden.shape[1], out.shape[1] - CORRECTIONS, np.float32(0.0)
+    own, change = np.dot(constant, weights.constant[s]), np.empty((width, n), np.float32)
+    taps, pooled = np.empty((3 * width, n), np.float32), np.empty((MIXED, n), np.float32)
+    source = np.empty((2, n_gen, MIXED, n), np.float32)
+    mean, flat = np.empty_like(source), (n_gen, MIXED * n)
     for g in range(n_gen):
-        _gather(seen[g], 1, near_seen)
-        np.dot(near_seen, weights.first[s], hidden[g])
-        for j in range(n):
-            for o in range(width):
-                hidden[g, j, o] += own[g, o] + weights.times[s, j, o]
+        _convolve(weights.first[s], seen[g], 1, taps, hidden[g])
+        for o in range(width):
+            _add(weights.times[s, o], own[g, o], hidden[g, o])
     for i in range(len(dilations)):
+        pooled[:] = zero
         for g in range(n_gen):
-            _gather(hidden[g], dilations[i], near)
-            np.dot(near, weights.spread[s, i], change)
-            for j in range(n):
-                for o in range(width):
-                    inner[g, j, o] = max(change[j, o] + weights.spread_bias[s, i, o], zero)
-        _mix(inner, width, units)
-        for g in range(n_gen):
-            np.dot(inner[g], weights.mix[s, i], change)
-            for j in range(n):
-                for o in range(width):
-                    hidden[g, j, o] += change[j, o] + weights.mix_bias[s, i, o]
-    for g in range(n_gen):
-        for j in range(n):
+            _convolve(weights.spread[s, i], hidden[g], dilations[i], taps, inner[g, :width])
             for o in range(width):
-                hidden[g, j, o] = max(hidden[g, j, o], zero)
-        np.dot(hidden[g], weights.last[s], out[g])
-        for j in range(n):
-            for o in range(out.shape[2]):
-                out[g, j, o] += weights.last_bias[s, o]
-        seen[g, :, n_in - n_memory :] = out[g, :, CORRECTIONS:]
+                _rectify(weights.spread_bias[s, i, o], inner[g, o])
+            source[0, g], source[1, g] = inner[g, :MIXED], inner[g, MIXED : 2 * MIXED]
+            for o in range(MIXED):
+                _add(inner[g, 2 * MIXED + o], zero, pooled[o])
+        np.dot(units.by_stiffness, source[0].reshape(flat), mean[0].reshape(flat))
+        np.dot(units.by_compliance, source[1].reshape(flat), mean[1].reshape(flat))
+        pooled /= np.float32(n_gen)
+        for g in range(n_gen):
+            inner[g, width : width + MIXED] = mean[0, g]
+            inner[g, width + MIXED : width + 2 * MIXED] = mean[1, g]
+            inner[g, width + 2 * MIXED :] = pooled
+            np.dot(weights.mix[s, i], inner[g], change)
+            for o in range(width):
+                _add(change[o], weights.mix_bias[s, i, o], hidden[g, o])
+    for g in range(n_gen):
+        for o in range(width):
+            _rectify(zero, hidden[g, o])
+        np.dot(weights.last[s], hidden[g], out[g])
+        for o in range(out.shape[1]):
+            out[g, o] += weights.last_bias[s, o]
+        seen[g, n_in - n_memory :] = out[g, CORRECTIONS:]
 
 
 @compiled
@@ -240,7 +242,7 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
     fine, turned = (len(p_slack) - 1) // (n - 1), np.empty((n, n_gen))
     for j in range(n):
         for g in range(n_gen):
-            turned[j, g] = units.turn * out[g, j, 1]
+            turned[j, g] = units.turn * out[g, 1, j]
     by_angle = np.dot(turned, units.stiffness)
     for j in range(n):
         slack = 0.0
@@ -248,8 +250,8 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
             for k in range(start * fine + 1, (start + 1) * fine + 1):
                 slack += 0.5 * p_slack[k] / fine
         for g in range(n_gen):
-            change = 2.0 * units.unit[g] * out[g, j, 0] + by_angle[j, g]
-            change += out[g, j, 2] * slack + out[g, j, 3] * (static[j, g] - powers[j, g])
+            change = 2.0 * units.unit[g] * out[g, 0, j] + by_angle[j, g]
+            change += out[g, 2, j] * slack + out[g, 3, j] * (static[g, j] - powers[j, g])
             update[j, g] = powers[j, g]
             if j > 0:
                 powers[j, g] += units.pace[g] * change
@@ -261,7 +263,7 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
 
 @compiled
 def _see(
-    p: Array,
+    powers: Array,
     update: Array,
     omega: Array,
     p_slack: Array,
@@ -271,81 +273,108 @@ def _see(
     seen: Array32,
 ) -> None:
     """Channels of a stage but its memory; see `UnrolledNetwork.sequence`."""
-    n, n_gen = p.shape
+    n, n_gen = powers.shape
     fine, cost, static, fixed = (len(omega) - 1) // (n - 1), given.cost[b], given.static[b], given.fixed[b]
-    missing, price = np.dot(static - p, units.compliance), np.empty((n, n_gen))
-    relative = np.empty((n_gen, n), np.float32)
-    for g in range(n_gen):
-        unit = units.unit[g]
-        for j in range(n):
-            before, channels = max(j - 1, 0), seen[g, j]
-            moved = p[j, g] - p[before, g]
-            away = static[j, g] - p[j, g]
-            relative[g, j] = moved / unit
-            channels[0] = (2.0 * p[j, g] - units.low[g] - units.high[g]) / (units.high[g] - units.low[g])
-            channels[1] = _squash(0.5 * (p[j, g] - units.low[g]) / unit)
-            channels[2] = _squash(0.5 * (units.high[g] - p[j, g]) / unit)
-            channels[3] = _squash(away / (2.0 * unit))
-            channels[4] = _squash(away / (20.0 * unit))
-            channels[5] = moved / units.step[g]
-            channels[6] = _squash(moved / unit)
-            channels[7] = _squash((static[j, g] - static[before, g]) / unit)
-            channels[8] = _squash(missing[j, g] / units.turn / 2.0)
-            channels[9] = _squash(missing[j, g] / units.turn / 20.0)
-            first = j * fine if j == 0 else (j - 1) * fine + 1
-            most, least, slack = -MOST, MOST, 0.0
+    p, last, slack = powers.T.copy(), update.T.copy(), np.empty(n)
+    at_knot, below, moved = p_slack[::fine].copy(), np.empty(n, np.float32), np.empty(n)
+    for j in range(n):
+        first = 0 if j == 0 else (j - 1) * fine + 1
+        slack[j] = p_slack[first : j * fine + 1].mean()
+        for g in range(n_gen):
+            most, least = -MOST, MOST
             for k in range(first, j * fine + 1):
                 ratio = min(max(omega[k, g] / units.bound, -MOST), MOST)
                 most, least = max(most, ratio), min(least, ratio)
-                slack += p_slack[k]
-            slack /= j * fine + 1 - first
-            channels[10], channels[11] = most, least
-            channels[12] = _squash(slack / unit)
-            channels[13] = _squash(slack / (10.0 * unit))
-            channels[14] = _squash(p_slack[j * fine] / unit)
-            price[j, g] = cost[1 + g] - cost[0] * _squash(4.0 * slack / unit)
-            channels[15] = price[j, g]
-            channels[17] = _squash(2.0 * update[j, g] / unit)
-            channels[18] = _squash(4.0 * (fixed[j, g] - fixed[before, g]) / unit)
-    by_angle, others = np.dot(price, units.stiffness), np.dot(units.by_stiffness, relative)
+            seen[g, 10, j], seen[g, 11, j] = most, least
+    away, price, relative = static - p, np.empty((n_gen, n)), np.empty((n_gen, n), np.float32)
+    missing = np.dot(units.compliance, away)
     for g in range(n_gen):
+        channels, unit, low, high = seen[g], units.unit[g], units.low[g], units.high[g]
+        _scale(p[g], 2.0 / (high - low), -(low + high) / (high - low), channels[0])
+        _squash(p[g], 0.5 / unit, -0.5 * low / unit, below, channels[1])
+        _squash(p[g], -0.5 / unit, 0.5 * high / unit, below, channels[2])
+        _squash(away[g], 0.5 / unit, 0.0, below, channels[3])
+        _squash(away[g], 0.05 / unit, 0.0, below, channels[4])
+        _difference(p[g], moved)
+        _scale(moved, 1.0 / units.step[g], 0.0, channels[5])
+        _scale(moved, 1.0 / unit, 0.0, relative[g])
+        _squash(moved, 1.0 / unit, 0.0, below, channels[6])
+        _difference(static[g], moved)
+        _squash(moved, 1.0 / unit, 0.0, below, channels[7])
+        _squash(missing[g], 0.5 / units.turn, 0.0, below, channels[8])
+        _squash(missing[g], 0.05 / units.turn, 0.0, below, channels[9])
+        _squash(slack, 1.0 / unit, 0.0, below, channels[12])
+        _squash(slack, 0.1 / unit, 0.0, below, channels[13])
+        _squash(at_knot, 1.0 / unit, 0.0, below, channels[14])
+        _squash(slack, 4.0 / unit, 0.0, below, channels[15])
         for j in range(n):
-            seen[g, j, 16] = by_angle[j, g] / units.stiffness[g, g]
-            seen[g, j, 19] = _squash(2.0 * others[g, j])
+            price[g, j] = cost[1 + g] - cost[0] * channels[15, j]
+        channels[15] = price[g]
+        _squash(last[g], 2.0 / unit, 0.0, below, channels[17])
+        _difference(fixed[g], moved)
+        _squash(moved, 4.0 / unit, 0.0, below, channels[18])
+    by_angle, others = np.dot(units.stiffness, price), np.dot(units.by_stiffness, relative)
+    for g in range(n_gen):
+        _scale(by_angle[g], 1.0 / units.stiffness[g, g], 0.0, seen[g, 16])
+        _squash(others[g], 2.0, 0.0, below, seen[g, 19])
 
 
 @compiled
-def _squash(value: float) -> float:
-    """To (-1, 1)."""
-    return value / (1.0 + abs(value))
+def _difference(values: Array, found: Array) -> None:
+    """To the knot before; 0 at the first."""
+    found[0] = 0.0
+    for j in range(1, len(values)):
+        found[j] = values[j] - values[j - 1]
 
 
 @compiled
-def _gather(values: Array32, dilation: int, near: Array32) -> None:
-    """Beside each other what knots before, here and after have; beyond both ends as at the ends."""
-    n, width = values.shape
-    for j in range(n):
-        before, after = max(j - dilation, 0), min(j + dilation, n - 1)
-        for o in range(width):
-            near[j, o] = values[before, o]
-            near[j, width + o] = values[j, o]
-            near[j, 2 * width + o] = values[after, o]
+def _scale(values: Array, factor: float, offset: float, found: Array32) -> None:
+    """factor * values + offset."""
+    for j in range(len(values)):
+        found[j] = factor * values[j] + offset
 
 
 @compiled
-def _mix(inner: Array32, width: int, units: Units) -> None:
-    """Weighted means of hidden channels over the other generators, after the channels themselves."""
-    n_gen, n, _ = inner.shape
-    source, mean = np.empty((n_gen, n, MIXED), np.float32), np.zeros((n, MIXED), np.float32)
-    for kind in range(3):
-        source[:] = inner[:, :, kind * MIXED : (kind + 1) * MIXED]
-        first = width + kind * MIXED
-        target, flat = inner[:, :, first : first + MIXED], source.reshape(n_gen, -1)
-        if kind == 0:
-            target[:] = np.dot(units.by_stiffness, flat).reshape(n_gen, n, MIXED)
-        elif kind == 1:
-            target[:] = np.dot(units.by_compliance, flat).reshape(n_gen, n, MIXED)
-        else:
-            for g in range(n_gen):
-                mean += source[g] / np.float32(n_gen)
-            target[:] = mean
+def _squash(values: Array, factor: float, offset: float, below: Array32, found: Array32) -> None:
+    """factor * values + offset, to (-1, 1); `below` is overwritten."""
+    _scale(values, factor, offset, found)
+    for j in range(len(values)):
+        below[j] = np.float32(1.0) + abs(found[j])
+    np.divide(found, below, found)  # Python's division would check each divisor
+
+
+@compiled
+def _convolve(weight: Array32, values: Array32, dilation: int, taps: Array32, found: Array32) -> None:
+    """Sum over each knot's neighbours at a distance, and itself; beyond both ends as at the ends.
+
+    Args:
+        weight: of knots before, here and after, (3 n_out, n_in).
+        values: (n_in, n_knots).
+        dilation: the distance, in knots.
+        taps: (3 n_out, n_knots), overwritten: shifting what comes out is cheaper.
+        found: receives the sums, (n_out, n_knots).
+    """
+    np.dot(weight, values, taps)
+    n_out, n = found.shape
+    d, zero = min(dilation, n - 1), np.float32(0.0)
+    for o in range(n_out):
+        before, after = taps[o], taps[2 * n_out + o]
+        found[o] = taps[n_out + o]
+        found[o, :d] += before[0]
+        _add(before[: n - d], zero, found[o, d:])
+        _add(after[d:], zero, found[o, : n - d])
+        found[o, n - d :] += after[n - 1]
+
+
+@compiled
+def _add(values: Array32, offset: np.float32, found: Array32) -> None:
+    """Add values and a constant."""
+    for j in range(len(found)):
+        found[j] += values[j] + offset
+
+
+@compiled
+def _rectify(offset: np.float32, found: Array32) -> None:
+    """Add a constant; what is negative becomes 0."""
+    for j in range(len(found)):
+        found[j] = max(found[j] + offset, np.float32(0.0))

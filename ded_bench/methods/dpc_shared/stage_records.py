@@ -59,11 +59,11 @@ class Given(NamedTuple):
     """What is known of a batch before the first stage."""
 
     cost: Array  # (slack, generators), in means of all, (batch, 1 + n_gen)
-    static: Array  # (batch, n_knots, n_gen), pu, as the next
+    static: Array  # (batch, n_gen, n_knots), pu, as the next
     fixed: Array
     offset: Array  # see `Linear`: (batch, n_fine, n_gen), pu
     slack: Array  # (batch, n_fine), pu
-    leverage: Array  # what an angle takes from the slack, (batch, n_fine, n_gen), pu/rad
+    leverage: Array  # what a mode takes from the slack, (batch, n_fine, n_modes), pu/rad
     change: Array  # (batch, n_instants, n_modes, n_modes)
     state: Array  # (batch, 2, n_modes)
     constant: Array32  # of each generator, (batch, n_gen, n_constant)
@@ -71,14 +71,14 @@ class Given(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Weights of all stages, the stage first, then blocks; matrices map rows to rows."""
+    """Weights of all stages, the stage first, then blocks; but for `constant`, matrices map columns."""
 
-    first: Array32  # of knots before, here and after, (n_stages, 3 n_sequence, width)
+    first: Array32  # of knots before, here and after, (n_stages, 3 width, n_sequence)
     constant: Array32  # (n_stages, n_constant, width)
-    times: Array32  # what depends on the knot alone, (n_stages, n_knots, width)
+    times: Array32  # what depends on the knot alone, (n_stages, width, n_knots)
     spread: Array32  # as `first`, (n_stages, n_blocks, 3 width, width)
     spread_bias: Array32  # (n_stages, n_blocks, width)
-    mix: Array32  # (n_stages, n_blocks, width + 3 MIXED, width)
+    mix: Array32  # (n_stages, n_blocks, width, width + 3 MIXED)
     mix_bias: Array32  # (n_stages, n_blocks, width)
-    last: Array32  # (n_stages, width, CORRECTIONS + n_memory)
+    last: Array32  # (n_stages, CORRECTIONS + n_memory, width)
     last_bias: Array32  # (n_stages, CORRECTIONS + n_memory)

@@ -25,8 +25,6 @@ N_SEQUENCE, N_CONSTANT, N_MEMORY = 20, 11, 4
 #: Channels among the constants that depend on the knot: time, and a decay after t = 0.
 TIMES = slice(6, 8)
 DECAYS = 12.0
-#: Weights that are matrices.
-MATRICES = "first", "constant", "spread", "mix", "last"
 #: Costs whose mean is smaller are as good as free.
 FREE = 1e-3
 #: Machines that swing further between knots, rad², are corrected less at a time: it would excite them.
@@ -120,6 +118,11 @@ def times_of(n_knots: int) -> Array:
     return np.stack([t, np.exp(-DECAYS * t)])
 
 
+def _taps(weights: Array32) -> Array32:
+    """Those of knots before, here and after one upon another, not beside each other."""
+    return np.ascontiguousarray(np.concatenate(np.split(weights, 3, axis=-1), axis=-2))
+
+
 class CompiledNetwork:
     """The same function as an UnrolledNetwork, with its state dict as arrays; powers in float64."""
 
@@ -129,13 +132,16 @@ class CompiledNetwork:
             name: np.stack([state[f"stages.{i}.{name}"] for i in range(n_stages)]).astype(np.float32)
             for name in (key.removeprefix("stages.0.") for key in state if key.startswith("stages.0."))
         }
-        times = times_of(len(model.response.knots)).T.astype(np.float32)
-        by_row = {name: np.ascontiguousarray(layer[name].swapaxes(-1, -2)) for name in MATRICES}
+        times = times_of(len(model.response.knots)).astype(np.float32)
         self._weights = Weights(
-            **by_row,
-            times=times @ by_row["constant"][:, TIMES] + layer["first_bias"][:, None],
+            first=_taps(layer["first"]),
+            constant=np.ascontiguousarray(layer["constant"].swapaxes(1, 2)),
+            times=layer["constant"][:, :, TIMES] @ times + layer["first_bias"][:, :, None],
+            spread=_taps(layer["spread"]),
             spread_bias=layer["spread_bias"],
+            mix=layer["mix"],
             mix_bias=layer["mix_bias"],
+            last=layer["last"],
             last_bias=layer["last_bias"],
         )
         self._model, self._units = model, units_of(model)
@@ -146,11 +152,11 @@ class CompiledNetwork:
         constant, cost = constants_of(self._model, self._units, outset)
         given = Given(
             cost=cost,
-            static=outset.static,
-            fixed=np.ascontiguousarray(outset.fixed[:, ::FINE]),
+            static=np.ascontiguousarray(outset.static.swapaxes(1, 2)),
+            fixed=np.ascontiguousarray(outset.fixed[:, ::FINE].swapaxes(1, 2)),
             offset=linear.offset,
             slack=linear.slack,
-            leverage=self._model.slack_stiffness(linear),
+            leverage=self._model.slack_stiffness(linear) @ self._model.response.shape.T,
             change=linear.change,
             state=outset.state,
             constant=np.ascontiguousarray(constant.swapaxes(1, 2), np.float32),

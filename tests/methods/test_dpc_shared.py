@@ -50,8 +50,7 @@ def drawn(model: PathModel, count: int = 6, seed: int = 0) -> Outset:
 
 
 def linearised(model: PathModel, outset: Outset) -> Linear:
-    x = model.respond(outset.start, outset, model.nominal(outset))[0]
-    return model.linearise(outset, x)
+    return model.linearise(outset, model.start_path(outset))
 
 
 def random_network(model: PathModel, size: float = 0.05) -> UnrolledNetwork:
@@ -329,11 +328,11 @@ def test_path_is_averaged_before_the_network_is_asked(ninebus: Case) -> None:
     """A fast swing of the path leaves no trace at the knots."""
     model = path_model(ninebus, 60.0)
     outset = drawn(model, 2)
-    x = model.respond(outset.start, outset, model.nominal(outset))[0]
+    x = model.respond(outset.start, outset, linearised(model, outset))[0]
     k = np.arange(x.shape[1])
     swing = 0.01 * np.cos(np.pi * k / FINE * 2)[None, :, None]
     swing[:, [0, -1]] = 0.0
-    calm, swung = model.linearise(outset, x), model.linearise(outset, x + swing)
+    calm, swung = model.along(outset, x), model.along(outset, x + swing)
     np.testing.assert_allclose(swung.offset[:, FINE:-FINE], calm.offset[:, FINE:-FINE], atol=3e-3)
 
 

@@ -26,6 +26,8 @@ FINE = 4
 ROUND_OFF = 1e-6
 #: Instants at which the stiffness along a path is taken; linear between them.
 INSTANTS = 5
+#: Longest time from one power flow along a path to the next, s, but for knots farther apart.
+FLOWS_S = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,8 @@ class GridResponse:
     shape: Array  # modes into angles, (n_modes, n_gen): x = q @ shape
     step: Array  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
     damping: Array  # of the modes, less γ, (n_modes, n_modes), 1/s
-    instants: Indices  # knots at which stiffness along a path is taken, (n_instants,)
+    every: int  # from one station, where a path's power flow is solved, to the next, in knots
+    instants: Indices  # knots, all stations, at which stiffness along a path is taken, (n_instants,)
     network: Network
     theta: Array  # angles of the nominal point, (n_bus,), rad
     inverse: Array  # of ∂f/∂θ there, without the slack, (n_bus - 1, n_bus - 1)
@@ -60,6 +63,8 @@ class GridResponse:
         fine = np.linspace(knots[0], knots[-1], FINE * (len(knots) - 1) + 1)
         weights = network.coupling * np.cos(theta @ network.incidence.T)
         full = network.incidence.T @ (weights[:, None] * network.incidence)
+        every = largest_divisor(len(knots) - 1, FLOWS_S / (knots[1] - knots[0]))
+        stations = (len(knots) - 1) // every + 1
         return GridResponse(
             knots=knots,
             fine=fine,
@@ -70,7 +75,8 @@ class GridResponse:
             shape=(u / root[:, None]).T.copy(),
             step=np.stack([_oscillator(square, rate, fine[1]) for square in squares]),
             damping=u.T @ np.diag(other) @ u,
-            instants=np.linspace(0, len(knots) - 1, min(INSTANTS, len(knots))).round().astype(np.int64),
+            every=every,
+            instants=every * np.linspace(0, stations - 1, min(INSTANTS, stations)).round().astype(np.int64),
             network=network,
             theta=theta,
             inverse=np.linalg.inv(full[np.ix_(network.unknown, network.unknown)]),
@@ -80,6 +86,11 @@ class GridResponse:
     def modes(self) -> Modes:
         """What compiled functions see of it."""
         return Modes(self.step, self.damping, 0.5 * float(self.fine[1]), self.instants * FINE)
+
+
+def largest_divisor(count: int, most: float) -> int:
+    """The largest divisor of a number that is at most so large; 1 if none is."""
+    return max(n for n in range(1, max(int(most + 1e-9), 1) + 1) if count % n == 0)
 
 
 def _oscillator(square: float, rate: float, h: float) -> Array:

@@ -101,7 +101,7 @@ def follow_path(
     before, change = np.empty(n), np.zeros(n)
     for i in range(n):
         before[i] = angle[lines.algebraic[i]]
-    off, inverse, at = np.empty(n), np.empty((n, n)), 0
+    off, inverse, at, known = np.empty(n), np.empty((n, n)), 0, False
     for k in range(len(path)):
         for g in range(n_gen):
             angle[lines.generators[g]] = path[k, g]
@@ -109,9 +109,6 @@ def follow_path(
             wanted[lines.loads[i]] = p_load[k, i]
         for i in range(n):
             angle[lines.algebraic[i]] = before[i] + change[i]
-        renew = at < len(instants) and instants[at] == k
-        if renew:
-            inverse[:] = np.linalg.inv(_jacobian(lines, lines.algebraic, angle))
         last = np.inf
         for step in range(STEPS):
             _injections(lines, angle, injection)
@@ -123,8 +120,8 @@ def follow_path(
                 break
             if not worst < 1e6 or step == STEPS - 1:
                 return False
-            if worst > CONTRACTION * last:
-                inverse[:] = np.linalg.inv(_jacobian(lines, lines.algebraic, angle))
+            if not known or worst > CONTRACTION * last:
+                inverse[:], known = np.linalg.inv(_jacobian(lines, lines.algebraic, angle)), True
             last = worst
             correction = np.dot(inverse, off)
             for i in range(n):
@@ -136,8 +133,8 @@ def follow_path(
             change[:] = 0.0
         for g in range(n_gen):
             f[k, g] = injection[lines.generators[g]]
-        if renew:
-            _reduced(lines, angle, inverse, stiffness[at])
+        if at < len(instants) and instants[at] == k:
+            _reduced(lines, angle, stiffness[at])
             at += 1
     return True
 
@@ -174,8 +171,8 @@ def _jacobian(lines: Lines, buses: Indices, theta: Array) -> Array:
 
 
 @compiled
-def _reduced(lines: Lines, theta: Array, inverse: Array, stiffness: Array) -> None:
-    """∂f/∂θ of the generators where the loads fix the other angles, pu/rad; `inverse` is nearly right."""
+def _reduced(lines: Lines, theta: Array, stiffness: Array) -> None:
+    """∂f/∂θ of the generators where the loads fix the other angles, pu/rad."""
     n_gen, n = len(lines.generators), len(lines.algebraic)
     place, own = np.full(len(theta), -1), np.full(len(theta), -1)
     for i in range(n):
@@ -198,7 +195,8 @@ def _reduced(lines: Lines, theta: Array, inverse: Array, stiffness: Array) -> No
             across[place[far], own[near]] -= slope
         if own[far] >= 0 and place[near] >= 0:
             across[place[near], own[far]] -= slope
-    stiffness -= np.dot(across.T, np.dot(inverse, across))
+    others = np.linalg.solve(_jacobian(lines, lines.algebraic, theta), across)
+    stiffness -= np.dot(across.T, others)
 
 
 @compiled

@@ -89,38 +89,48 @@ class PathModel:
         track_rows(powers, self.case.p_min, self.case.p_max, self.ramp)
         return np.asarray(powers)
 
-    def nominal(self, outset: Outset) -> Linear:
-        """The grid linearised at its nominal point."""
-        batch, n_gen, n = len(outset.fixed), outset.fixed.shape[2], len(self.response.instants)
-        none = np.zeros((batch, n, n_gen, n_gen))
-        initial = outset.problems.p_initial[:, None]
-        return Linear(-outset.fixed - initial, none, self._slack(outset, outset.fixed + initial), none)
+    def start_path(self, outset: Outset) -> Array:
+        """Steady x under the first schedules at the stations, (batch, n_stations, n_gen), rad."""
+        every = self.response.every
+        p_load = outset.fixed[:, :: every * FINE]
+        powers = outset.start[:, ::every] - outset.problems.p_initial[:, None]
+        return np.asarray((powers - p_load) @ self.response.compliance)
 
-    def linearise(self, outset: Outset, path: Array) -> Linear:
-        """The grid linearised along paths of x.
+    def along(self, outset: Outset, path: Array) -> Linear:
+        """The grid linearised along paths of x at the fine points, (batch, n_fine, n_gen), rad.
+
+        What swings faster than the time from one station to the next is averaged out.
+        """
+        return self.linearise(outset, averaged(path, self.response.every * FINE))
+
+    def linearise(self, outset: Outset, slow: Array) -> Linear:
+        """The grid linearised along slow paths of x.
+
+        The power flow is solved at the stations. What it says that neither S nor ΔS do is taken as linear
+        between them.
 
         Args:
             outset: of the problems.
-            path: x at the fine points, (batch, n_fine, n_gen), rad; its fast swings are averaged out.
+            slow: x at the stations, (batch, n_stations, n_gen), rad.
         """
         response, problems = self.response, outset.problems
-        slow = averaged(path, FINE)
-        batch, n_knots, n_gen = slow.shape
-        f = np.empty((batch, n_knots, n_gen))
+        points = response.every * FINE
+        batch, n_stations, n_gen = slow.shape
+        f = np.empty((batch, n_stations, n_gen))
         stiffness = np.empty((batch, len(response.instants), n_gen, n_gen))
-        loads = np.ascontiguousarray(problems.load[:, ::FINE])
-        generators = self.network.generators
+        loads = np.ascontiguousarray(problems.load[:, ::points])
+        generators, instants = self.network.generators, response.instants // response.every
         for b in range(batch):
             if outset.served[b]:
                 angles = outset.theta[b, generators] + slow[b]
-                place = outset.theta[b], response.instants
+                place = outset.theta[b], instants
                 outset.served[b] = follow_path(self.lines, angles, loads[b], *place, f[b], stiffness[b])
         bad = np.logical_not(outset.served)
         f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
         change = stiffness - response.stiffness
-        rest = f - slow @ response.stiffness - outset.fixed[:, ::FINE]
-        along = np.einsum("ns,bsng->bng", self.between[::FINE], slow[:, None] @ change)
-        taken = outset.fixed + self.to_fine(rest - along)
+        rest = f - slow @ response.stiffness - outset.fixed[:, ::points]
+        by_change = np.einsum("ns,bsng->bng", self.between[::points], slow[:, None] @ change)
+        taken = outset.fixed + linear_between(rest - by_change, points)
         modal = response.gain.T @ change @ response.shape.T
         return Linear(-taken, modal, self._slack(outset, taken), change)
 
@@ -135,7 +145,7 @@ class PathModel:
         Returns:
             At the fine points: x (batch, n_fine, n_gen), rad, ω likewise, rad/s, P_s (batch, n_fine), pu.
         """
-        v = (self.to_fine(powers) + linear.offset) @ self.response.gain
+        v = (linear_between(powers, FINE) + linear.offset) @ self.response.gain
         q, speed = np.empty_like(v), np.empty_like(v)
         q[:, 0], speed[:, 0] = outset.state[:, 0], outset.state[:, 1]
         swing(self.modes, linear.change, v, q, speed)
@@ -147,12 +157,12 @@ class PathModel:
         """Σ_g of S + ΔS at the fine points, (batch, n_fine, n_gen), pu/rad."""
         return np.asarray(self.response.stiffness.sum(axis=0) + self.between @ linear.stiffness.sum(axis=2))
 
-    def to_fine(self, at_knots: Array) -> Array:
-        """Linear between knots, (batch, n_knots, n) to (batch, n_fine, n)."""
-        found = np.empty((at_knots.shape[0], len(self.response.fine), at_knots.shape[2]))
-        for i in range(FINE):
-            found[:, i::FINE][:, : at_knots.shape[1] - 1] = at_knots[:, :-1] * (1 - i / FINE) + at_knots[
-                :, 1:
-            ] * (i / FINE)
-        found[:, -1] = at_knots[:, -1]
-        return found
+
+def linear_between(values: Array, points: int) -> Array:
+    """Linear between rows, (batch, n, n_columns) to (batch, points (n - 1) + 1, n_columns)."""
+    batch, n, n_columns = values.shape
+    found = np.empty((batch, points * (n - 1) + 1, n_columns))
+    for i in range(points):
+        found[:, i:-1:points] = values[:, :-1] * (1 - i / points) + values[:, 1:] * (i / points)
+    found[:, -1] = values[:, -1]
+    return found

@@ -99,8 +99,7 @@ class SharedPolicy:
             starts = range(0, len(problems), CHUNK)
             return np.concatenate([self.powers(problems[i : i + CHUNK]) for i in starts])
         outset = self.model.outset(problems)
-        path = self.model.respond(outset.start, outset, self.model.nominal(outset))[0]
-        return self.answer(outset, self.model.linearise(outset, path))
+        return self.answer(outset, self.model.linearise(outset, self.model.start_path(outset)))
 
     def answer(self, outset: Outset, linear: Linear) -> Array:
         """As `powers`, where the grid along the path of the first schedule is known."""

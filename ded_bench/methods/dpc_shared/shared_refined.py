@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_shared import shared_policy
 from ded_bench.methods.dpc_shared.drawn_problems import Problems
-from ded_bench.methods.dpc_shared.grid_response import GridResponse
+from ded_bench.methods.dpc_shared.grid_response import GridResponse, largest_divisor
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset
 from ded_bench.methods.dpc_shared.path_program import PathProgram
 from ded_bench.methods.dpc_shared.shared_policy import SharedPolicy
@@ -61,7 +61,7 @@ class Refiner:
         """
         policy, model = self.policy, self.policy.model
         outset = model.outset(policy.problems([instance]))
-        linear = model.linearise(outset, model.respond(outset.start, outset, model.nominal(outset))[0])
+        linear = model.linearise(outset, model.start_path(outset))
         answer = policy.answer(outset, linear) if self.learned else outset.start
         iterations = 0
         for start in (answer, outset.start) if self.learned else (answer,):
@@ -76,7 +76,7 @@ class Refiner:
         model, knots, iterations = self.policy.model, knots_between(self.policy.knots), 0
         limited: NDArray[np.bool_] | bool = False
         for number in range(PATHS):
-            linear = model.linearise(outset, model.respond(powers, outset, linear)[0])
+            linear = model.along(outset, model.respond(powers, outset, linear)[0])
             program = PathProgram(model, outset, linear, powers, knots, self.bound)
             if number and not program.near(1.0 + OFF).any():
                 break
@@ -115,9 +115,7 @@ class Refiner:
 
 def knots_between(knots: Array) -> int:
     """Intervals from one correction to the next: as many as `SPACING_S` allows, of those that divide all."""
-    count = len(knots) - 1
-    most = int(SPACING_S / (knots[1] - knots[0]))
-    return max(n for n in range(1, max(most, 1) + 1) if count % n == 0)
+    return largest_divisor(len(knots) - 1, SPACING_S / (knots[1] - knots[0]))
 
 
 def margin_of(response: GridResponse) -> float:
@@ -141,7 +139,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         schedule, iterations = refiner(instance)
-        schedule.at(instance.grid)
         elapsed = time.perf_counter() - started
         return Solution(Status.POLICY, schedule, iterations, solve_s=elapsed, solver_version=VERSION)
 

@@ -14,6 +14,7 @@ from ded_bench.methods.dpc_shared.stage_records import (
     PRICE,
     STRAIGHT,
     Array32,
+    Floats,
     Given,
     Indices,
     Modes,
@@ -28,21 +29,22 @@ MOST = np.float64(3.0)
 
 
 @compiled
-def swing(modes: Modes, change: Array, v: Array, q: Array, speed: Array) -> None:
+def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> None:
     """Advance problems from one fine point to the next: q̈ + γ q̇ + λ q + δD q̇ + C(t) q = v.
 
     Strang's splitting: half a kick by δD and C, the exact map of the rest, half a kick. Both are symmetric,
     so that products add up rows.
 
     Args:
-        modes: the grid.
+        modes: the grid; its arrays and the others are all of one precision.
         change: C at the instants, linear between, (batch, n_instants, n_modes, n_modes), 1/s².
         v: inputs, (batch, n_fine, n_modes).
         q: coordinates, (batch, n_fine, n_modes); the first row is given.
         speed: their derivatives, likewise.
     """
     n = v.shape[2]
-    kicked, kick, damped = np.empty(n), np.empty(n), np.any(modes.damping != 0.0)
+    kicked, kick, damped = np.empty(n, v.dtype), np.empty(n, v.dtype), np.any(modes.damping != 0.0)
+    shares = np.empty(3, v.dtype)  # of C before and after, and of δD, times half a step
     for b in range(len(v)):
         part = 0
         for k in range(v.shape[1]):
@@ -64,16 +66,16 @@ def swing(modes: Modes, change: Array, v: Array, q: Array, speed: Array) -> None
                         + a[1, 2] * before
                         + a[1, 3] * v[b, k, i]
                     )
+            shares[0], shares[1], shares[2] = modes.half * (1.0 - share), modes.half * share, modes.half
             kick[:] = 0.0
             for j in range(n):
-                later = modes.half * share * q[b, k, j]
-                now = modes.half * q[b, k, j] - later
+                now, later = shares[0] * q[b, k, j], shares[1] * q[b, k, j]
                 left, right = change[b, part, j], change[b, part + 1, j]
                 for i in range(n):
                     kick[i] += now * left[i] + later * right[i]
             if damped:
                 for j in range(n):
-                    loss, row = modes.half * speed[b, k, j], modes.damping[j]
+                    loss, row = shares[2] * speed[b, k, j], modes.damping[j]
                     for i in range(n):
                         kick[i] += loss * row[i]
             for i in range(n):
@@ -116,7 +118,8 @@ def answer(
     batch, n, n_gen = powers.shape
     n_fine, n_out = given.offset.shape[1], weights.last.shape[1]
     n_in, width = weights.first.shape[2], weights.first.shape[1] // 3
-    omega, p_slack, update = np.empty((n_fine, n_gen)), np.empty(n_fine), np.empty((n, n_gen))
+    omega, p_slack = np.empty((n_fine, n_gen), np.float32), np.empty(n_fine, np.float32)
+    update = np.empty((n, n_gen))
     seen, out = np.empty((n_gen, n_in, n), np.float32), np.empty((n_gen, n_out, n), np.float32)
     hidden = np.empty((n_gen, width, n), np.float32)
     inner = np.empty((n_gen, width + 3 * MIXED, n), np.float32)
@@ -138,7 +141,9 @@ def answer(
 
 
 @compiled
-def _loss(p: Array, omega: Array, p_slack: Array, given: Given, b: int, units: Units, modes: Modes) -> float:
+def _loss(
+    p: Array, omega: Array32, p_slack: Array32, given: Given, b: int, units: Units, modes: Modes
+) -> float:
     """Cost as a part of the static dispatch's, and the penalty; see `ScheduleLoss`."""
     cost, penalty, (n, n_gen), n_fine = 0.0, 0.0, p.shape, len(p_slack)
     for j in range(n):
@@ -158,12 +163,12 @@ def _loss(p: Array, omega: Array, p_slack: Array, given: Given, b: int, units: U
 
 @compiled
 def _respond(
-    powers: Array, given: Given, b: int, units: Units, modes: Modes, omega: Array, p_slack: Array
+    powers: Array, given: Given, b: int, units: Units, modes: Modes, omega: Array32, p_slack: Array32
 ) -> None:
     """What a schedule does: ω (n_fine, n_gen) and P_s (n_fine,); see `PathModel.respond`."""
     (n, n_gen), n_fine = powers.shape, len(p_slack)
-    fine, force = (n_fine - 1) // (n - 1), np.empty((1, n_fine, n_gen))
-    q, speed, p_fine = np.empty(force.shape), np.empty(force.shape), np.empty(omega.shape)
+    fine, force = (n_fine - 1) // (n - 1), np.empty((1, n_fine, n_gen), np.float32)
+    q, speed, p_fine = np.empty_like(force), np.empty_like(force), np.empty_like(omega)
     for j in range(n - 1):
         for i in range(fine):
             share = i / fine
@@ -236,7 +241,9 @@ def _stage(
 
 
 @compiled
-def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: Units, update: Array) -> None:
+def _correct(
+    powers: Array, out: Array32, p_slack: Array32, static: Array, units: Units, update: Array
+) -> None:
     """Correct a schedule as a stage says, and follow it within its limits; `update` receives the change."""
     n, n_gen = powers.shape
     fine, turned = (len(p_slack) - 1) // (n - 1), np.empty((n, n_gen))
@@ -265,8 +272,8 @@ def _correct(powers: Array, out: Array32, p_slack: Array, static: Array, units: 
 def _see(
     powers: Array,
     update: Array,
-    omega: Array,
-    p_slack: Array,
+    omega: Array32,
+    p_slack: Array32,
     given: Given,
     b: int,
     units: Units,
@@ -328,14 +335,14 @@ def _difference(values: Array, found: Array) -> None:
 
 
 @compiled
-def _scale(values: Array, factor: float, offset: float, found: Array32) -> None:
+def _scale(values: Floats, factor: float, offset: float, found: Array32) -> None:
     """factor * values + offset."""
     for j in range(len(values)):
         found[j] = factor * values[j] + offset
 
 
 @compiled
-def _squash(values: Array, factor: float, offset: float, below: Array32, found: Array32) -> None:
+def _squash(values: Floats, factor: float, offset: float, below: Array32, found: Array32) -> None:
     """factor * values + offset, to (-1, 1); `below` is overwritten."""
     _scale(values, factor, offset, found)
     for j in range(len(values)):

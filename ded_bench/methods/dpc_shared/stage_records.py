@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ded_bench.problem.case import Array
 
 Array32 = NDArray[np.float32]
+#: Of either precision.
+Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int_]
 
 #: Hidden channels of each kind that are averaged over other generators.
@@ -31,8 +33,8 @@ SMALLEST_COST = 0.05
 class Modes(NamedTuple):
     """The grid in modal coordinates; see `GridResponse`."""
 
-    step: Array  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
-    damping: Array  # what is left of it, (n_modes, n_modes), 1/s
+    step: Floats  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
+    damping: Floats  # what is left of it, (n_modes, n_modes), 1/s
     half: float  # half the spacing of fine points, s
     instants: Indices  # fine points at which stiffness changes are given, (n_instants,)
 
@@ -51,8 +53,8 @@ class Units(NamedTuple):
     compliance: Array
     by_stiffness: Array32
     by_compliance: Array32
-    gain: Array  # see `GridResponse`, as the next
-    shape: Array
+    gain: Array32  # see `GridResponse`, as the next
+    shape: Array32
 
 
 class Given(NamedTuple):
@@ -61,11 +63,11 @@ class Given(NamedTuple):
     cost: Array  # (slack, generators), in means of all, (batch, 1 + n_gen)
     static: Array  # (batch, n_gen, n_knots), pu, as the next
     fixed: Array
-    offset: Array  # see `Linear`: (batch, n_fine, n_gen), pu
-    slack: Array  # (batch, n_fine), pu
-    leverage: Array  # what a mode takes from the slack, (batch, n_fine, n_modes), pu/rad
-    change: Array  # (batch, n_instants, n_modes, n_modes)
-    state: Array  # (batch, 2, n_modes)
+    offset: Array32  # see `Linear`: (batch, n_fine, n_gen), pu
+    slack: Array32  # (batch, n_fine), pu
+    leverage: Array32  # what a mode takes from the slack, (batch, n_fine, n_modes), pu/rad
+    change: Array32  # (batch, n_instants, n_modes, n_modes), 1/s²
+    state: Array32  # (batch, 2, n_modes)
     constant: Array32  # of each generator, (batch, n_gen, n_constant)
     scale: Array  # mean cost of the static dispatch, in means of all costs, (batch,)
 

@@ -73,8 +73,8 @@ def units_of(model: PathModel) -> Units:
         compliance=response.compliance,
         by_stiffness=_others(response.stiffness),
         by_compliance=_others(response.compliance),
-        gain=response.gain,
-        shape=response.shape,
+        gain=response.gain.astype(np.float32),
+        shape=response.shape.astype(np.float32),
     )
 
 
@@ -144,7 +144,10 @@ class CompiledNetwork:
             last=layer["last"],
             last_bias=layer["last_bias"],
         )
-        self._model, self._units = model, units_of(model)
+        self._model, self._units, modes = model, units_of(model), model.modes
+        self._modes = modes._replace(
+            step=modes.step.astype(np.float32), damping=modes.damping.astype(np.float32)
+        )
         self._dilations = np.array(dilations_of(model.spacing))
 
     def __call__(self, outset: Outset, linear: Linear) -> Array:
@@ -154,14 +157,14 @@ class CompiledNetwork:
             cost=cost,
             static=np.ascontiguousarray(outset.static.swapaxes(1, 2)),
             fixed=np.ascontiguousarray(outset.fixed[:, ::FINE].swapaxes(1, 2)),
-            offset=linear.offset,
-            slack=linear.slack,
-            leverage=self._model.slack_stiffness(linear) @ self._model.response.shape.T,
-            change=linear.change,
-            state=outset.state,
+            offset=linear.offset.astype(np.float32),
+            slack=linear.slack.astype(np.float32),
+            leverage=self._model.slack_stiffness(linear).astype(np.float32) @ self._units.shape.T,
+            change=linear.change.astype(np.float32),
+            state=outset.state.astype(np.float32),
             constant=np.ascontiguousarray(constant.swapaxes(1, 2), np.float32),
             scale=static_cost(outset) / np.maximum(outset.problems.cost.mean(axis=1), FREE),
         )
         powers = outset.start.copy()
-        answer(powers, given, self._units, self._model.modes, self._dilations, self._weights)
+        answer(powers, given, self._units, self._modes, self._dilations, self._weights)
         return powers

@@ -235,8 +235,7 @@ class UnrolledNetwork(nn.Module):
         s, model, view = self.scales, self.model, self.view(outset)
         powers = torch.as_tensor(outset.start, dtype=torch.float32)
         p = powers.permute(2, 1, 0)
-        x = model.respond(outset.start, outset, model.nominal(outset))[0]
-        linear = model.linearise(outset, x)
+        linear = model.linearise(outset, model.start_path(outset))
         _, omega, p_slack = Respond.apply(powers, model, outset, linear)  # type: ignore[no-untyped-call]
         memory, update = p.new_zeros(N_MEMORY, *p.shape), torch.zeros_like(p)
         found = []
@@ -252,7 +251,7 @@ class UnrolledNetwork(nn.Module):
             powers = p.permute(2, 1, 0)
             if number == len(self.stages):
                 x = model.respond(powers.detach().numpy().astype(np.float64), outset, linear)[0]
-                linear = model.linearise(outset, x)
+                linear = model.along(outset, x)
             _, omega, p_slack = Respond.apply(powers, model, outset, linear)  # type: ignore[no-untyped-call]
             found.append((powers, omega, p_slack))
         return found

@@ -19,7 +19,7 @@ STAMP   := .venv/installed
 
 # How many instances slow methods answer, on one case or on all others; 0: none. A smaller LIMIT comes first.
 # Full DED: by Euler steps on 9bus, as in the paper; elsewhere by Radau collocation, and by Euler to compare.
-# DED-KO over all points refuses 140bus: its program would take 15 GiB. Radau collocation would take 30 there.
+# DED-KO over all points and Radau collocation refuse 140bus: their programs would take 15 and 13 GiB by estimate.
 LIMIT_ded              ?= 0
 LIMIT_ded_9bus         ?= all
 LIMIT_ded_two-area     ?= 10

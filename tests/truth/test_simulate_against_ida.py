@@ -13,11 +13,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.optimize import root
 from sksundae.ida import IDA
 
 from ded_bench.files.strict import parse_record
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
@@ -86,7 +87,7 @@ class Reference:
         return out
 
     def equilibrium(self, p_gen: np.ndarray, p_load: np.ndarray) -> np.ndarray:
-        """y with the angles that serve the given powers, and ω = 0."""
+        """y with the angles that serve the given powers, near those of the linear power flow, and ω = 0."""
         angles = [*range(self.n), *range(2 * self.n, self.size)]
         wanted = self.wanted(p_gen, p_load)
 
@@ -97,11 +98,14 @@ class Reference:
 
         answer = root(
             lambda theta: (np.array(self.flows(full(theta))[0]) - wanted)[angles],
-            np.zeros(len(angles)),
+            np.linalg.solve(self.stiffness(np.zeros(self.size))[np.ix_(angles, angles)], wanted[angles]),
             tol=1e-13,
         )
         assert np.abs(answer.fun).max() < 1e-11
-        return full(answer.x)
+        y = full(answer.x)
+        # Beyond a right angle on some line the grid may rest, too, but not stay there.
+        assert (np.linalg.eigvalsh(self.stiffness(y)[np.ix_(angles, angles)]) > 0).all()
+        return y
 
     def consistent_slopes(self, y: np.ndarray, power: list[float], rate: list[float]) -> np.ndarray:
         """y' from the swing equation, and from d/dt of the load equations."""
@@ -193,6 +197,14 @@ def calm(instance: Instance, omega: float) -> Instance:
     return parse_record(Instance, json.dumps(data), "calm")
 
 
+def early(instance: Instance, horizon_s: float) -> Instance:
+    """Load ramps that begin and end soon, at none of the grid's points, and a shorter horizon."""
+    data = json.loads(instance.model_dump_json(by_alias=True)) | {"horizon_s": horizon_s}
+    for ramp in data["load"].values():
+        ramp["start"], ramp["duration"] = 0.5031, 1.7
+    return parse_record(Instance, json.dumps(data), "short")
+
+
 def straight(case: Case, instance: Instance) -> Schedule:
     """From P_0 to the middle of the limits: no kink at all."""
     ends = np.stack([instance.p_initial(case), 0.5 * (case.p_min + case.p_max)])
@@ -225,13 +237,23 @@ def test_smooth_and_fifty_knot_schedules(case_file, case):
         compare(case_file, instance, schedule, simulate(case, instance, schedule))
 
 
+@pytest.mark.parametrize(
+    ("name", "horizon_s"), [("two-area", 12.0), ("39bus", 6.0), ("68bus", 3.0), ("140bus", 1.5)]
+)
+def test_physical_grids(name, horizon_s):
+    """Loads ramp, and all powers go up and down at nine tenths of their ramp limits."""
+    file = SHIPPED_CASES / name / "case.json"
+    case = Case.load(file)
+    instance = early(sample_instance(case, 60, 1), horizon_s)
+    thirds = np.linspace(0.0, horizon_s, 4)
+    p = instance.p_initial(case) + 0.3 * horizon_s * np.outer([0.0, 1.0, 0.0, 1.0], case.ramp)
+    schedule = Schedule(t=thirds, p=p)
+    compare(file, instance, schedule, simulate(case, instance, schedule))
+
+
 def test_bang_bang_schedule(case_file, case):
     """A kink at every single grid point: a schedule that an optimiser in a corner would give."""
-    data = json.loads(sample_instance(case, 60, 1).model_dump_json(by_alias=True))
-    data["horizon_s"] = 6.0
-    for ramp in data["load"].values():
-        ramp["start"], ramp["duration"] = 0.5031, 1.7
-    instance = parse_record(Instance, json.dumps(data), "short")
+    instance = early(sample_instance(case, 60, 1), 6.0)
     schedule = bang_bang(case, instance)
     kinks = np.abs(np.diff(schedule.p, n=2, axis=0)).min(axis=0)
     assert (kinks > 0).all()

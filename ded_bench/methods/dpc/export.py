@@ -22,7 +22,7 @@ def network_of(policy: DispatchPolicy) -> StagedNetwork:
 
 
 def export(policy: DispatchPolicy, path: Path) -> None:
-    """Write the network (channels in, powers at the knots out)."""
+    """Write the network (channels in, powers at the knots out), without the `BoundKeeper` that follows it."""
     case = policy.scope.case
     n_sequence, n_constants = n_channels(case)
     widths = len(case.generators), policy.response.n_outputs, n_sequence

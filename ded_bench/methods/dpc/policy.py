@@ -1,6 +1,7 @@
 """DED-DPC (`ded-dpc`): a network looks at what a schedule would do and corrects it, in stages.
 
-Bounds, ramps and P_0 hold for any weights.
+Where the result would still exceed the bound on |ω|, the least change that mends it follows. Bounds, ramps
+and P_0 hold for any weights.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.dpc.bound_keeper import BoundKeeper
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.response import Response
@@ -67,6 +69,10 @@ class DispatchPolicy:
     def _compiled(self) -> CompiledStages:
         return CompiledStages(self.scope.case, self.response, self.weights, tuple(self.training["dilations"]))
 
+    @functools.cached_property
+    def _keeper(self) -> BoundKeeper:
+        return BoundKeeper.make(self.scope.case, self.scope.regime, self.knots)
+
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
 
@@ -82,12 +88,16 @@ class DispatchPolicy:
     def powers(self, inputs: Inputs, threads: int = 1) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
         if len(inputs) <= CHUNK:
-            return self._compiled(self.channels(inputs))
+            return self._keeper(inputs, self.network_powers(inputs))
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
         if threads == 1:
             return np.concatenate([self.powers(part) for part in parts])
         with ThreadPoolExecutor(threads) as pool:
             return np.concatenate(list(pool.map(self.powers, parts)))
+
+    def network_powers(self, inputs: Inputs) -> Array:
+        """What the network alone answers, as `powers`."""
+        return self._compiled(self.channels(inputs))
 
     def channels(self, inputs: Inputs) -> Channels:
         """What the network reads of instances."""

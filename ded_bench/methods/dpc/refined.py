@@ -51,7 +51,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         started = time.perf_counter()
         inputs = Inputs.of(case, [instance])
         schedule = Schedule(policy.knots, refiner(inputs, policy.powers(inputs), steps)[0])
-        schedule.at(instance.grid)
         elapsed = time.perf_counter() - started
         return Solution(Status.POLICY, schedule, steps, solve_s=elapsed, solver_version=VERSION)
 

@@ -1,0 +1,114 @@
+"""The last step of `ded-dpc`: where |ω| would exceed its bound, the least change of powers that mends it.
+
+The linearised grid tells what a schedule does to ω between the knots too, within a hundredth of the bound
+of what the true system does (docs/model.md). Only where |ω| comes nearer than that to the bound is anything
+changed: damped Gauss-Newton steps lead the powers to where ω stays below. Each passes through the follower,
+so that bounds, ramps and P_0 hold after any number of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ded_bench.koopman.condensed import CondensedRollout
+from ded_bench.koopman.linear import linear_model
+from ded_bench.methods.dpc.inputs import Inputs
+from ded_bench.methods.dpc.kernels import OmegaModel, predict
+from ded_bench.methods.ramp_follower import follow
+from ded_bench.problem.case import Array, Case
+from ded_bench.truth.network import Network
+
+#: Points at which ω is looked at, for each interval between knots.
+PARTS = 10
+#: The bound is tightened by this fraction, the error of the linearisation; from t = 0, where the state is
+#: given and nothing can be changed, it grows to that over one interval.
+MARGIN = 0.01
+#: Steps aim below the tightened bound by this fraction of it, so that few of them are needed.
+AIM = 0.003
+#: Steps are damped by this part of the most that powers can do to ω at one point (squares, summed over them).
+DAMPING = 0.1
+#: Most steps; on validation instances one to four, hardly ever more than ten.
+STEPS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class BoundKeeper:
+    """Changes schedules that would take |ω| beyond its bound."""
+
+    case: Case
+    model: OmegaModel
+    spacing_s: float  # of the points
+    limit: Array  # of |ω| at the points, (n_points,), rad/s
+    of_power: Array  # ω at the points by powers at the knots, (n_gen, n_points, n_knots, n_gen), rad/s per pu
+    damping: float  # of steps, (rad/s per pu)²
+    step: Array  # largest change of power between two knots, (n_gen,), pu
+
+    @staticmethod
+    def make(case: Case, regime: str, knots: Array) -> BoundKeeper:
+        """Condense the linearisation at the nominal point; knots are equidistant."""
+        n_gen = len(case.generators)
+        points = np.linspace(knots[0], knots[-1], PARTS * (len(knots) - 1) + 1)
+        linear = linear_model(case, float(points[1]))
+        of_change = linear.g - linear.b
+        model = OmegaModel(
+            linear.k,
+            np.ascontiguousarray(linear.lift[:, len(case.buses) + Network(case).generators]),
+            np.ascontiguousarray(of_change[:, :n_gen]),
+            np.ascontiguousarray(of_change[:, n_gen:]),
+        )
+        gamma = CondensedRollout.make(case, linear, points, knots).gamma[:n_gen]
+        of_power = gamma.reshape(n_gen, len(points), len(knots), n_gen)
+        limit = case.omega_bound(regime) * (1.0 - MARGIN * np.minimum(points / knots[1], 1.0))
+        damping = DAMPING * float((of_power[:, :, 1:] ** 2).sum(axis=(2, 3)).max())
+        step = case.ramp * (knots[1] - knots[0])
+        return BoundKeeper(case, model, float(points[1]), limit, of_power, damping, step)
+
+    def __call__(self, inputs: Inputs, p_gen: Array) -> Array:
+        """Schedules that keep the bound, as far as the linearised grid tells and the limits let them.
+
+        Args:
+            inputs: the instances.
+            p_gen: powers at the knots, (batch, n_knots, n_gen), pu, within bounds and ramps.
+
+        Returns:
+            As `p_gen`; the same where nothing is exceeded.
+        """
+        by_generator = np.ascontiguousarray(p_gen.swapaxes(1, 2))
+        omega = np.empty((*by_generator.shape[:2], len(self.limit)))
+        if not predict(
+            inputs.load, inputs.state, by_generator, self.model, self.limit, self.spacing_s, omega
+        ):
+            return p_gen
+        kept = p_gen.copy()
+        for b in np.flatnonzero((np.abs(omega) > self.limit).any(axis=(1, 2))):
+            kept[b] = self._mended(omega[b], p_gen[b])
+        return kept
+
+    def _mended(self, omega: Array, p_gen: Array) -> Array:
+        """The schedule, of all that the steps lead to, whose squared excess is least.
+
+        Args:
+            omega: at the points, (n_gen, n_points), rad/s.
+            p_gen: powers at the knots, (n_knots, n_gen), pu.
+        """
+        aim, best, least = (1.0 - AIM) * self.limit, p_gen, self._excess(omega)
+        tried, now = p_gen, omega
+        damping = self.damping * np.eye(p_gen[1:].size)
+        for _ in range(STEPS):
+            if least == 0.0:
+                break
+            g, k = np.nonzero(np.abs(now) > aim)
+            rows = self.of_power[g, k, 1:].reshape(len(g), -1) * np.sign(now[g, k])[:, None]
+            excess = np.abs(now[g, k]) - aim[k]
+            change = np.linalg.solve(rows.T @ rows + damping, rows.T @ excess)
+            targets = np.clip(tried[1:] - change.reshape(tried[1:].shape), self.case.p_min, self.case.p_max)
+            tried = follow(targets[None], tried[:1], self.step)[0]
+            now = omega + np.tensordot(self.of_power, tried - p_gen, 2)
+            if (left := self._excess(now)) < least:
+                best, least = tried, left
+        return best
+
+    def _excess(self, omega: Array) -> float:
+        return float((np.maximum(np.abs(omega) - self.limit, 0.0) ** 2).sum())

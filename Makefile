@@ -45,6 +45,7 @@ SCENARIOS_ded-ko       ?= 0
 SCENARIOS_ded-slp_9bus ?= 5
 SCENARIOS_sweep        ?= 10
 SCENARIOS_period       ?= 5
+SCENARIOS_real-time    ?= 4
 
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
 MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)
@@ -105,7 +106,8 @@ train-ko: $(STAMP)  ## identify the Koopman model from simulated trajectories
 solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in all regimes (SPLIT=all: all instances)
 	$(call SOLVE,ed, --settings '*')
 	$(call SOLVE,$(BASELINES))
-	$(if $(filter 9bus,$(CASE)),$(call SOLVE,ded, --settings accelerated))
+	$(if $(filter 9bus,$(CASE)),$(call SOLVE,ded, --settings accelerated),$(call \
+	  SOLVE,ded-ko-knots, --settings real-time --model trajectory))
 
 radau: train-ko  ## full DED by Radau collocation: the accurate reference
 	$(DED) solve --method ded-radau $(CHOICE)
@@ -160,6 +162,7 @@ online: train-ko  ## the closed loop: all methods at their own latency, then swe
 	  OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
 	$(call OPERATE,ded-ko-knots) $(KNOTS)
 	$(call OPERATE,ded-ko-knots) $(KNOTS) --latency 0 --forecast perfect
+	$(if $(SURROGATE),$(call OPERATE,ded-ko-knots,real-time) --settings real-time $(SURROGATE) --period 0.1)
 	$(foreach m,$(OPERATED),$(call OPERATE,$m,period) --period 0.1$(NEWLINE))
 	$(call OPERATE,ded-ko-knots,period) $(KNOTS) --period 0.1
 	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency $(LATENCIES)

@@ -136,6 +136,7 @@ METHODS: dict[str, Method] = {
                 ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
                 ("receding", "ded_bench.methods.receding_knots"),
                 ("receding-wide", "ded_bench.methods.receding_knots"),
+                ("real-time", "ded_bench.methods.real_time_knots"),
             ),
         ),
         Method(

@@ -20,6 +20,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import Surrogate, find_surrogate
 from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.memory import too_large
 from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
@@ -45,8 +46,8 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
 PYOMO_ENTRIES = 1_000_000
 #: Limit of the arrays' programs where none is given: HiGHS, the last resort, knows no end on large grids.
 TIME_LIMIT_S = 1800.0
-#: Memory that a program takes for each entry of its equations (39bus), and may take in all.
-BYTES_PER_ENTRY, MAX_BYTES = 150, 4 * 2**30
+#: Bytes that a program takes for each entry of its equations: as arrays (39bus), as a Pyomo model (two-area).
+ARRAYS_BYTES, PYOMO_BYTES = 150, 1000
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -88,9 +89,9 @@ def _array_solver(case: Case, surrogate: Surrogate, regime: str, settings: Setti
 
     def solve(instance: Instance) -> Solution:
         points = np.arange(instance.steps + 1)
-        if (needed := BYTES_PER_ENTRY * _entries(case, surrogate, instance.steps)) > MAX_BYTES:
-            problem = f"the program of {len(points)} points would take {needed / 2**30:.0f} GiB"
-            return Solution(Status.FAILED, error=f"{problem}; `ded-ko-knots` takes fewer")
+        needed = ARRAYS_BYTES * _entries(case, surrogate, instance.steps)
+        if refusal := too_large(needed, f"the program of {len(points)} points", "`ded-ko-knots` takes fewer"):
+            return refusal
         limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
         # Softly, since one widening for all of thousands of intervals would be a dense column.
         solution = solve_on_surrogate(case, surrogate, instance, regime, points, limit_s, soft=True)
@@ -111,6 +112,9 @@ def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings)
 
     def solve(instance: Instance) -> Solution:
         koopman.check_step(instance)
+        needed = PYOMO_BYTES * _entries(case, koopman, instance.steps)
+        if refusal := too_large(needed, "the Pyomo model", "the default settings make arrays instead"):
+            return refusal
         started = time.perf_counter()
         program = _Program(case, koopman.fingerprint, instance.steps, koopman)
         model = _built(program)

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.collocation import POINTS
+from ded_bench.methods.memory import too_large
 from ded_bench.methods.radau_program import RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.status import Status
 from ded_bench.truth.network import Network
 
 #: Mean length of an element: at most `length_s`, and at most a part of the period of the grid's fastest mode.
@@ -32,10 +32,10 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "500ms": {"length_s": 0.5},
     "1s": {"length_s": 1.0},
 }
-#: Memory that IPOPT takes for an entry of `program_bytes`, and may take in all. Measured as the peak of a
+#: Memory that IPOPT takes for an entry of `program_bytes`. Measured as the peak of a
 #: process that solves one instance in TO, less what imports take: 21 bytes on 39bus (0.7 GiB in all), 13 on
 #: 68bus (1.4 GiB); on 9bus and two-area over 90, but 0.3 GiB in all. Larger grids are extrapolated.
-BYTES_PER_ENTRY, MAX_BYTES = 20, 4 * 2**30
+BYTES_PER_ENTRY = 20
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -46,9 +46,9 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         elements = element_count(case, instance, length_s)
-        if (needed := program_bytes(case, elements)) > MAX_BYTES:
-            problem = f"the program of {elements} elements would take {needed / 2**30:.0f} GiB"
-            return Solution(Status.FAILED, error=f"{problem}; `ded-slp` takes less")
+        needed = program_bytes(case, elements)
+        if refusal := too_large(needed, f"the program of {elements} elements", "`ded-slp` takes less"):
+            return refusal
         ends = element_ends(instance, elements)
         program = _program(case, elements)
         numbers = program.numbers(instance, regime, ends)

@@ -85,7 +85,7 @@ def _start(m: pyo.ConcreteModel, case: Case, instance: Instance) -> None:
 def _add_dynamics(m: pyo.ConcreteModel, case: Case, instance: Instance, length: dict[int, float]) -> None:
     """The swing equations at the points, the power flow there and at t = 0; lengths in s."""
     network, points = Network(case), collocation_points(m)
-    injection = injections(m, case, network)
+    injection = injections(m, m.tau, case, network)
     times = np.append(0.0, np.cumsum(list(length.values())))
     at = {0.0: 0.0} | {tau: times[e - 1] + c * length[e] for tau, (e, c) in points.items()}
     load = instance.p_load(case)

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.methods import ded
+from ded_bench.methods.memory import too_large
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
 from ded_bench.problem.case import Array, Case
@@ -36,6 +37,8 @@ from ded_bench.truth.network import Network, PowerFlowError
 TOLERANCE = 1e-8
 #: A sequence that is longer does not converge.
 MAX_PROGRAMS = 10
+#: Memory for each entry of the stiffness of all points: 28 bytes on 39bus, as the peak of a process.
+BYTES_PER_ENTRY = 28
 #: This setting of `ded` has no options.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"accelerated": {}}
 
@@ -48,6 +51,9 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
 
 def _solve(case: Case, regime: str, settings: Settings, instance: Instance) -> Solution:
     """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
+    needed = BYTES_PER_ENTRY * (instance.steps + 1) * len(case.buses) ** 2
+    if refusal := too_large(needed, "the sequence of programs", "`ded-slp` takes less"):
+        return refusal
     started = time.perf_counter()
     programs = _programs(case, regime, instance.steps, instance.dt_s)
     build_s = time.perf_counter() - started

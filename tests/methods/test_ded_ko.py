@@ -14,7 +14,7 @@ from ded_bench.koopman.instance_model import model_along
 from ded_bench.koopman.linear import linear_model, nominal_model
 from ded_bench.koopman.model import Koopman
 from ded_bench.koopman.surrogates import find_surrogate
-from ded_bench.methods import ded_ko, ded_ko_knots
+from ded_bench.methods import ded_ko
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
 from ded_bench.methods.solution import Settings
@@ -223,12 +223,3 @@ def test_arrays_are_the_pyomo_model(regime, ninebus: Case, monkeypatch: pytest.M
         found.append(solution)
     assert found[0].setup_s > found[1].setup_s == 0  # only a Pyomo model is compiled
     assert found[0].solver_objective == pytest.approx(found[1].solver_objective, rel=2e-7)
-
-
-def test_a_program_too_large_is_refused_at_once(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ded_ko, "PYOMO_ENTRIES", 0)
-    monkeypatch.setattr(ded_ko, "MAX_BYTES", 2**20)
-    for method, fits in ((ded_ko, False), (ded_ko_knots, True)):
-        solution = method.prepare(ninebus, "NO", Settings(model="linear"))(short(ninebus, 0))
-        assert (solution.status == Status.OPTIMAL) == fits
-        assert fits or ("GiB" in solution.error and solution.schedule is None)

@@ -7,17 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ded_bench.methods import ded_radau
 from ded_bench.methods.collocation import BETWEEN, POINTS, WEIGHTS, differentiation, lagrange
-from ded_bench.methods.ded_radau import (
-    MAX_BYTES,
-    SETTINGS,
-    element_count,
-    element_ends,
-    element_length,
-    prepare,
-    program_bytes,
-)
+from ded_bench.methods.ded_radau import SETTINGS, element_count, element_ends, element_length, prepare
 from ded_bench.methods.ded_radau_model import build_ded_radau, collocation_points
 from ded_bench.methods.radau_program import RadauProgram
 from ded_bench.methods.solution import Settings
@@ -210,24 +201,3 @@ def test_impossible_instances_and_time_limits_are_reported_as_such(threebus: Cas
     assert solution.error
     solution = prepare(threebus, "TO", Settings(time_limit_s=1e-4))(instance)
     assert solution.status == Status.TIME_LIMIT
-
-
-@pytest.mark.parametrize("name", ["9bus", "two-area", "39bus", "68bus", "140bus"])
-def test_a_program_too_large_is_refused_at_once(name: str) -> None:
-    """By the size of the grid; 140 buses are too many."""
-    case = Case.load(name)
-    instance = sample_instance(case, 77, 0)
-    elements = element_count(case, instance, element_length(case, **SETTINGS["default"]))
-    assert (program_bytes(case, elements) > MAX_BYTES) == (name == "140bus")
-    if name == "140bus":
-        solution = prepare(case, "NO", Settings())(instance)
-        assert (solution.status, solution.schedule) == (Status.FAILED, None)
-        assert "GiB" in solution.error
-
-
-def test_what_is_not_too_large_is_solved(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    instance = short(case, 0)
-    needed = program_bytes(case, element_count(case, instance, 0.1))
-    for limit, status in ((needed - 1, Status.FAILED), (needed, Status.OPTIMAL)):
-        monkeypatch.setattr(ded_radau, "MAX_BYTES", limit)
-        assert prepare(case, "NO", Settings(name="default"))(instance).status == status

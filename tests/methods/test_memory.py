@@ -1,0 +1,64 @@
+"""Programs too large for a worker's memory are refused by their size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from ded_bench.koopman.linear import linear_model
+from ded_bench.methods import ded, ded_ko, ded_radau, ded_sequential, memory
+from ded_bench.methods.solution import Settings, Solver
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.solvers.status import Status
+
+
+def on_linear(case: Case, regime: str, settings: Settings) -> Solver:
+    return ded_ko.prepare_with(case, linear_model(case), regime, settings)
+
+
+PREPARED: list[Any] = [
+    pytest.param(ded.prepare, "default", {"68bus", "140bus"}, id="ded"),
+    pytest.param(ded_sequential.prepare, "accelerated", {"140bus"}, id="accelerated"),
+    pytest.param(ded_radau.prepare, "default", {"140bus"}, id="ded-radau"),
+    pytest.param(on_linear, "default", {"140bus"}, id="ded-ko"),
+    pytest.param(on_linear, "highs", {"68bus", "140bus"}, id="ded-ko-highs"),
+    pytest.param(on_linear, "ipopt", {"68bus", "140bus"}, id="ded-ko-ipopt"),
+]
+Prepare = Callable[[Case, str, Settings], Solver]
+
+
+@pytest.mark.parametrize(("prepare", "settings", "refused"), PREPARED)
+def test_what_is_too_large_is_refused(prepare: Prepare, settings: str, refused: set[str]) -> None:
+    """By the size of the grid and of the horizon, before anything is made."""
+    for name in refused:
+        case = Case.load(name)
+        solution = prepare(case, "NO", Settings(settings))(sample_instance(case, 77, 0))
+        assert (solution.status, solution.schedule) == (Status.FAILED, None)
+        assert "GiB" in solution.error
+
+
+@pytest.mark.parametrize(("prepare", "settings", "refused"), PREPARED)
+def test_what_is_small_enough_is_solved(
+    prepare: Prepare, settings: str, refused: set[str], threebus: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instance = sample_instance(threebus, 77, 0).model_copy(update={"horizon_s": 1.0})
+    solve = prepare(threebus, "NO", Settings(settings))
+    assert solve(instance).status == Status.OPTIMAL
+    monkeypatch.setattr(memory, "MAX_BYTES", 1000)
+    assert solve(instance).status == Status.FAILED
+
+
+def test_what_the_reference_runs_hold_is_allowed() -> None:
+    """`ded` on two-area and 39bus, `ded-radau` on 68bus."""
+    for name in ("two-area", "39bus"):
+        case = Case.load(name)
+        assert ded.program_bytes(case, sample_instance(case, 77, 0)) <= memory.MAX_BYTES
+    case = Case.load("68bus")
+    instance = sample_instance(case, 77, 0)
+    elements = ded_radau.element_count(
+        case, instance, ded_radau.element_length(case, **ded_radau.SETTINGS["default"])
+    )
+    assert ded_radau.program_bytes(case, elements) <= memory.MAX_BYTES

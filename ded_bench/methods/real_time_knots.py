@@ -27,8 +27,9 @@ from typing import Any
 import numpy as np
 
 from ded_bench.koopman.instance_model import model_along
-from ded_bench.koopman.surrogates import Surrogate, find_surrogate
-from ded_bench.koopman.trajectory import Indices, TrajectoryModel
+from ded_bench.koopman.planned_trajectory import simulate_plan
+from ded_bench.koopman.surrogates import TRAJECTORY, Surrogate, find_surrogate
+from ded_bench.koopman.trajectory import Indices, TrajectoryModel, linearise_along
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
@@ -67,25 +68,31 @@ def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
     case.check_regimes([regime])
     surrogate = find_surrogate(case, settings.model, settings.search)
-    return RealTimeSolver(case, surrogate, regime, **SETTINGS[settings.name])
+    limit_s = np.inf if settings.time_limit_s is None else settings.time_limit_s
+    return RealTimeSolver(case, surrogate, regime, limit_s=limit_s, **SETTINGS[settings.name])
 
 
 class SoftProgram(KnotProgram):
     """The program around one trajectory with a priced excess of |ω| in every interval."""
 
-    def solve_soft(self, limits: set[Limit]) -> FormAnswer:
+    def solve_soft(self, limits: set[Limit], deadline: float) -> FormAnswer:
         """Solve with |ω| limited softly at all knots and at the points chosen.
+
+        Args:
+            limits: the points, by generator.
+            deadline: on the clock of `time.perf_counter`.
 
         Returns:
             As `KnotProgram.solve`; the objective is not that of the plan alone.
         """
         rows = np.array(sorted(limits), dtype=int).reshape(-1, 2)
         form, order = self._relaxed_form(rows, True, PRICE)
-        answer = solve_form(form, np.inf, True, REGULARISATION, GAP, RESIDUAL)
+        left = deadline - time.perf_counter()
+        answer = solve_form(form, left, True, REGULARISATION, GAP, RESIDUAL)
         if answer.status == Status.FAILED:
-            answer = self._answer(form, np.inf)
+            answer = self._answer(form, deadline - time.perf_counter())
         if answer.status == Status.FAILED:
-            answer = solve_by_highs(form, np.inf)
+            answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
         if answer.status != Status.OPTIMAL:
             return answer
         x = np.empty(len(order))
@@ -101,6 +108,7 @@ class RealTimeSolver:
     surrogate: Surrogate
     regime: str
     margin: float  # part of the bound
+    limit_s: float = np.inf  # of a step
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve by two steps; the first, from the static dispatch, is `setup_s`."""
@@ -135,9 +143,9 @@ class RealTimeSolver:
         program = SoftProgram(case, instance, case.omega_bound(self.regime), model)
         built = time.perf_counter()
         limits = set() if last is None else program.near(model.omega)
-        answer, prediction, iterations = self._solved(program, limits)
+        answer, prediction, iterations = self._solved(program, limits, started + self.limit_s)
         if prediction is None:
-            return Solution(Status.FAILED, iterations=iterations, error=answer.message)
+            return Solution(answer.status, iterations=iterations, error=answer.message)
         exceeds = program.excess(prediction.omega) > OPEN * program.bound
         status = Status.INFEASIBLE if exceeds else Status.FEASIBLE
         return Solution(
@@ -157,7 +165,10 @@ class RealTimeSolver:
         wanted = self._within_ramps(instance, last, points)
         for p_gen in first_schedules(self.case, instance, wanted, points):
             try:
-                return model_along(self.case, self.surrogate, instance, p_gen, points)
+                if self.surrogate.kind != TRAJECTORY:
+                    return model_along(self.case, self.surrogate, instance, p_gen, points)
+                plan = Schedule(instance.grid[points], p_gen)
+                return linearise_along(self.case, simulate_plan(self.case, instance, plan), points)
             except SimulationError as error:
                 reason = error
         raise reason
@@ -174,11 +185,13 @@ class RealTimeSolver:
         return p_gen
 
     @staticmethod
-    def _solved(program: SoftProgram, limits: set[Limit]) -> tuple[FormAnswer, Prediction | None, int]:
+    def _solved(
+        program: SoftProgram, limits: set[Limit], deadline: float
+    ) -> tuple[FormAnswer, Prediction | None, int]:
         """The last answer, what it predicts, if anything, and iterations of all programs."""
         prediction, iterations = None, 0
         for _ in range(PROGRAMS):
-            answer = program.solve_soft(limits)
+            answer = program.solve_soft(limits, deadline)
             iterations += answer.iterations
             if answer.status != Status.OPTIMAL:
                 break

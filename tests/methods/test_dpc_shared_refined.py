@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,26 @@ def test_limits_that_cannot_hold_are_widened(ninebus: Case) -> None:
     assert answer.status == Status.OPTIMAL
     powers = tight.corrected(answer.x, widened=True)
     assert powers.shape == outset.start.shape
+
+
+def test_every_knot_is_corrected_where_fewer_corrections_have_no_solution(
+    ninebus: Case, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    policy, path = random_policy(ninebus), tmp_path / "p.safetensors"
+    policy.save(path)
+    solve = prepare(ninebus, policy.scope.regime, Settings(policy=path))
+    instance = short_instance(ninebus)
+    finest, sizes = solve(instance).schedule, []
+
+    def one_fails(form, **options):
+        sizes.append(len(form.cost))
+        answer = solve_form(form, **options)
+        return dataclasses.replace(answer, status=Status.FAILED) if len(sizes) == 1 else answer
+
+    monkeypatch.setattr(shared_refined, "solve_form", one_fails)
+    monkeypatch.setattr(shared_refined, "knots_between", lambda knots: len(knots) - 1)
+    np.testing.assert_array_equal(solve(instance).schedule.p, finest.p)
+    assert sizes[0] < sizes[1]
 
 
 def test_one_correction_for_so_many_knots() -> None:

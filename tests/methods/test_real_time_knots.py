@@ -85,3 +85,9 @@ def test_build_and_solution_times_are_those_of_one_step(ninebus: Case) -> None:
     parts = call.solution.build_s, call.solution.setup_s, call.solution.solve_s
     assert min(parts) > 0
     assert sum(parts) == pytest.approx(call.seconds, rel=0.2)
+
+
+def test_a_time_limit_is_kept(ninebus: Case) -> None:
+    settings = Settings("real-time", model="linear", time_limit_s=1e-4)
+    solution = get_method("ded-ko-knots").prepare(ninebus, "NO", settings)(sample_instance(ninebus, 77, 0))
+    assert (solution.status, solution.schedule) == (Status.TIME_LIMIT, None)

@@ -32,7 +32,7 @@ METHOD = "ded-dpc-shared-refined"
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {"learned": True}, "unlearned": {"learned": False}}
 #: Most paths along which the grid is linearised, and most programs around each.
 PATHS, PROGRAMS = 4, 2
-#: Time from one correction to the next, at most, s.
+#: Time from one correction to the next, at most, s; where limits of |ω| cannot hold so, every knot has one.
 SPACING_S = 1.3
 #: By what part the bound is tightened, of what the fastest mode can rise between two fine points.
 MARGIN = 0.45
@@ -63,17 +63,29 @@ class Refiner:
         outset = model.outset(policy.problems([instance]))
         linear = model.linearise(outset, model.start_path(outset))
         answer = policy.answer(outset, linear) if self.learned else outset.start
-        iterations = 0
-        for start in (answer, outset.start) if self.learned else (answer,):
-            powers, needed = self._corrected(outset, linear, start)
+        apart, iterations = knots_between(policy.knots), 0
+        attempts = [(answer, knots) for knots in sorted({apart, 1}, reverse=True)]
+        attempts += [(outset.start, 1)] if self.learned else []
+        for start, knots in attempts:
+            powers, needed = self._corrected(outset, linear, start, knots, widen=knots == 1)
             iterations += needed
             if powers is not None:
                 return Schedule(policy.knots, powers[0]), iterations
         return Schedule(policy.knots, answer[0]), iterations
 
-    def _corrected(self, outset: Outset, linear: Linear, powers: Array) -> tuple[Array | None, int]:
-        """Corrected powers and iterations; None: a program has no solution that is found."""
-        model, knots, iterations = self.policy.model, knots_between(self.policy.knots), 0
+    def _corrected(
+        self, outset: Outset, linear: Linear, powers: Array, knots: int, widen: bool
+    ) -> tuple[Array | None, int]:
+        """Corrected powers and iterations; None: a program has no solution that is found.
+
+        Args:
+            outset: of one problem.
+            linear: along its first path.
+            powers: at the knots, (1, n_knots, n_gen), pu.
+            knots: from one correction to the next.
+            widen: where limits of |ω| cannot hold they are widened.
+        """
+        model, iterations = self.policy.model, 0
         limited: NDArray[np.bool_] | bool = False
         for number in range(PATHS):
             linear = model.along(outset, model.respond(powers, outset, linear)[0])
@@ -82,7 +94,7 @@ class Refiner:
                 break
             limited = limited | program.near(NEAR if number else FIRST)
             for _ in range(PROGRAMS):
-                found, needed = self._solved(program, limited)
+                found, needed = self._solved(program, limited, widen)
                 iterations += needed
                 if found is None:
                     return None, iterations
@@ -94,10 +106,10 @@ class Refiner:
         return powers, iterations
 
     @staticmethod
-    def _solved(program: PathProgram, limited: NDArray[np.bool_]) -> tuple[Array | None, int]:
-        """Corrected powers or None, and iterations; where limits of |ω| cannot hold they are widened."""
+    def _solved(program: PathProgram, limited: NDArray[np.bool_], widen: bool) -> tuple[Array | None, int]:
+        """Corrected powers or None, and iterations."""
         iterations = 0
-        for widened in (False, True):
+        for widened in (False, True) if widen else (False,):
             form = program.form(limited, widened)
             answer = solve_form(form, staged=True, regularisation=REGULARISATION, gap=GAP, residual=RESIDUAL)
             iterations += answer.iterations

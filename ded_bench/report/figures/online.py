@@ -117,8 +117,7 @@ def _sweep(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
 def _own(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
     handles = []
     for _, one in lines.iterrows():
-        of_period = f", every {one['period_s']:g} s" if one["period_s"] != 1.0 else ""
-        label = f"{plain(title(one['method'], one['settings']))}{of_period}"
+        label = f"{plain(title(one['method'], one['settings']))}{_how_often(one)}"
         handles += ax.plot(
             [one["latency_s"]],
             [one[name]],
@@ -131,6 +130,13 @@ def _own(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
             zorder=3,
         )
     return handles
+
+
+def _how_often(one: pd.Series) -> str:
+    """What to add to a method's name where its plans do not come every second."""
+    if one["period_s"] == 1.0:
+        return ""
+    return ", as soon as due" if one["latency_s"] > one["period_s"] else f", every {one['period_s']:g} s"
 
 
 class Operated(NamedTuple):

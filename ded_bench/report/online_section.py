@@ -84,7 +84,7 @@ EXPLANATION = (
     "Every scenario is operated for its whole length: every period, or when the last plan is due if that is "
     "later, a method gets the measured state and a forecast, and its plan takes effect after its latency, "
     "the median time of `timing.csv`. Cost is that of the true trajectory over the optimum of the "
-    "whole scenario with true loads (hindsight), which keeps the frequency bound: who exceeds it may cost less.",
+    "whole scenario with true loads (hindsight), which keeps the bound: who exceeds it may cost less.",
     "Largest excess: of any generator at any time over the bound, the mean over scenarios. Time outside: "
     "share of grid points with some generator more than 1e-6 Hz beyond the bound. Slack travel: Σ|ΔP_s|.",
     "Moved by unforeseen loads: how far loads that no plan in force knew of move the frequency of some "

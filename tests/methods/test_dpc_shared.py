@@ -336,6 +336,21 @@ def test_path_is_averaged_before_the_network_is_asked(ninebus: Case) -> None:
     np.testing.assert_allclose(swung.offset[:, FINE:-FINE], calm.offset[:, FINE:-FINE], atol=3e-3)
 
 
+@pytest.mark.parametrize("far", [np.inf, np.nan, 1e300])
+def test_a_path_without_end_is_not_served(case: Case, far: float) -> None:
+    """A schedule under which the linearised grid swings up: nothing is raised, and the others are served."""
+    model = path_model(case)
+    outset = drawn(model, 3)
+    slow = model.start_path(outset)
+    expected = model.linearise(outset, slow).offset
+    assert outset.served.all()
+    slow[1, 5:] = far
+    found = model.linearise(outset, slow)
+    np.testing.assert_array_equal(outset.served, [True, False, True])
+    assert all(np.isfinite(values).all() for values in dataclasses.astuple(found))
+    np.testing.assert_array_equal(found.offset[[0, 2]], expected[[0, 2]])
+
+
 def test_committed_weights_are_worth_having() -> None:
     """On a validation instance of two-area: limits are met, and NO costs less than static dispatch does."""
     case = Case.load("two-area")

@@ -11,6 +11,7 @@ from torch import Tensor
 from ded_bench.methods.dpc_shared.adjoint_kernels import follow_all, follow_all_adjoint, swing_adjoint
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
+from ded_bench.problem.case import Array
 
 
 class Respond(torch.autograd.Function):
@@ -21,7 +22,7 @@ class Respond(torch.autograd.Function):
         """See `PathModel.respond`; (batch, n_knots, n_gen) to two (batch, n_fine, n_gen), (batch, n_fine)."""
         ctx.model, ctx.linear = model, linear
         x, omega, p_slack = model.respond(powers.detach().numpy().astype(np.float64), outset, linear)
-        return tuple(torch.from_numpy(part.astype(np.float32)) for part in (x, omega, p_slack))
+        return tuple(map(_single, (x, omega, p_slack)))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
@@ -37,7 +38,13 @@ class Respond(torch.autograd.Function):
         for i in range(1, FINE):
             found[:, :-1] += (1 - i / FINE) * fine[:, i::FINE]
             found[:, 1:] += (i / FINE) * fine[:, i::FINE]
-        return torch.from_numpy(found.astype(np.float32)), None, None, None
+        return _single(found), None, None, None
+
+
+def _single(values: Array) -> Tensor:
+    """In single precision; where the linearised grid swings up without end, infinity."""
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(values.astype(np.float32))
 
 
 class FollowTargets(torch.autograd.Function):

@@ -99,7 +99,7 @@ def modules_of(module: str) -> set[str]:
         (
             "ded",
             "default",
-            r"koopman|truth\.(?!network|integrator)|methods\.(?!(ded|solution|solver_answer)$)",
+            r"koopman|truth\.(?!network|integrator)|methods\.(?!(ded|memory|solution|solver_answer)$)",
         ),
         ("ded-radau", "default", r"koopman|truth\.(?!network|integrator)|methods\.(ded$|ded_radau_model)"),
         ("ded-slp", "default", r"\.ac_|koopman\.(?!trajectory)|methods\.ded_(?!slp$)"),

@@ -33,7 +33,8 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "executable": {"solver": "ipopt-executable"},
 }
 #: Memory that model and solver take for each line and point: the peak of a process that solves one instance
-#: in TO, less what imports take, was 12 KB on two-area (1.2 GiB in all) and 11 KB on 39bus (3.6 GiB).
+#: in TO, less what imports take, was 12 KB on two-area (1.2 GiB in all) and 11 KB on 39bus (3.6 GiB). After
+#: several instances it is 4.2 GiB there.
 BYTES_PER_FLOW = 12_000
 
 

@@ -128,9 +128,10 @@ class PathModel:
                     outset.served[b] = follow_path(self.lines, angles, loads[b], *place, f[b], stiffness[b])
                 except np.linalg.LinAlgError:  # a singular Jacobian, or a path without end
                     outset.served[b] = False
-        bad = np.logical_not(outset.served)
-        f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
-        slow = np.where(bad[:, None, None], 0.0, slow)
+        if not outset.served.all():
+            bad = np.logical_not(outset.served)
+            f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
+            slow = np.where(bad[:, None, None], 0.0, slow)
         change = stiffness - response.stiffness
         rest = f - slow @ response.stiffness - outset.fixed[:, ::points]
         by_change = np.einsum("ns,bsng->bng", self.between[::points], slow[:, None] @ change)

@@ -206,38 +206,34 @@ def _stage(
     width, n_memory, zero = hidden.shape[1], out.shape[1] - CORRECTIONS, np.float32(0.0)
     own, change = np.dot(constant, weights.constant[s]), np.empty((width, n), np.float32)
     taps, pooled = np.empty((3 * width, n), np.float32), np.empty((MIXED, n), np.float32)
-    source = np.empty((2, n_gen, MIXED, n), np.float32)
+    source, nothing = np.empty((2, n_gen, MIXED, n), np.float32), np.zeros(width, np.float32)
     mean, flat = np.empty_like(source), (n_gen, MIXED * n)
     for g in range(n_gen):
         _convolve(weights.first[s], seen[g], 1, taps, hidden[g])
-        for o in range(width):
-            _add(weights.times[s, o], own[g, o], hidden[g, o])
+        _add(weights.times[s], own[g], hidden[g])
     for i in range(len(dilations)):
         pooled[:] = zero
         for g in range(n_gen):
             _convolve(weights.spread[s, i], hidden[g], dilations[i], taps, inner[g, :width])
-            for o in range(width):
-                _rectify(weights.spread_bias[s, i, o], inner[g, o])
-            source[0, g], source[1, g] = inner[g, :MIXED], inner[g, MIXED : 2 * MIXED]
-            for o in range(MIXED):
-                _add(inner[g, 2 * MIXED + o], zero, pooled[o])
+            _rectify(weights.spread_bias[s, i], inner[g, :width])
+            _copy(inner[g, :MIXED], source[0, g])
+            _copy(inner[g, MIXED : 2 * MIXED], source[1, g])
+            _add(inner[g, 2 * MIXED : 3 * MIXED], nothing, pooled)
         np.dot(units.by_stiffness, source[0].reshape(flat), mean[0].reshape(flat))
         np.dot(units.by_compliance, source[1].reshape(flat), mean[1].reshape(flat))
         pooled /= np.float32(n_gen)
         for g in range(n_gen):
-            inner[g, width : width + MIXED] = mean[0, g]
-            inner[g, width + MIXED : width + 2 * MIXED] = mean[1, g]
-            inner[g, width + 2 * MIXED :] = pooled
+            _copy(mean[0, g], inner[g, width : width + MIXED])
+            _copy(mean[1, g], inner[g, width + MIXED : width + 2 * MIXED])
+            _copy(pooled, inner[g, width + 2 * MIXED :])
             np.dot(weights.mix[s, i], inner[g], change)
-            for o in range(width):
-                _add(change[o], weights.mix_bias[s, i, o], hidden[g, o])
+            _add(change, weights.mix_bias[s, i], hidden[g])
     for g in range(n_gen):
-        for o in range(width):
-            _rectify(zero, hidden[g, o])
+        _rectify(nothing, hidden[g])
         np.dot(weights.last[s], hidden[g], out[g])
         for o in range(out.shape[1]):
             out[g, o] += weights.last_bias[s, o]
-        seen[g, n_in - n_memory :] = out[g, CORRECTIONS:]
+        _copy(out[g, CORRECTIONS:], seen[g, n_in - n_memory :])
 
 
 @compiled
@@ -363,25 +359,42 @@ def _convolve(weight: Array32, values: Array32, dilation: int, taps: Array32, fo
     """
     np.dot(weight, values, taps)
     n_out, n = found.shape
-    d, zero = min(dilation, n - 1), np.float32(0.0)
+    d = min(dilation, n - 1)
     for o in range(n_out):
-        before, after = taps[o], taps[2 * n_out + o]
-        found[o] = taps[n_out + o]
-        found[o, :d] += before[0]
-        _add(before[: n - d], zero, found[o, d:])
-        _add(after[d:], zero, found[o, : n - d])
-        found[o, n - d :] += after[n - 1]
+        before, here, after, sums = taps[o], taps[n_out + o], taps[2 * n_out + o], found[o]
+        here_later, later, after_later, last = here[d:], sums[d:], after[d:], sums[n - d :]
+        for j in range(d):
+            sums[j] = here[j] + before[0]
+        for j in range(n - d):  # slices, as Numba does not vectorise indices that may be negative
+            later[j] = here_later[j] + before[j]
+        for j in range(n - d):
+            sums[j] += after_later[j]
+        for j in range(d):
+            last[j] += after[n - 1]
 
 
 @compiled
-def _add(values: Array32, offset: np.float32, found: Array32) -> None:
-    """Add values and a constant."""
-    for j in range(len(found)):
-        found[j] += values[j] + offset
+def _copy(values: Array32, found: Array32) -> None:
+    """What an assignment does, which Numba does not vectorise."""
+    for o in range(len(found)):
+        row, copied = values[o], found[o]
+        for j in range(len(copied)):
+            copied[j] = row[j]
 
 
 @compiled
-def _rectify(offset: np.float32, found: Array32) -> None:
-    """Add a constant; what is negative becomes 0."""
-    for j in range(len(found)):
-        found[j] = max(found[j] + offset, np.float32(0.0))
+def _add(values: Array32, offsets: Array32, found: Array32) -> None:
+    """Add values, (n_channels, n_knots), and a constant for each channel."""
+    for o in range(len(found)):
+        row, sums, offset = values[o], found[o], offsets[o]
+        for j in range(len(sums)):
+            sums[j] += row[j] + offset
+
+
+@compiled
+def _rectify(offsets: Array32, found: Array32) -> None:
+    """Add a constant to each channel, (n_channels, n_knots); what is negative becomes 0."""
+    for o in range(len(found)):
+        sums, offset = found[o], offsets[o]
+        for j in range(len(sums)):
+            sums[j] = max(sums[j] + offset, np.float32(0.0))

@@ -37,3 +37,17 @@ def test_dispatch_with_foresight(ninebus: Case, monkeypatch: pytest.MonkeyPatch)
     schedule = lookahead_dispatch.solve(instance, "NO", ninebus)
     verdict = ded_bench.score(instance, schedule, "NO")
     assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8
+
+
+def test_a_line_outage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without more training the policy keeps the bound on its own grid, and refined on the other, too."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import line_outage
+
+    line_outage.main(["--epochs", "0", "--draws", "2", "--out", str(tmp_path)])
+    table = pd.read_csv(tmp_path / "table.csv").set_index(["weights", "grid"])
+    assert (table["n"] == 2).all()
+    assert table.loc[("reference", "two-area"), "feasible"] == 2
+    refined = table.loc[[("reference, refined", "two-area"), ("reference, refined", "two-area-outage")]]
+    assert (refined["feasible"] == 2).all()
+    assert (refined["gap_percent"] < 1.0).all()

@@ -45,11 +45,13 @@ def run(*words: object) -> None:
     subprocess.run([sys.executable, "-m", "ded_bench", *map(str, words)], check=True)
 
 
-def trained_on(case: str | Path, start: Path, epochs: int, out: Path) -> Path:
+def trained_on(case: str | Path, start: Path, epochs: int, results: Path) -> Path:
     """File of weights after more epochs on a grid."""
+    out = results / "weights.safetensors"
     if not out.exists():
+        run("train-ko", "--case", case, "--results", results)
         choice = ("--case", case, "--regime", REGIME, "--start", start, "--epochs", epochs, "--out", out)
-        run("train-dpc", "--method", "ded-dpc-shared", *choice, "--results", out.parent)
+        run("train-dpc", "--method", "ded-dpc-shared", *choice, "--results", results)
     return out
 
 
@@ -104,9 +106,9 @@ def main(words: list[str] | None = None) -> None:
     known = find_policy_file("ded-dpc-shared", intact, REGIME, Settings(search=search_folders(intact)))
     files = {"reference": (intact, known)}
     if chosen.epochs:
-        more, less = (chosen.out / f"{name}.safetensors" for name in ("intact", "outage"))
-        files["more epochs, intact"] = intact, trained_on(chosen.case, known, chosen.epochs, more)
-        files["more epochs, outage"] = outage, trained_on(chosen.out / "grid", known, chosen.epochs, less)
+        for name, grid, place in ("intact", intact, chosen.case), ("outage", outage, chosen.out / "grid"):
+            path = trained_on(place, known, chosen.epochs, chosen.out / name)
+            files[f"more epochs, {name}"] = grid, path
     rows = [row for grid in (intact, outage) for row in judged(grid, policies_on(grid, files), chosen.draws)]
     table = (
         pd.DataFrame(rows)

@@ -15,6 +15,7 @@ from ded_bench.evaluate.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.results_folder import ResultsFolder
+from ded_bench.problem.case import REPOSITORY
 from ded_bench.report.figures.growth import gap_figure, growth_figure
 from ded_bench.report.grids import across, payoffs, read_grid, slopes
 from ded_bench.report.overview import write_overview
@@ -84,6 +85,15 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert not page.open
     assert len(list(page.every("img"))) == 2
     assert "In TO, time grows with the number of generators to the power of: DED (SLP) 2.0." in page.text
+
+
+def test_the_committed_page_follows_from_the_reference_runs(tmp_path: Path) -> None:
+    runs = REPOSITORY / "results"
+    write_overview([path.parent for path in runs.glob("*-reference/results.csv")], tmp_path)
+    tables = sorted((runs / "overview-reference" / "tables").glob("*.csv"))
+    assert tables
+    for table in tables:
+        assert table.read_text() == (tmp_path / "tables" / table.name).read_text(), table.name
 
 
 def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Path) -> None:

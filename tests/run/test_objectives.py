@@ -19,7 +19,7 @@ from ded_bench.run.objectives import (
 )
 from ded_bench.run.results import Results, Row
 
-RUNS = sorted((REPOSITORY / "results").glob("*-reference"))
+RUNS = sorted(path.parent for path in (REPOSITORY / "results").glob("*-reference/results.csv"))
 ROW = Row(
     *("a-0001", "test", "NO", "ded", "default", "Optimal"), objective=2.5, case="a", problems_version="1"
 )

@@ -82,7 +82,7 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
                 ax.set_yscale("symlog", linthresh=linear)
                 ax.set_xlim(left=-LINEAR_S / 5)
                 values = [0.0, *(v for drawn in ax.get_lines() for v in np.atleast_1d(drawn.get_ydata()))]
-                ax.set_ylim(1.6 * min(values) - linear / 10, 1.6 * max(values) + linear / 10)
+                ax.set_ylim(3.0 * min(values) - linear / 10, 3.0 * max(values) + linear / 10)
             row[0].set_ylabel(label)
         for regime, top, bottom in zip(regimes, *axes, strict=True):
             top.set_title(regime)

@@ -259,12 +259,12 @@ def performance_profile(frame: pd.DataFrame, column: str) -> pd.DataFrame:
         column: `solve_s` or `objective`.
 
     Returns:
-        Columns regime, method, settings, title, ratio, fraction: `fraction` of the instances have a
-        ratio up to `ratio`; one step per row.
+        Columns regime, method, settings, title, ratio, fraction: `fraction` of the instances that a
+        method was asked have a ratio up to `ratio`; one step per row.
     """
     usable = frame[(frame["feasible"] == True) & (frame[column] > 0)]  # noqa: E712
     best = usable.groupby(["instance", "regime"])[column].min()
-    instances = frame.groupby("regime")["instance"].nunique()
+    asked = frame.groupby(GROUP)["instance"].nunique()
     rows = []
     for regime, method, settings, group in groups(usable):
         lowest = best.reindex(pd.MultiIndex.from_frame(group[["instance", "regime"]])).to_numpy()
@@ -277,7 +277,7 @@ def performance_profile(frame: pd.DataFrame, column: str) -> pd.DataFrame:
                     "settings": settings,
                     "title": title(method, settings),
                     "ratio": float(ratio),
-                    "fraction": i / int(instances[regime]),
+                    "fraction": i / int(asked[regime, method, settings]),
                 }
             )
     return table(rows, [*GROUP, "title", "ratio", "fraction"])

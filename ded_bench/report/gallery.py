@@ -315,10 +315,10 @@ def _draw_tradeoff(gallery: Gallery, frame: pd.DataFrame) -> Iterator[Call]:
     objectives = performance_profile(usual, "objective")
     if len(times) or len(objectives):
         caption = (
-            "Dolan–Moré performance profiles of the methods with default settings: share of the instances on "
-            "which a method is within a factor of the fastest (top; the instances and times of "
-            "`ded-bench bench`) or within a percentage of the cheapest schedule (bottom). Only feasible "
-            "schedules count"
+            "Dolan–Moré performance profiles of the methods with default settings: share of the instances "
+            "that a method was asked on which it is within a factor of the fastest (top; the instances and "
+            "times of `ded-bench bench`) or within a percentage of the cheapest schedule (bottom). Only "
+            "feasible schedules count"
         )
         caption += without_curve(usual, objectives)
         yield gallery.add("profile", "profile", caption, profile_figure, times, objectives)

@@ -244,12 +244,14 @@ def test_performance_profile_by_hand() -> None:
         row("b", "ded-ko", 1.0, solve_s=16.0),
         row("a", "ed", 1.0, solve_s=0.001, feasible=False),
         row("b", "ed", solve_s=0.001),
+        row("b", "ded-radau", 1.0, solve_s=32.0),
     )
     profile = performance_profile(frame, "solve_s")
     steps = {m: p[["ratio", "fraction"]].to_numpy().tolist() for m, p in profile.groupby("method")}
     assert steps == {
         "ded": [[1.0, 0.5], [2.0, 1.0]],
         "ded-ko": [[1.0, 0.5], [2.0, 1.0]],
+        "ded-radau": [[4.0, 1.0]],  # asked one instance only
     }  # ed: never feasible
 
 

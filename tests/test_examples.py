@@ -51,3 +51,18 @@ def test_a_line_outage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     refined = table.loc[[("reference, refined", "two-area"), ("reference, refined", "two-area-outage")]]
     assert (refined["feasible"] == 2).all()
     assert (refined["gap_percent"] < 1.0).all()
+
+
+def test_no_first_plan(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Powers stay as long as no plan is in force; then the solver is asked."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import no_first_plan
+
+    instance = sample_instance(ninebus, 1_500_000, 0)
+    solver = no_first_plan.prepare(ninebus, "TO", None)
+    first = solver.solve(instance)
+    assert (first.p == instance.p_initial(ninebus)).all()
+    planned = solver.solve(instance, ded_bench.Solution(ded_bench.Status.FEASIBLE, first)).schedule
+    verdicts = [ded_bench.score(instance, schedule, "TO") for schedule in (first, planned)]
+    assert verdicts[1].objective < verdicts[0].objective
+    assert verdicts[1].feasible

@@ -45,7 +45,6 @@ SCENARIOS_ded-ko       ?= 0
 SCENARIOS_ded-slp_9bus ?= 5
 SCENARIOS_sweep        ?= 10
 SCENARIOS_period       ?= 5
-SCENARIOS_real-time    ?= 12
 SCENARIOS_real-time_39bus ?= 3
 
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots

@@ -17,6 +17,7 @@ import functools
 import gc
 import hashlib
 import itertools
+import math
 import os
 import resource
 import sys
@@ -40,7 +41,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of_method, named
 from ded_bench.run.environment import host, now, version
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import Key, Results
+from ded_bench.run.results import Key, Results, Row
 from ded_bench.run.tasks import failed
 
 #: Instances that are timed, unless the caller says otherwise.
@@ -291,20 +292,22 @@ def largest_difference(a: Schedule, b: Schedule) -> float:
 
 
 def runs_of(
-    keys: Iterable[Key], settings: Settings, methods: Mapping[str, Method] | None = None
+    rows: Mapping[Key, Row], settings: Settings, methods: Mapping[str, Method] | None = None
 ) -> list[Job]:
     """What a results table holds, to be timed, in the methods' order.
 
-    Rows of studies, of other methods and of models given as a file are left out.
+    Rows of studies, of other methods and of models given as a file are left out. A method all of whose rows
+    in a regime were made with a time limit has it, here as there: without it a call might take hours.
 
     Args:
-        settings: all but the name and the model, which come from the keys.
+        settings: all but the name, the model and the time limit, which come from the rows.
         methods: those to time, by the name that their rows carry; None: all that are registered.
     """
     methods = registered() if methods is None else methods
-    found: dict[tuple[str, str], set[str]] = {}
-    for key in keys:
-        found.setdefault((key.method, key.settings), set()).add(key.regime)
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for key, row in rows.items():
+        limits = found.setdefault((key.method, key.settings), {}).setdefault(key.regime, [])
+        limits.append(math.inf if row.time_limit_s is None else row.time_limit_s)
     jobs = []
     for method in methods:
         for slug in sorted(slug for name, slug in found if name == method and not in_own_table(slug)):
@@ -313,8 +316,11 @@ def runs_of(
                 dataclasses.replace(settings, name=name, model=model) for name in known for model in MODELS
             ]
             match = next((choice for choice in choices if choice.slug == slug), None)
-            if match is not None:
-                jobs += [Job(method, regime, match) for regime in sorted(found[method, slug])]
+            if match is None:
+                continue
+            for regime, limits in sorted(found[method, slug].items()):
+                limit = max(limits) if math.isfinite(max(limits)) else None
+                jobs.append(Job(method, regime, dataclasses.replace(match, time_limit_s=limit)))
     return jobs
 
 

@@ -369,17 +369,22 @@ def test_the_sample_is_spread_and_the_same_every_time(threebus: Case) -> None:
     assert choose_sample(many[:3], 5) == many[:3]
 
 
-def test_runs_of_a_results_table(fake) -> None:
-    """Settings come back from the keys; strangers and models from files do not."""
-    keys = [
-        Key("a", "TO", "fake", "default"),
-        Key("b", "NO", "fake", "default"),
-        Key("a", "TO", "fake", "other-linear"),
-        Key("a", "TO", "fake", "default-myfile"),
-        Key("a", "TO", "stranger", "default"),
-    ]
-    assert runs_of(keys, Settings(time_limit_s=9.0)) == [
-        Job("fake", "NO", Settings(time_limit_s=9.0)),
-        Job("fake", "TO", Settings(time_limit_s=9.0)),
-        Job("fake", "TO", Settings(name="other", model="linear", time_limit_s=9.0)),
+def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
+    """Settings and limits of the time come back from the rows; strangers and models from files do not."""
+    rows = {
+        Key("a", "TO", "fake", "default"): 9.0,
+        Key("b", "TO", "fake", "default"): 20.0,
+        Key("b", "NO", "fake", "default"): None,
+        Key("c", "NO", "fake", "default"): 9.0,
+        Key("a", "TO", "fake", "other-linear"): None,
+        Key("a", "TO", "fake", "default-myfile"): None,
+        Key("a", "TO", "stranger", "default"): None,
+    }
+    made = {
+        key: Row(key.instance, "test", *key[1:], "Optimal", time_limit_s=limit) for key, limit in rows.items()
+    }
+    assert runs_of(made, Settings(search=(tmp_path,))) == [
+        Job("fake", "NO", Settings(search=(tmp_path,))),
+        Job("fake", "TO", Settings(time_limit_s=20.0, search=(tmp_path,))),
+        Job("fake", "TO", Settings(name="other", model="linear", search=(tmp_path,))),
     ]

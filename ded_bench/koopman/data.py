@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
@@ -14,7 +16,7 @@ from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.network import Network
 from ded_bench.truth.servable import servable
-from ded_bench.truth.simulate import simulate
+from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
 
 #: Range of a uniform draw.
 Span = tuple[float, float]
@@ -47,32 +49,49 @@ class Trajectories:
 def trajectories(
     case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
 ) -> Trajectories:
-    """Simulate schedules and stack the result."""
-    shape = (instances[0].steps + 1, len(instances))
-    inputs = np.empty((*shape, len(case.generators) + len(case.loads)))
-    theta, omega = np.empty((2, *shape, len(case.generators)))
-    p_slack, initial = np.empty(shape), np.empty((len(instances), len(case.buses)))
+    """Simulate schedules and stack the result; raises SimulationError where the system cannot follow one."""
     generators = Network(case).generators
-    for i, (instance, schedule) in enumerate(zip(instances, schedules, strict=True)):
-        run = simulate(case, instance, schedule)
-        inputs[:, i] = np.hstack([run.p_gen, run.p_load])
-        initial[i], theta[:, i] = run.theta[0], run.theta[:, generators]
-        omega[:, i], p_slack[:, i] = run.omega, run.p_slack
-    return Trajectories(tuple(instances), tuple(kinds), inputs, initial, theta, omega, p_slack)
+    pairs = zip(instances, schedules, strict=True)
+    return _stacked(instances, kinds, [_signals(simulate(case, *pair), generators) for pair in pairs])
+
+
+def _signals(run: Trajectory, generators: Array) -> tuple[Array, ...]:
+    """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""
+    inputs = np.hstack([run.p_gen, run.p_load])
+    return inputs, run.theta[0].copy(), run.theta[:, generators], run.omega, run.p_slack
+
+
+def _stacked(instances: list[Instance], kinds: list[str], runs: list[tuple[Array, ...]]) -> Trajectories:
+    inputs, initial, *signals = zip(*runs, strict=True)
+    stacked = (np.stack(signal, axis=1) for signal in signals)
+    return Trajectories(tuple(instances), tuple(kinds), np.stack(inputs, axis=1), np.stack(initial), *stacked)
 
 
 def sample_trajectories(
     case: Case, seed: int, count: int, first: int = 0, mix: Sequence[str] | None = None
 ) -> Trajectories:
-    """Simulate `count` fresh instances under the kinds of schedules in `mix` (default: all) in turn."""
+    """Simulate `count` fresh instances under the kinds of schedules in `mix` (default: all) in turn.
+
+    Those that the system cannot follow, as on weak grids, are left out.
+
+    Raises:
+        InputError: it cannot follow most of them.
+    """
     mix = mix or list(KINDS)
-    instances = list(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable))
-    kinds = [mix[i % len(mix)] for i in range(count)]
-    schedules = []
-    for i, (instance, kind) in enumerate(zip(instances, kinds, strict=True)):
+    generators = Network(case).generators
+    instances, kinds, runs = [], [], []
+    for i, instance in enumerate(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable)):
+        kind = mix[i % len(mix)]
         rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
-        schedules.append(Schedule(instance.grid, KINDS[kind](case, instance, rng)))
-    return trajectories(case, instances, schedules, kinds)
+        schedule = Schedule(instance.grid, KINDS[kind](case, instance, rng))
+        with contextlib.suppress(SimulationError):
+            runs.append(_signals(simulate(case, instance, schedule), generators))
+            instances.append(instance)
+            kinds.append(kind)
+    if 2 * len(runs) < count:
+        lost = f"the system cannot follow {count - len(runs)} of {count} drawn schedules"
+        raise InputError(f"case {case.id}", "", f"{lost}: the power flow has no solution")
+    return _stacked(instances, kinds, runs)
 
 
 def tracking(

@@ -44,7 +44,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     """
     count = n_training(case) if count is None else count
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
-    training: dict[str, int | float] = {"seed": seed, "trajectories": count}
+    training: dict[str, int | float] = {"seed": seed, "trajectories": len(data.kinds)}
     if _whole_energy_form(case):
         return _identify_energy_form(case, data, training)
     return _identify_lines(case, data, training)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.network import Network
+from ded_bench.truth.simulate import SimulationError, simulate
 
 
 def nominal_form(case: Case):
@@ -156,6 +158,28 @@ def test_training_schedules_obey_the_limits(case: Case) -> None:
     assert (p_gen >= case.p_min - coast).all()
     assert (p_gen <= case.p_max + coast).all()
     assert set(data.kinds) == set(KINDS)
+
+
+def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkeypatch) -> None:
+    """A third of them is; the others are what they were. Where most are, that is said."""
+    complete, calls = sample_trajectories(case, seed=1, count=6), itertools.count()
+
+    def failing(period: int):
+        def run(case, instance, schedule):
+            if next(calls) % period == 0:
+                raise SimulationError("no power flow")
+            return simulate(case, instance, schedule)
+
+        return run
+
+    monkeypatch.setattr("ded_bench.koopman.data.simulate", failing(3))
+    part = sample_trajectories(case, seed=1, count=6)
+    assert [i.id for i in part.instances] == [complete.instances[k].id for k in (1, 2, 4, 5)]
+    assert (part.omega == complete.omega[:, [1, 2, 4, 5]]).all()
+    assert (part.theta_initial == complete.theta_initial[[1, 2, 4, 5]]).all()
+    monkeypatch.setattr("ded_bench.koopman.data.simulate", failing(1))
+    with pytest.raises(InputError, match="cannot follow 6 of 6 drawn schedules"):
+        sample_trajectories(case, seed=1, count=6)
 
 
 def test_model_files_round_trip(case: Case, tmp_path: Path) -> None:

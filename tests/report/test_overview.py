@@ -92,8 +92,9 @@ def test_the_committed_page_follows_from_the_reference_runs(tmp_path: Path) -> N
     write_overview([path.parent for path in runs.glob("*-reference/results.csv")], tmp_path)
     tables = sorted((runs / "overview-reference" / "tables").glob("*.csv"))
     assert tables
-    for table in tables:
-        assert table.read_text() == (tmp_path / "tables" / table.name).read_text(), table.name
+    for table in tables:  # eigenvalues differ by round-off between machines
+        made = pd.read_csv(tmp_path / "tables" / table.name)
+        pd.testing.assert_frame_equal(pd.read_csv(table), made, rtol=1e-9, obj=table.name)
 
 
 def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,8 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
             write_atomically(files[-1], text)
     pictures = _draw(found, out)
     files += [out / "figures" / f"{name}.{form}" for name in pictures for form in ("png", "pdf")]
-    blocks = _blocks(grids, tables, pictures)
+    seen = {grid.case.id: Path(os.path.relpath(grid.folder, out)).as_posix() for grid in grids}
+    blocks = _blocks(grids, seen, tables, pictures)
     write_atomically(out / "overview.md", render_markdown(blocks))
     write_atomically(out / "overview.html", render_html(blocks, out))
     return [*files, out / "overview.md", out / "overview.html"]
@@ -196,8 +198,10 @@ def _draw(found: pd.DataFrame, out: Path) -> dict[str, Picture]:
     return pictures
 
 
-def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str, Picture]) -> list[Block]:
-    """The page."""
+def _blocks(
+    grids: Sequence[Grid], seen: dict[str, str], tables: dict[str, Table], pictures: dict[str, Picture]
+) -> list[Block]:
+    """The page; `seen` says where the folder of each grid lies, seen from there."""
 
     def part(heading: str, *names: str) -> list[Block]:
         known: dict[str, Block] = {**tables, **pictures}
@@ -210,7 +214,7 @@ def _blocks(grids: Sequence[Grid], tables: dict[str, Table], pictures: dict[str,
     missing = [] if "times" in tables else [Text("No method was timed alone yet; run `ded-bench bench`.")]
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
-    items = [f"`{grid.case.id}`: `{grid.folder}`" for grid in grids]
+    items = [f"`{case}`: `{folder}`, seen from this page" for case, folder in seen.items()]
     return [
         Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
         Text(_finding(tables)),

@@ -103,6 +103,8 @@ def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Pat
     write_overview([folder], tmp_path / "out")
     text = (tmp_path / "out" / "overview.md").read_text()
     assert "No method was timed alone yet" in text
+    assert "`9bus`: `../one`, seen from this page" in text
+    assert str(tmp_path) not in text
     assert "Too few grids were timed" in text
 
 

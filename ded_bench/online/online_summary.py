@@ -15,6 +15,8 @@ RUN = ["regime", "method", "settings"]
 STATIC = ("ed", "1s")
 #: A method with so many latencies at one forecast was swept.
 SWEPT = 3
+#: Own latencies that differ by so small a part share a line.
+SAME = 0.01
 #: Forecasts of a sweep, and plans from the present state under announcements.
 KINDS = (*QUALITIES, "present")
 
@@ -30,12 +32,21 @@ def online_rows(results: OnlineResults, case: str, truth: str = TRUTHS[0]) -> pd
     announced = frame["forecast"] == QUALITIES[0]
     frame["kind"] = frame["forecast"].where(frame["predicted"].astype(bool), "present")
     frame = frame[frame["predicted"].astype(bool) | announced].reset_index(drop=True)
+    frame["latency_s"] = _shared_latency(frame)
     known = frame[(frame["kind"] == "perfect") & (frame["latency_s"] == 0) & frame["warm"].astype(bool)]
     best = known.set_index([*RUN, "scenario"])["objective"]
     best = best[~best.index.duplicated()]
     same = best.reindex(pd.MultiIndex.from_frame(frame[[*RUN, "scenario"]])).to_numpy()
     frame["over_known_percent"] = 100 * (frame["objective"].to_numpy() / same - 1)
     return frame.join(_static(frame), on=["regime", "scenario"])
+
+
+def _shared_latency(frame: pd.DataFrame) -> pd.Series[float]:
+    """Latencies, s; a method's own ones that a new table of times moved by next to nothing are one."""
+    alike = ["latency_source", *(name for name in LOOP if name != "latency_s")]
+    typical = frame.groupby(alike)["latency_s"].transform("median")
+    close = (frame["latency_s"] - typical).abs() <= SAME * typical
+    return frame["latency_s"].mask((frame["latency_source"] == "timing") & close, typical)
 
 
 def _static(frame: pd.DataFrame) -> pd.DataFrame:

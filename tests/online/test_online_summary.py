@@ -64,6 +64,19 @@ def test_methods_at_their_own_latency(results):
     assert (one["share_outside"], one["slack_travel_pu"]) == (0.25, 2.0)
 
 
+def test_own_latencies_that_hardly_differ_share_a_line(tmp_path):
+    """As after `bench` was run anew; half as long a latency is another line."""
+    kept = OnlineResults(tmp_path)
+    kept.table.add(
+        [
+            row(s, t, 102.0, latency_source="timing")
+            for s, t in zip("abcd", (0.2, 0.2, 0.2001, 0.1), strict=True)
+        ]
+    )
+    lines = own_latency(online_rows(kept, "here"))
+    assert lines[["latency_s", "n"]].to_numpy().tolist() == [[0.2, 3], [0.1, 1]]
+
+
 def test_sweeps_are_about_the_same_scenarios(results):
     """Cold starts and other present states do not count, nor what few scenarios were operated under."""
     lines = sweeps(online_rows(results, "here"))

@@ -54,7 +54,7 @@ def _ratio(best: Line, lines: Sequence[Line]) -> str:
 
 def _claims(lines: Sequence[Line]) -> Iterator[str]:
     """Where claims and verdicts differ most."""
-    judged = [line for line in lines if line.statistics["rows"]]
+    judged = [line for line in lines if np.isfinite(line.statistics["freq_violation_hz_max"])]
     if not judged:
         return
     apart = max(judged, key=lambda line: line.statistics["success_rate"] - line.statistics["correct_rate"])

@@ -8,6 +8,7 @@ import pandas as pd
 
 from ded_bench.evaluate.ablation import split_slug
 from ded_bench.evaluate.reference import DEFAULT
+from ded_bench.evaluate.summary import title
 from ded_bench.report.columns import FRONT_V, FRONT_VI, Column, tabulate, without_paper
 from ded_bench.report.details import rows_caption
 from ded_bench.report.findings import findings
@@ -40,7 +41,9 @@ def opening_blocks(
     case, reference = sources.case, sources.reference.title
     front = [line for line in lines if line.paper] or [line for line in lines if _default(line.settings)]
     five, six = result_columns(sources, FRONT_V, FRONT_VI)
-    certificates = [f"**Certificate:** {certificate.sentence}" for certificate in sources.certificates]
+    certificates = [
+        f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates
+    ]
     regimes = ", ".join(f"{name} |ω| ≤ {limit.omega_hz:g} Hz" for name, limit in case.regimes.items())
     what = (
         f"{len(case.buses)} buses, {len(case.generators)} generators besides the slack bus, "

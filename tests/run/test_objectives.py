@@ -55,6 +55,14 @@ def test_committed_tables_follow_from_the_rows(folder: Path) -> None:
     assert OBJECTIVES.read(objectives_file(folder)) == objectives_of(Results(folder).rows.values())
 
 
+@pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
+def test_committed_rows_of_success_have_a_score(folder: Path) -> None:
+    """Or say why they have none."""
+    rows = [row for row in Results(folder).rows.values() if row.status in ("Optimal", "Feasible", "Policy")]
+    assert rows
+    assert not [row.key for row in rows if row.objective is None and not row.error]
+
+
 def test_models_are_looked_for_in_the_given_folder_first(threebus: Case, tmp_path: Path, monkeypatch) -> None:
     """Then in the default results folder, then in the reference run; each once."""
     monkeypatch.setattr(reference_run, "REFERENCE_RUNS", REPOSITORY / "results")

@@ -137,6 +137,7 @@ METHODS: dict[str, Method] = {
                 ("receding", "ded_bench.methods.receding_knots"),
                 ("receding-wide", "ded_bench.methods.receding_knots"),
                 ("real-time", "ded_bench.methods.real_time_knots"),
+                ("reserve", "ded_bench.methods.real_time_reserve"),
             ),
         ),
         Method(

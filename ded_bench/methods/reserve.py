@@ -1,0 +1,107 @@
+"""Reserve: room for generators to follow the steepest ramp of a load that nobody announced.
+
+A load that ramps turns the machines around it. Generators near it can follow the load; where all of them
+stand at a limit, as a static dispatch has them, none can, and no plan is fast enough. So at every knot, for
+both directions of each ramp, a response is asked for: ramps δ of the generators that go on as long as the
+load's, stay within their limits, and leave every machine a steady speed within `limit`,
+
+    |K (δ - T λ)| <= limit + e,    p_min <= P + τ δ <= p_max,    |δ| <= ramp,    e >= 0
+
+with K the compliance S⁻¹ and T the loads' shares (`Network.linearise`) at the nominal point, λ the load's
+ramp and τ its duration. The shortage e has a price.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from ded_bench.koopman.trajectory import Indices
+from ded_bench.problem.case import Array, Case
+from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.truth.network import Network
+
+
+@dataclass(frozen=True, eq=False)
+class Reserve:
+    """The ramps that plans of one case must be able to follow."""
+
+    case: Case
+    speeds: Array  # steady speeds under each ramp if nobody follows, (n_ramps, n_gen), rad/s
+    compliance: Array  # K, (n_gen, n_gen), rad/pu
+    limit: float  # rad/s
+    duration_s: float  # τ
+
+    @staticmethod
+    def of(case: Case, limit: float) -> Reserve:
+        """The steepest ramps of a case, up and down, that turn a machine too fast if nobody follows.
+
+        Args:
+            case: gives the loads' ranges (`sampling`).
+            limit: of steady speeds, rad/s.
+        """
+        network = Network(case)
+        linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
+        compliance = np.asarray(np.linalg.inv(linear.stiffness), dtype=np.float64)
+        speeds = (compliance @ linear.share * np.abs(case.load_rate).max(axis=0)).T
+        fast = speeds[np.abs(speeds).max(axis=1) > limit]
+        duration = float(np.mean(case.sampling.duration_s))
+        return Reserve(case, np.concatenate([fast, -fast]), compliance, limit, duration)
+
+    def required(
+        self, form: FreeForm, power: Indices, p_gen: Array, after: Indices, price: Array
+    ) -> tuple[FreeForm, Indices]:
+        """A program with a response to every ramp at some knots.
+
+        Args:
+            form: the program.
+            power: its columns of powers less `p_gen`, at these knots, (n_knots, n_gen).
+            p_gen: pu, likewise.
+            after: the column after which those of a knot are to stand, (n_knots,).
+            price: of a shortage of 1 rad/s at each knot, (n_knots,).
+
+        Returns:
+            The program, and of each of its columns the number in `form`; new ones have the numbers after.
+        """
+        (n_knots, n_gen), n_ramps, n_old = power.shape, len(self.speeds), len(form.cost)
+        count = n_knots * n_ramps
+        new = n_old + np.arange(count * (n_gen + 1)).reshape(count, n_gen + 1)
+        response, shortage, total = new[:, :-1], new[:, -1:], n_old + new.size
+
+        def rows(columns: Indices, values: Array) -> sp.csc_matrix:
+            """One row for each response and generator; columns and values are (count, n_gen, any)."""
+            place = np.broadcast_to(np.arange(count * n_gen).reshape(count, n_gen, 1), columns.shape)
+            entries = np.broadcast_to(values, columns.shape).ravel()
+            return sp.csc_matrix((entries, (place.ravel(), columns.ravel())), (count * n_gen, total))
+
+        every = (count, n_gen, n_gen)
+        speed = rows(np.broadcast_to(response[:, None, :], every), self.compliance)
+        short = rows(np.broadcast_to(shortage[:, :, None], (count, n_gen, 1)), np.ones(1))
+        at_knot = np.repeat(power, n_ramps, axis=0)
+        room = rows(np.stack([at_knot, response], axis=2), np.array([1.0, self.duration_s]))
+        alone = np.tile(self.speeds, (n_knots, 1)).ravel()
+        planned = np.repeat(p_gen, n_ramps, axis=0)
+        free = np.full(alone.shape, np.inf)
+        ramp, zero = self.case.ramp, np.zeros(new.size)
+        cost = np.append(form.cost, zero)
+        cost[shortage[:, 0]] = np.repeat(price, n_ramps)
+        lower = np.append(form.lower, np.tile(np.append(-ramp, 0.0), count))
+        upper = np.append(form.upper, np.tile(np.append(ramp, np.inf), count))
+        place = np.append(np.arange(n_old), np.repeat(after, n_ramps * (n_gen + 1)) + 0.5)
+        order = np.argsort(place, kind="stable")
+        equal, kept = (
+            sp.hstack([part, sp.csc_matrix((part.shape[0], new.size))]) for part in (form.equal, form.between)
+        )
+        between = sp.csc_matrix(sp.vstack([kept, speed - short, speed + short, room]))
+        return FreeForm(
+            cost=cost[order],
+            equal=sp.csc_matrix(equal)[:, order],
+            right=form.right,
+            between=between[:, order],
+            low=np.concatenate([form.low, -free, -self.limit - alone, (self.case.p_min - planned).ravel()]),
+            high=np.concatenate([form.high, self.limit - alone, free, (self.case.p_max - planned).ravel()]),
+            lower=lower[order],
+            upper=upper[order],
+        ), order

@@ -82,6 +82,9 @@ OPERATE  = $(DED) online --method $(1) --case $(CASE) $(ONLY) --scenarios $(call
   --workers $(WORKERS) --out $(RESULTS)
 LATENCIES  := 0,0.03,0.1,0.3,1,3,7,15,30
 SURROGATE  := $(if $(filter 9bus,$(CASE)),,--model trajectory)
+# Real-time iterations, on two-area with reserve, too: on the larger grids no load's ramp is fast enough to ask for one.
+COMMA      := ,
+REAL_TIME  := --settings real-time$(if $(filter two-area,$(CASE)),$(COMMA)reserve) --model trajectory
 # What is swept: knots that keep their places from plan to plan; the margin depends on the grid (docs/online.md).
 KNOTS      := --settings $(if $(filter 9bus,$(CASE)),receding,receding-wide) $(SURROGATE)
 OPERATED   := $(if $(ANSWERING),$(POLICIES) $(REFINED))
@@ -110,7 +113,7 @@ solve-baselines: train-ko  ## solve and score static dispatch, DED and DED-KO in
 	$(call SOLVE,ed, --settings '*')
 	$(call SOLVE,$(BASELINES))
 	$(if $(filter 9bus,$(CASE)),$(call SOLVE,ded, --settings accelerated),$(call \
-	  SOLVE,ded-ko-knots, --settings real-time --model trajectory))
+	  SOLVE,ded-ko-knots, $(REAL_TIME)))
 
 radau: train-ko  ## full DED by Radau collocation: the accurate reference
 	$(DED) solve --method ded-radau $(CHOICE)
@@ -165,7 +168,7 @@ online: train-ko  ## the closed loop: all methods at their own latency, then swe
 	  OPERATE,$m) $(if $(filter ded-ko-knots,$m),$(SURROGATE))$(NEWLINE)))
 	$(call OPERATE,ded-ko-knots) $(KNOTS)
 	$(call OPERATE,ded-ko-knots) $(KNOTS) --latency 0 --forecast perfect
-	$(if $(SURROGATE),$(call OPERATE,ded-ko-knots,real-time) --settings real-time $(SURROGATE) --period 0.1)
+	$(if $(SURROGATE),$(call OPERATE,ded-ko-knots,real-time) $(REAL_TIME) --period 0.1)
 	$(foreach m,$(OPERATED),$(call OPERATE,$m,period) --period 0.1$(NEWLINE))
 	$(call OPERATE,ded-ko-knots,period) $(KNOTS) --period 0.1
 	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency $(LATENCIES)

@@ -39,10 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a locale may lack arrows and Greek letters
             stream.reconfigure(errors="replace")
-    arguments = parser().parse_args(argv)
-    if sys.stderr.isatty():  # the first imports take a second, and some commands work for minutes
-        print(f"ded-bench: {arguments.task} ...", file=sys.stderr, flush=True)
     try:
+        arguments = parser().parse_args(argv)
+        if sys.stderr.isatty():  # the first imports take a second, and some commands work for minutes
+            print(f"ded-bench: {arguments.task} ...", file=sys.stderr, flush=True)
         code: int = arguments.run(arguments)
         return code
     except InputError as error:

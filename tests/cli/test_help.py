@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 
@@ -73,6 +74,18 @@ def test_people_hear_at_once_what_a_command_does(monkeypatch, capsys: pytest.Cap
     monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
     assert main(["cases"]) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("arguments", [("online", "--help"), ("--version",), ("cases",)])
+def test_a_reader_that_leaves_early_sees_no_traceback(arguments: tuple[str, ...]) -> None:
+    """As in `ded-bench online --help | head -1`."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as pipe:
+        command = [sys.executable, "-m", "ded_bench", *arguments]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == ""
 
 
 def test_windows_is_told_plainly() -> None:

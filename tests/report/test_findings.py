@@ -29,7 +29,14 @@ def test_the_fastest_that_keeps_every_limit_and_who_claims_too_much(ninebus: Cas
     assert "differ most for ED in TO" in claims
     assert "success on 100% of the instances and is feasible on 0%" in claims
     assert "by up to 0.003 Hz" in claims
-    assert nearest.endswith("that keep every limit, DED-KO in TO, +1 % on 1 instances.")
+    assert nearest.endswith("that keep every limit, DED-KO in TO, +1 % on 1 instance.")
+
+
+def test_a_method_that_was_asked_little_is_not_the_nearest(ninebus: Case) -> None:
+    both = [row(i, m, cost) for i in "ab" for m, cost in (("ded", 100.0), ("ded-ko", 101.0))]
+    lucky = row("a", "ed", 100.0)
+    nearest = findings(ninebus, lines_of(frame_of(*both, lucky)), "DED")[-1]
+    assert "DED-KO in TO, +1 % on 2 instances" in nearest
 
 
 def test_claims_that_hold_and_cells_behind_the_paper(ninebus: Case) -> None:

@@ -21,8 +21,8 @@ from ded_bench.problem.case import Case
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"reserve": real_time_knots.SETTINGS["real-time"]}
-#: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings to twice its
-#: steady speed.
+#: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to
+#: twice its steady speed. This and the price were chosen on scenarios drawn for it (docs/online.md).
 LIMIT = 0.5
 #: What a shortage as large as that costs, in pu of generation at the mean cost of all machines.
 PRICE = 1.0

@@ -46,7 +46,7 @@ SCENARIOS_ded-ko       ?= 0
 SCENARIOS_ded-slp_9bus ?= 5
 SCENARIOS_sweep        ?= 10
 SCENARIOS_period       ?= 5
-SCENARIOS_real-time_39bus ?= 7
+SCENARIOS_real-time_39bus ?= 11
 
 BASELINES := ded ded-radau ded-slp ded-ko ded-ko-knots
 MODELS    := linear koopman-paper $(if $(filter 9bus,$(CASE)),koopman-single,trajectory)

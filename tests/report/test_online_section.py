@@ -100,6 +100,10 @@ def test_figures_show_the_numbers(threebus, folder):
     assert own.get_xdata()[0] == 0.0
     assert own.get_ydata()[0] == swept.get_ydata()[0]
     assert swept.get_label() == "forecast as announced"
+    assert not any(ax.texts for ax in figure.axes)  # one setting of each method: the legend tells them apart
+    other = own_latency(frame).assign(settings="10s", latency_s=0.3)
+    figure = latency_figure(sweeps(frame), pd.concat([own_latency(frame), other]), "")
+    assert all({word.get_text() for word in ax.texts} == {"1s", "10s"} for ax in figure.axes)
     scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
     (ax,) = forecast_figure(threebus, scenario, "").axes
     truth, *seen = (line for line in ax.get_lines() if len(line.get_xdata()) > 1)

@@ -16,6 +16,7 @@ from ded_bench.online.online_summary import KINDS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.scenario import Scenario
+from ded_bench.report.figures.labels import Label, place_labels
 from ded_bench.report.figures.style import (
     BLACK,
     BLUE,
@@ -89,7 +90,19 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
             bottom.set_xlabel("latency (s)")
         legend_below(figure, handles, columns=2)
         figure.suptitle(heading)
+        for (name, _, _), row in zip(MEASURES, axes, strict=True):
+            for regime, ax in zip(regimes, row, strict=True):
+                place_labels(figure, ax, _settings(own[own["regime"] == regime], name))
     return figure
+
+
+def _settings(lines: pd.DataFrame, name: str) -> list[Label]:
+    """Words for methods with several settings, whose points look alike."""
+    several = lines.groupby("method")["settings"].transform("nunique") > 1
+    return [
+        Label(one["settings"], one["latency_s"], one[name], colour(one["method"]))
+        for _, one in lines[several].iterrows()
+    ]
 
 
 def counted(lines: pd.DataFrame) -> str:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 import ded_bench
 from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.scenario_sampling import sample_scenario
+from ded_bench.truth.servable import servable
 
 EXAMPLES = REPOSITORY / "examples"
 
@@ -66,3 +71,21 @@ def test_no_first_plan(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     verdicts = [ded_bench.score(instance, schedule, "TO") for schedule in (first, planned)]
     assert verdicts[1].objective < verdicts[0].objective
     assert verdicts[1].feasible
+
+
+def test_stretches_around_ramps_that_nobody_announces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loads are those of the scenario from 20 s before the ramp; other scenarios have none."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import unannounced_ramps
+
+    case = Case.load("two-area")
+    scenarios = [sample_scenario(case, 77, index, servable) for index in (5, 6)]
+    (data,) = unannounced_ramps.stretches(case, scenarios)
+    stretch = Scenario.model_validate_json(json.dumps(data))
+    stretch.check_case(case)
+    (ramp,) = (ramp for ramp in scenarios[1].load["7"].ramps if ramp.rate == 0.093139983)
+    (same,) = (one for one in stretch.load["7"].ramps if one.rate == ramp.rate)
+    assert (same.start, same.announced_start) == (pytest.approx(20.0), None)
+    # The fluctuation is linear between other points; its standard deviation is 5e-4 of the load.
+    then = scenarios[1].p_load(case, ramp.start - 20.0 + stretch.grid)
+    assert np.allclose(stretch.p_load(case), then, atol=2e-3)

@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
-from ded_bench.methods.dpc_shared.stage_records import Indices, Modes
+from ded_bench.methods.dpc_shared.iteration_records import Indices, Modes
+from ded_bench.methods.dpc_shared.path_kernels import oscillators
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 
@@ -41,6 +41,7 @@ class GridResponse:
     share: Array  # T, (n_gen, n_load)
     gain: Array  # powers into modes, (n_gen, n_modes): v = p @ gain
     shape: Array  # modes into angles, (n_modes, n_gen): x = q @ shape
+    rate: float  # γ, 1/s
     step: Array  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
     damping: Array  # of the modes, less γ, (n_modes, n_modes), 1/s
     every: int  # from one station, where a path's power flow is solved, to the next, in knots
@@ -73,7 +74,8 @@ class GridResponse:
             share=linear.share,
             gain=u / root[:, None],
             shape=(u / root[:, None]).T.copy(),
-            step=np.stack([_oscillator(square, rate, fine[1]) for square in squares]),
+            rate=rate,
+            step=oscillators(squares, rate, float(fine[1])),
             damping=u.T @ np.diag(other) @ u,
             every=every,
             instants=every * np.linspace(0, stations - 1, min(INSTANTS, stations)).round().astype(np.int64),
@@ -91,13 +93,3 @@ class GridResponse:
 def largest_divisor(count: int, most: float) -> int:
     """The largest divisor of a number that is at most so large; 1 if none is."""
     return max(n for n in range(1, max(int(most + 1e-9), 1) + 1) if count % n == 0)
-
-
-def _oscillator(square: float, rate: float, h: float) -> Array:
-    """Exact map of q̈ + rate q̇ + square q = v over h, v linear, (2, 4): (q, q̇, v, v⁺) -> (q⁺, q̇⁺)."""
-    generator = np.zeros((4, 4))
-    generator[0, 1] = generator[1, 2] = generator[2, 3] = 1.0
-    generator[1, :2] = -square, -rate
-    exact = expm(generator * h)[:2]
-    by_slope = exact[:, 3] / h
-    return np.column_stack([exact[:, :2], exact[:, 2] - by_slope, by_slope])

@@ -32,6 +32,41 @@ class Lines(NamedTuple):
 
 
 @compiled
+def oscillators(squares: Array, rate: float, h: float) -> Array:
+    """Exact maps of q̈ + rate q̇ + square q = v over h, v linear: (q, q̇, v, v⁺) -> (q⁺, q̇⁺).
+
+    Args:
+        squares: of angular frequencies, (n_modes,), 1/s².
+        rate: of damping, 1/s.
+        h: time, s.
+
+    Returns:
+        (n_modes, 2, 4).
+    """
+    maps, column, term = np.empty((len(squares), 2, 4)), np.empty(4), np.empty(4)
+    for m in range(len(squares)):
+        halvings = 0
+        while (abs(squares[m]) * h + rate + 1.0) * h > 0.5 * 2.0**halvings:
+            halvings += 1
+        short, exact = h / 2.0**halvings, np.zeros((4, 4))  # of (q, q̇, v, v̇)
+        for c in range(4):
+            column[:], term[:] = 0.0, 0.0
+            column[c] = term[c] = 1.0
+            for power in range(1, 15):
+                part = short / power
+                fall = -(squares[m] * term[0] + rate * term[1]) + term[2]
+                term[0], term[1], term[2], term[3] = part * term[1], part * fall, part * term[3], 0.0
+                column += term
+            exact[:, c] = column
+        for _ in range(halvings):
+            exact = np.dot(exact, exact)
+        maps[m, :, :2] = exact[:2, :2]
+        maps[m, :, 3] = exact[:2, 3] / h
+        maps[m, :, 2] = exact[:2, 2] - maps[m, :, 3]
+    return maps
+
+
+@compiled
 def start_angles(
     lines: Lines, unknown: Indices, nominal: Array, inverse: Array, wanted: Array, theta: Array
 ) -> bool:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ded_bench.methods.dpc_shared.drawn_problems import Problems, averaged
 from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
+from ded_bench.methods.dpc_shared.iteration_kernels import swing, track_rows
 from ded_bench.methods.dpc_shared.path_kernels import Lines, follow_path, start_angles
-from ded_bench.methods.dpc_shared.stage_kernels import swing, track_rows
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 

@@ -1,4 +1,4 @@
-"""The linearised grid and the follower in torch: their adjoints are compiled."""
+"""The linearised grid, the follower and the quadratic model in torch: their adjoints are compiled."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ded_bench.methods.dpc_shared.adjoint_kernels import follow_all, follow_all_adjoint, swing_adjoint
+from ded_bench.methods.dpc_shared.adjoint_kernels import modal_products, track_rows_adjoint
 from ded_bench.methods.dpc_shared.grid_response import FINE
-from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
+from ded_bench.methods.dpc_shared.iteration_kernels import modal_change, swing, swing_adjoint, track_rows
+from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel, linear_between
 from ded_bench.problem.case import Array
 
 
@@ -21,34 +22,61 @@ class Respond(torch.autograd.Function):
     def forward(ctx: Any, powers: Tensor, model: PathModel, outset: Outset, linear: Linear) -> Any:
         """See `PathModel.respond`; (batch, n_knots, n_gen) to two (batch, n_fine, n_gen), (batch, n_fine)."""
         ctx.model, ctx.linear = model, linear
-        x, omega, p_slack = model.respond(powers.detach().numpy().astype(np.float64), outset, linear)
+        x, omega, p_slack = model.respond(_double(powers), outset, linear)
         return tuple(map(_single, (x, omega, p_slack)))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
         """The transposed recursion."""
+        return _single(_transposed(ctx.model, ctx.linear, *map(_double, gradients))), None, None, None
+
+
+class Transposed(torch.autograd.Function):
+    """What gradients in ω and P_s at the fine points are in powers at the knots."""
+
+    @staticmethod
+    def forward(ctx: Any, on_omega: Tensor, on_slack: Tensor, model: PathModel, linear: Linear) -> Tensor:
+        """(batch, n_fine, n_gen) and (batch, n_fine) to (batch, n_knots, n_gen)."""
+        ctx.model, ctx.linear = model, linear
+        on_x = np.zeros(on_omega.shape)
+        return _single(_transposed(model, linear, on_x, _double(on_omega), _double(on_slack)))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        """The response itself, from rest and without loads."""
         model, linear = ctx.model, ctx.linear
-        on_x, on_omega, on_slack = (part.numpy().astype(np.float64) for part in gradients)
-        on_x = on_x - on_slack[:, :, None] * model.slack_stiffness(linear)
-        shape, gain = model.response.shape, model.response.gain
-        on_v = np.empty_like(on_omega)
-        swing_adjoint(model.modes, linear.change, on_x @ shape.T, on_omega @ shape.T, on_v)
-        fine = on_v @ gain.T
-        found = fine[:, ::FINE].copy()
-        for i in range(1, FINE):
-            found[:, :-1] += (1 - i / FINE) * fine[:, i::FINE]
-            found[:, 1:] += (i / FINE) * fine[:, i::FINE]
-        return _single(found), None, None, None
+        response = model.response
+        v = linear_between(_double(gradients[0]), FINE) @ response.gain
+        q, speed = np.zeros_like(v), np.zeros_like(v)
+        swing(model.modes, linear.change, v, q, speed)
+        on_slack = -(model.slack_stiffness(linear) * (q @ response.shape)).sum(axis=2)
+        return _single(speed @ response.shape), _single(on_slack), None, None
 
 
-def _single(values: Array) -> Tensor:
-    """In single precision; where the linearised grid swings up without end, infinity."""
-    with np.errstate(over="ignore"):
-        return torch.from_numpy(values.astype(np.float32))
+class ModalChange(torch.autograd.Function):
+    """Change of powers that minimises the quadratic model of an iteration."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, weights: Tensor, modes: tuple[Array, Array, Array]) -> Tensor:
+        """See `modal_change`; gradient (batch, n_knots, n_gen), weights (4,), modes of `mean_modes_of`."""
+        ctx.modes, ctx.weights = modes, _double(weights)
+        change = _changes(_double(gradient), ctx.weights, modes)
+        ctx.change = change
+        return _single(change)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Another solution with the same, symmetric, matrix; for the weights, its parts between both."""
+        modes, step, leverage = ctx.modes
+        on_gradient = _changes(_double(gradients[0]), ctx.weights, ctx.modes)
+        back = np.linalg.inv(modes.swapaxes(1, 2))
+        on_weights = np.zeros(4)
+        modal_products(step, leverage, FINE, on_gradient @ back, ctx.change @ back, on_weights)
+        return _single(on_gradient), _single(on_weights), None
 
 
 class FollowTargets(torch.autograd.Function):
-    """Clip targets to bounds and follow them within ramps; knots, generators, batch.
+    """Clip targets to bounds and follow them within ramps; batch, knots, generators.
 
     Where a target lies beyond a bound, its gradient is kept if descent leads back inside.
     """
@@ -57,20 +85,50 @@ class FollowTargets(torch.autograd.Function):
     def forward(
         ctx: Any, targets: Tensor, p_initial: Tensor, low: Tensor, high: Tensor, step: Tensor
     ) -> Tensor:
-        """Targets (n_gen, n_knots, batch), P_0 (n_gen, batch), limits (n_gen,)."""
-        out = torch.empty_like(targets)
-        limits = (low.numpy(), high.numpy(), step.numpy())
-        follow_all(targets.detach().numpy(), p_initial.numpy(), *limits, out.numpy())
-        ctx.save_for_backward(out, targets, low, high, step)
-        return out
+        """Targets (batch, n_knots, n_gen), P_0 (batch, n_gen), limits (n_gen,)."""
+        ctx.limits = _double(low), _double(high), _double(step)
+        ctx.targets = _double(targets)
+        ctx.powers = ctx.targets.copy()
+        ctx.powers[:, 0] = _double(p_initial)
+        track_rows(ctx.powers, *ctx.limits)
+        return _single(ctx.powers)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Adjoint of the recursion, from the last knot to the first."""
-        out, targets, low, high, step = ctx.saved_tensors
-        found = torch.empty_like(out)
-        limits = (low.numpy(), high.numpy(), step.numpy())
-        follow_all_adjoint(
-            targets.numpy(), out.numpy(), *limits, gradients[0].contiguous().numpy(), found.numpy()
-        )
-        return found, None, None, None, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None, None]:
+        """Gradient in the targets."""
+        on_targets, (low, high, step) = np.zeros(ctx.targets.shape), ctx.limits
+        track_rows_adjoint(ctx.targets, ctx.powers, low, high, step, _double(gradients[0]), on_targets)
+        return _single(on_targets), None, None, None, None
+
+
+def _transposed(model: PathModel, linear: Linear, on_x: Array, on_omega: Array, on_slack: Array) -> Array:
+    """Gradient in powers at the knots from those in x, ω and P_s at the fine points."""
+    on_x = on_x - on_slack[:, :, None] * model.slack_stiffness(linear)
+    shape, gain = model.response.shape, model.response.gain
+    on_v = np.empty_like(on_omega)
+    swing_adjoint(model.modes, linear.change, on_x @ shape.T, on_omega @ shape.T, on_v)
+    fine = on_v @ gain.T
+    found = fine[:, ::FINE].copy()
+    for i in range(1, FINE):
+        found[:, :-1] += (1 - i / FINE) * fine[:, i::FINE]
+        found[:, 1:] += (i / FINE) * fine[:, i::FINE]
+    return np.asarray(found)
+
+
+def _changes(gradient: Array, weights: Array, modes: tuple[Array, Array, Array]) -> Array:
+    """`modal_change` of a batch, in powers."""
+    into, step, leverage = modes
+    found = np.empty_like(gradient)
+    for b in range(len(gradient)):
+        modal_change(step[b], leverage[b], FINE, weights, gradient[b] @ into[b], found[b])
+    return np.asarray(found @ into.swapaxes(1, 2))
+
+
+def _double(values: Tensor) -> Array:
+    return values.detach().numpy().astype(np.float64)
+
+
+def _single(values: Array) -> Tensor:
+    """In single precision; where the linearised grid swings up without end, infinity."""
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(values.astype(np.float32))

@@ -19,7 +19,7 @@ from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc_shared.drawn_problems import Problems
 from ded_bench.methods.dpc_shared.grid_response import GridResponse
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
-from ded_bench.methods.dpc_shared.unrolled_inference import CompiledNetwork, weight_shapes
+from ded_bench.methods.dpc_shared.unrolled_inference import CompiledIterations, weight_shapes
 from ded_bench.methods.policy_file import (
     Scope,
     Weights,
@@ -38,7 +38,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.truth.network import PowerFlowError
 
 if TYPE_CHECKING:
-    from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
+    from ded_bench.methods.dpc_shared.unrolled_iterations import UnrolledIterations
 
 METHOD = "ded-dpc-shared"
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
@@ -52,12 +52,13 @@ class SharedPolicy:
 
     scope: Scope
     weights: Weights
-    training: dict[str, Any]  # facts of the training; `stages`, `width` and `margin` shape answers
+    training: dict[str, Any]  # facts of the training; `iterations` and `margin` shape answers
 
     @staticmethod
-    def of(scope: Scope, network: UnrolledNetwork, training: dict[str, Any]) -> SharedPolicy:
-        """The policy of a network in torch."""
-        return SharedPolicy(scope, weights_of(network), training | network.shape)
+    def of(scope: Scope, unrolled: UnrolledIterations, training: dict[str, Any]) -> SharedPolicy:
+        """The policy that was trained in torch."""
+        facts = training | {"iterations": len(unrolled.start)}
+        return SharedPolicy(scope, weights_of(unrolled), facts)
 
     @functools.cached_property
     def model(self) -> PathModel:
@@ -73,8 +74,8 @@ class SharedPolicy:
         return self.model.response.knots
 
     @functools.cached_property
-    def _compiled(self) -> CompiledNetwork:
-        return CompiledNetwork(self.model, self.weights)
+    def _compiled(self) -> CompiledIterations:
+        return CompiledIterations(self.model, self.weights, self.training["iterations"])
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -103,7 +104,7 @@ class SharedPolicy:
 
     def answer(self, outset: Outset, linear: Linear) -> Array:
         """As `powers`, where the grid along the path of the first schedule is known."""
-        return self._compiled(outset, linear)
+        return self._compiled(outset, linear, outset.start)
 
     def save(self, path: Path) -> None:
         """Write weights and header."""
@@ -113,10 +114,10 @@ class SharedPolicy:
     def load(path: str | Path, case: Case, regime: str) -> SharedPolicy:
         """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
         arrays, scope, training = read_policy(path, METHOD, case, regime)
-        stages, width = training.get("stages"), training.get("width")
-        if not (isinstance(stages, int) and isinstance(width, int) and 0 < stages < 99 and 0 < width < 999):
-            raise InputError(path, "training", "stages and width of the network are missing or mistyped")
-        return SharedPolicy(scope, checked_weights(arrays, weight_shapes(stages, width), path), training)
+        iterations = training.get("iterations")
+        if not (isinstance(iterations, int) and 0 < iterations < 1000):
+            raise InputError(path, "training", "number of iterations is missing or mistyped")
+        return SharedPolicy(scope, checked_weights(arrays, weight_shapes(), path), training)
 
     @functools.cached_property
     def fingerprint(self) -> str:

@@ -1,4 +1,15 @@
-"""The network of the shared policy without torch, whose overhead per layer would dominate a single answer."""
+"""The unrolled ADMM of the shared policy without torch, whose overhead would dominate a single answer.
+
+The linear program along the path of a problem is
+
+    min Σ c P + c_s |P_s|   with P, P⁺ - P and ω within limits, all affine in P.
+
+Each iteration of the alternating direction method of multipliers (Boyd et al. 2011) projects copies of P, its
+changes, ω and P_s on their limits (for P_s: the proximal map of its price), and then moves P to the least of
+a quadratic model. Norms weigh generators by inertia, so that in the modes of the mean stiffness the model
+falls apart into one small recursion per mode. A few iterations are far from convergence: how they weigh what
+they minimise is learned, and the only weights of the policy.
+"""
 
 from __future__ import annotations
 
@@ -7,101 +18,118 @@ from collections.abc import Mapping
 import numpy as np
 
 from ded_bench.methods.dpc_shared.grid_response import FINE
+from ded_bench.methods.dpc_shared.iteration_kernels import answer
+from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST, Given, Limits
+from ded_bench.methods.dpc_shared.path_kernels import oscillators
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
-from ded_bench.methods.dpc_shared.stage_kernels import answer
-from ded_bench.methods.dpc_shared.stage_records import (
-    CORRECTIONS,
-    MIXED,
-    SMALLEST_COST,
-    Array32,
-    Given,
-    Units,
-    Weights,
-)
 from ded_bench.problem.case import Array
 
-#: Channels that a stage sees at every knot, the constants of a generator, and what a stage hands on.
-N_SEQUENCE, N_CONSTANT, N_MEMORY = 20, 11, 4
-#: Channels among the constants that depend on the knot: time, and a decay after t = 0.
-TIMES = slice(6, 8)
-DECAYS = 12.0
-#: Costs whose mean is smaller are as good as free.
-FREE = 1e-3
-#: Machines that swing further between knots, rad², are corrected less at a time: it would excite them.
-SWING = 3.0
-#: A stage sees so many seconds to either side.
-REACH_S = 11.0
+#: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
+#: bounds, ramps, ω and P_s, in the case's `price`; what part of the last the quadratic model has; relaxation;
+#: tightening of the bound on |ω|.
+SETTINGS = {
+    "bounds": (0.1, 400.0),
+    "ramps": (20.0, 1000.0),
+    "frequency": (20.0, 1000.0),
+    "slack": (0.1, 20.0),
+    "slack_model": (2.0, 0.2),
+    "relaxation": (1.5, 1.7),
+    "tightening": (0.08, 0.03),
+}
+#: How many of them are penalties.
+PENALTIES = 4
+#: Largest relaxation and tightening.
+MOST = {"relaxation": 2.0, "tightening": 0.1}
 
 
-def dilations_of(spacing_s: float) -> tuple[int, int, int]:
-    """1, √n and n knots, where n knots are REACH_S."""
-    n = max(REACH_S / spacing_s, 1.0)
-    return 1, round(np.sqrt(n)), round(n)
+#: Iterations, equally far apart, whose weights are learned; those of others lie between.
+NODES = 4
 
 
-def weight_shapes(stages: int, width: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a network's weights, in the order of its state dict: the same on every grid."""
-    blocks = len(dilations_of(1.0))
-    stage: dict[str, tuple[int, ...]] = {
-        "first": (width, 3 * (N_SEQUENCE + N_MEMORY)),
-        "constant": (width, N_CONSTANT),
-        "first_bias": (width,),
-        "spread": (blocks, width, 3 * width),
-        "spread_bias": (blocks, width),
-        "mix": (blocks, width, width + 3 * MIXED),
-        "mix_bias": (blocks, width),
-        "last": (CORRECTIONS + N_MEMORY, width),
-        "last_bias": (CORRECTIONS + N_MEMORY,),
-    }
-    return {f"stages.{i}.{name}": shape for i in range(stages) for name, shape in stage.items()}
+def weight_shapes() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the weights: the same on every grid."""
+    return {"nodes": (NODES, len(SETTINGS))}
 
 
-def units_of(model: PathModel) -> Units:
-    """Limits of a model's case, and the units of powers in it."""
+def starting_settings(iterations: int) -> Array:
+    """Settings where training starts, (iterations, 7)."""
+    return np.stack([np.geomspace(*ends, iterations) for ends in SETTINGS.values()], axis=1)
+
+
+def between_nodes(iterations: int) -> Array:
+    """Linear interpolation from the nodes to all iterations, (iterations, NODES)."""
+    at = np.linspace(0.0, NODES - 1.0, iterations)
+    return np.stack([np.interp(at, np.arange(NODES), row) for row in np.eye(NODES)], axis=1)
+
+
+def settings_of(weights: Array, iterations: int) -> Array:
+    """Settings of each iteration, (iterations, 7), from weights, which are 0 where training starts.
+
+    Penalties are multiplied by e^w; what has a largest value moves to it along a logistic curve.
+    """
+    start = starting_settings(iterations)
+    found = start * np.exp(between_nodes(iterations) @ weights.astype(np.float64))
+    for name, most in MOST.items():
+        i = list(SETTINGS).index(name)
+        found[:, i] *= most / (most - start[:, i] + found[:, i])
+    return found
+
+
+def limits_of(model: PathModel) -> Limits:
+    """Limits of a model's case, and what makes them comparable."""
     case, response = model.case, model.response
-    turn, own = model.bound * model.spacing, np.diag(response.stiffness)
-    swing = own / response.network.m * model.spacing**2  # square of a machine's own swing in a knot, rad²
-    return Units(
+    inertia, by_bound = response.network.m, np.diag(response.stiffness) * model.bound * model.spacing
+    unit = float(np.exp(np.log(np.minimum(model.ramp, by_bound)).mean()))
+    return Limits(
         low=case.p_min,
         high=case.p_max,
         step=model.ramp,
-        unit=np.minimum(model.ramp, own * turn),
-        pace=np.minimum(SWING / swing, 1.0) ** 2,
-        turn=turn,
         bound=model.bound,
-        stiffness=response.stiffness,
-        compliance=response.compliance,
-        by_stiffness=_others(response.stiffness),
-        by_compliance=_others(response.compliance),
+        mass=inertia / inertia.mean(),
+        unit=unit,
+        price=unit
+        / ((len(response.knots) - 1) * float(np.maximum(np.abs(case.p_min), np.abs(case.p_max)).sum())),
         gain=response.gain.astype(np.float32),
         shape=response.shape.astype(np.float32),
     )
 
 
-def _others(matrix: Array) -> Array32:
-    weights = (matrix - np.diag(np.diag(matrix))) / np.diag(matrix)[:, None]
-    return weights.astype(np.float32)
+def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
+    """What compiled iterations know of problems."""
+    response = model.response
+    shape32 = response.shape.astype(np.float32)
+    mean_modes, mean_step, mean_leverage = mean_modes_of(model, linear)
+    return Given(
+        cost=outset.problems.cost / static_cost(outset)[:, None],
+        offset=linear.offset.astype(np.float32),
+        slack=linear.slack.astype(np.float32),
+        leverage=model.slack_stiffness(linear).astype(np.float32) @ shape32.T,
+        change=linear.change.astype(np.float32),
+        state=outset.state.astype(np.float32),
+        mean_modes=mean_modes,
+        mean_step=mean_step,
+        mean_leverage=mean_leverage,
+    )
 
 
-def constants_of(model: PathModel, units: Units, outset: Outset) -> tuple[Array, Array]:
-    """What a stage sees of a generator at all knots, (batch, N_CONSTANT, n_gen), and costs in their means.
+def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array]:
+    """Modes of the mean stiffness along paths, in which powers weigh by inertia.
 
-    The entries `TIMES` are zero; they depend on the knot.
+    Returns:
+        Powers by column (batch, n_gen, n_modes), maps as `Modes.step` (batch, n_modes, 2, 4), and what a
+        mode takes from the slack (batch, n_modes), pu/rad.
     """
-    problems, (batch, n_gen) = outset.problems, outset.problems.p_initial.shape
-    mean = np.maximum(problems.cost.mean(axis=1, keepdims=True), FREE)
-    cost, dear = problems.cost[:, 1:], problems.cost[:, :1]
-    speed = np.clip(problems.omega / units.bound, -3.0, 3.0)
-    found = np.zeros((batch, N_CONSTANT, n_gen))
-    found[:, 0] = (cost - dear) / np.maximum(cost + dear, FREE)
-    found[:, 1], found[:, 2] = cost / mean - 1.0, dear / mean - 1.0
-    found[:, 3] = (2.0 * problems.p_initial - units.low - units.high) / (units.high - units.low)
-    found[:, 4], found[:, 5] = speed, speed @ units.by_stiffness.T
-    own = np.diag(units.stiffness)
-    found[:, 8] = np.log(0.02 * (units.high - units.low) / units.unit)
-    found[:, 9] = np.log(own * units.turn / units.step)
-    found[:, 10] = np.log(np.sqrt(own / model.network.m) * model.spacing)
-    return found, problems.cost / mean
+    inertia = model.response.network.m
+    root = np.sqrt(inertia / inertia.mean())
+    share = np.gradient(model.response.instants.astype(float))
+    share[[0, -1]] *= 0.5
+    mean = model.response.stiffness + np.einsum("i,bign->bgn", share / share.sum(), linear.stiffness)
+    squares, u = np.linalg.eigh(mean / np.outer(root, root))
+    rate, h = model.response.rate, float(model.response.fine[1])
+    step = np.stack([oscillators(row / inertia.mean(), rate, h) for row in squares])
+    step[..., 2:] /= inertia.mean()
+    leverage = np.einsum("bg,bgm->bm", mean.sum(axis=1) / root, u)
+    return np.ascontiguousarray(root[:, None] * u), step, leverage
 
 
 def static_cost(outset: Outset) -> Array:
@@ -112,59 +140,20 @@ def static_cost(outset: Outset) -> Array:
     return np.asarray(np.maximum(cost.mean(axis=1), SMALLEST_COST * max(1.0, static.shape[2] / 2)))
 
 
-def times_of(n_knots: int) -> Array:
-    """Channels that depend on the knot alone, (2, n_knots)."""
-    t = np.linspace(0.0, 1.0, n_knots)
-    return np.stack([t, np.exp(-DECAYS * t)])
+class CompiledIterations:
+    """The same function as `UnrolledIterations`, with its state dict as arrays; powers in float64."""
 
-
-def _taps(weights: Array32) -> Array32:
-    """Those of knots before, here and after one upon another, not beside each other."""
-    return np.ascontiguousarray(np.concatenate(np.split(weights, 3, axis=-1), axis=-2))
-
-
-class CompiledNetwork:
-    """The same function as an UnrolledNetwork, with its state dict as arrays; powers in float64."""
-
-    def __init__(self, model: PathModel, state: Mapping[str, np.ndarray]) -> None:
-        n_stages = 1 + max(int(name.split(".")[1]) for name in state)
-        layer = {
-            name: np.stack([state[f"stages.{i}.{name}"] for i in range(n_stages)]).astype(np.float32)
-            for name in (key.removeprefix("stages.0.") for key in state if key.startswith("stages.0."))
-        }
-        times = times_of(len(model.response.knots)).astype(np.float32)
-        self._weights = Weights(
-            first=_taps(layer["first"]),
-            constant=np.ascontiguousarray(layer["constant"].swapaxes(1, 2)),
-            times=layer["constant"][:, :, TIMES] @ times + layer["first_bias"][:, :, None],
-            spread=_taps(layer["spread"]),
-            spread_bias=layer["spread_bias"],
-            mix=layer["mix"],
-            mix_bias=layer["mix_bias"],
-            last=layer["last"],
-            last_bias=layer["last_bias"],
-        )
-        self._model, self._units, modes = model, units_of(model), model.modes
+    def __init__(self, model: PathModel, weights: Mapping[str, np.ndarray], iterations: int) -> None:
+        self._model, self._limits, modes = model, limits_of(model), model.modes
+        self._settings = settings_of(weights["nodes"], iterations)
+        self._settings[:, :PENALTIES] *= self._limits.price
         self._modes = modes._replace(
             step=modes.step.astype(np.float32), damping=modes.damping.astype(np.float32)
         )
-        self._dilations = np.array(dilations_of(model.spacing))
 
-    def __call__(self, outset: Outset, linear: Linear) -> Array:
-        """Powers at the knots, (batch, n_knots, n_gen), pu."""
-        constant, cost = constants_of(self._model, self._units, outset)
-        given = Given(
-            cost=cost,
-            static=np.ascontiguousarray(outset.static.swapaxes(1, 2)),
-            fixed=np.ascontiguousarray(outset.fixed[:, ::FINE].swapaxes(1, 2)),
-            offset=linear.offset.astype(np.float32),
-            slack=linear.slack.astype(np.float32),
-            leverage=self._model.slack_stiffness(linear).astype(np.float32) @ self._units.shape.T,
-            change=linear.change.astype(np.float32),
-            state=outset.state.astype(np.float32),
-            constant=np.ascontiguousarray(constant.swapaxes(1, 2), np.float32),
-            scale=static_cost(outset) / np.maximum(outset.problems.cost.mean(axis=1), FREE),
-        )
-        powers = outset.start.copy()
-        answer(powers, given, self._units, self._modes, self._dilations, self._weights)
+    def __call__(self, outset: Outset, linear: Linear, start: Array) -> Array:
+        """Powers at the knots, from first ones, both (batch, n_knots, n_gen), pu."""
+        powers = start.copy()
+        given = given_of(self._model, outset, linear)
+        answer(powers, given, self._limits, self._modes, self._settings)
         return powers

@@ -7,24 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from ded_bench.methods.dpc_shared.iteration_records import DOUBLING, STRAIGHT
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
-from ded_bench.methods.dpc_shared.stage_records import DOUBLING, STRAIGHT
 from ded_bench.methods.dpc_shared.unrolled_inference import static_cost
-from ded_bench.problem.case import Array
+from ded_bench.methods.dpc_shared.unrolled_iterations import Outcome, means_over_time
 
 #: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
 MARGIN = 0.015
-#: The price of the penalty grows from a part of `stage_records.PRICE` to it.
-FIRST_PRICE = 0.125
-#: Part of the loss of each stage before the last.
-EARLIER = 0.1
-
-#: Powers (batch, n_knots, n_gen), ω (batch, n_fine, n_gen) and P_s (batch, n_fine).
-Outcome = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +34,8 @@ class ScheduleLoss:
     def __init__(self, model: PathModel) -> None:
         self.model = model
         self.spacing = float(model.response.fine[1])
-        self.at_fine = _means(model.response.fine)
-        self.at_knots = _means(model.response.knots)
+        self.at_fine = means_over_time(len(model.response.fine))
+        self.at_knots = means_over_time(len(model.response.knots))
 
     def __call__(self, outset: Outset, outcome: Outcome, margin: float = 0.0) -> Judged:
         """Judge schedules by what they do.
@@ -62,22 +54,3 @@ class ScheduleLoss:
         penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * self.spacing
         scale = torch.as_tensor(static_cost(outset), dtype=torch.float32)
         return Judged(total / scale, penalty, excess.amax(dim=(1, 2)))
-
-
-def total_loss(judged: list[Judged], price: float, used: Tensor) -> Tensor:
-    """Loss over all stages; the last one counts most.
-
-    Args:
-        judged: of each stage.
-        price: of the penalty.
-        used: which problems count, (batch,).
-    """
-    parts = [(j.cost + price * j.penalty)[used].mean() for j in judged]
-    return parts[-1] + EARLIER * torch.stack([*parts[:-1], parts[-1].new_zeros(())]).sum()
-
-
-def _means(times: Array) -> Tensor:
-    """Weights of the mean over time of what is linear between points."""
-    weights = np.gradient(times)
-    weights[[0, -1]] *= 0.5
-    return torch.as_tensor(weights / weights.sum(), dtype=torch.float32)

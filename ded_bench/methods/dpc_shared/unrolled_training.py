@@ -19,13 +19,13 @@ from ded_bench.files.errors import InputError
 from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc_shared.drawn_problems import Problems, draw
 from ded_bench.methods.dpc_shared.grid_response import GridResponse
+from ded_bench.methods.dpc_shared.iteration_records import PRICE
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
 from ded_bench.methods.dpc_shared.shared_margin import with_margin
 from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy
-from ded_bench.methods.dpc_shared.stage_records import PRICE
 from ded_bench.methods.dpc_shared.unrolled_inference import weight_shapes
-from ded_bench.methods.dpc_shared.unrolled_loss import FIRST_PRICE, MARGIN, ScheduleLoss, total_loss
-from ded_bench.methods.dpc_shared.unrolled_network import UnrolledNetwork
+from ded_bench.methods.dpc_shared.unrolled_iterations import UnrolledIterations
+from ded_bench.methods.dpc_shared.unrolled_loss import MARGIN, ScheduleLoss
 from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
@@ -33,16 +33,19 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
-#: Stages of the network and its width.
-STAGES, WIDTH = 5, 16
+#: Iterations of an answer: the fewest, and times generators on small grids, where they take less time.
+FEWEST, ROUNDS = 10, 60
 #: Steps of an epoch, epochs.
-STEPS, EPOCHS = 100, 80
+STEPS, EPOCHS = 100, 15
 #: Problems of a step: so many that generators times knots of all are near the first number.
 ROWS, SMALLEST_BATCH = 4000, 8
-LEARNING_RATE, WEIGHT_DECAY, CLIP_NORM = 4e-3, 1e-4, 1.0
+LEARNING_RATE, CLIP_NORM = 3e-2, 1.0
 #: Fractions of the training: warm-up of the learning rate, then a cosine down to `LAST` of it.
 WARM_UP, LAST = 0.02, 1e-3
 AVERAGE = 0.998  # of the weights, exponentially
+#: Penalty, as a part of an instance's cost, of which half counts: a few instances have no feasible schedule,
+#: and would else be all that is learned from.
+HOPELESS = 0.03
 #: Most instances on which weights are compared.
 HELD_OUT = 100
 PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
@@ -50,12 +53,16 @@ PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
 
 @dataclass(frozen=True)
 class Variant:
-    """What a training may choose of network and optimiser."""
+    """What a training may choose."""
 
-    stages: int = STAGES
-    width: int = WIDTH
+    iterations: int | None = None  # by the size of the case
     rate: float = LEARNING_RATE
-    price: float = PRICE  # of the penalty, at the end of the training
+    price: float = PRICE  # of the penalty
+
+
+def iterations_of(case: Case) -> int:
+    """Iterations of an answer, by the size of a case."""
+    return max(FEWEST, ROUNDS // len(case.generators))
 
 
 def batch_of(case: Case) -> int:
@@ -89,18 +96,16 @@ def train(
     horizon = instances[0].horizon_s
     response = GridResponse.make(case, case.knot_times(horizon))
     path_model = PathModel(case, case.omega_bound(regime), response)
-    with torch.random.fork_rng():
-        torch.manual_seed(options.seed)
-        network = UnrolledNetwork(path_model, chosen.stages, chosen.width)
-    start = read_start(options.start, chosen) if options.start else None
+    unrolled = UnrolledIterations(path_model, chosen.iterations or iterations_of(case))
+    start = read_start(options.start) if options.start else None
     if start is not None:
-        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
+        unrolled.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
     check = path_model.outset(Problems.of(case, instances[:HELD_OUT], response.fine))
-    run = _Run(network, options.seed, chosen, batch_of(case), checkpoint_file(out))
+    run = _Run(unrolled, options.seed, chosen, batch_of(case), checkpoint_file(out))
     if options.resume and run.checkpoint.is_file():
         run.load()
     run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
-    network.load_state_dict(run.best_weights)
+    unrolled.load_state_dict(run.best_weights)
     training = {
         "seed": options.seed,
         "epochs": run.epoch,
@@ -111,46 +116,44 @@ def train(
         "instances": run.step * run.batch,
         "held_out": len(check.served),
         "held_out_loss": run.best,
-        "parameters": sum(p.numel() for p in network.parameters()),
+        "parameters": sum(p.numel() for p in unrolled.parameters()),
         "price": chosen.price,
         "start": weights_fingerprint(start) if start is not None else "",
         "torch": torch.__version__,
         "code": options.code,
         "device": options.device,
     }
-    policy = with_margin(SharedPolicy.of(Scope(case, regime, horizon), network, training), instances)
+    policy = with_margin(SharedPolicy.of(Scope(case, regime, horizon), unrolled, training), instances)
     policy.save(out)
     write_history(out, run.history)
     return policy
 
 
-def read_start(path: Path, chosen: Variant) -> Weights:
+def read_start(path: Path) -> Weights:
     """Weights of a policy of whatever grid and regime, to start from.
 
     Raises:
-        InputError: the file is wrong, or holds another network.
+        InputError: the file is wrong, or a policy of another method.
     """
     arrays, header = read_arrays(path)
     if header.get("method") != METHOD:
         raise InputError(path, "method", f"is no {METHOD} policy")
-    return checked_weights(arrays, weight_shapes(chosen.stages, chosen.width), path)
+    return checked_weights(arrays, weight_shapes(), path)
 
 
 class _Run:
-    """The state of one training: network, average of its weights, optimiser, progress."""
+    """The state of one training: iterations, average of their weights, optimiser, progress."""
 
     def __init__(
-        self, network: UnrolledNetwork, seed: int, chosen: Variant, batch: int, checkpoint: Path
+        self, unrolled: UnrolledIterations, seed: int, chosen: Variant, batch: int, checkpoint: Path
     ) -> None:
-        self.network, self.seed, self.batch, self.checkpoint = network, seed, batch, checkpoint
+        self.unrolled, self.seed, self.batch, self.checkpoint = unrolled, seed, batch, checkpoint
         self.rate, self.price = chosen.rate, chosen.price
-        self.loss = ScheduleLoss(network.model)
-        self.average = copy.deepcopy(network)
-        self.optimiser = torch.optim.AdamW(
-            network.parameters(), lr=chosen.rate, weight_decay=WEIGHT_DECAY, betas=(0.9, 0.99)
-        )
+        self.loss = ScheduleLoss(unrolled.model)
+        self.average = copy.deepcopy(unrolled)
+        self.optimiser = torch.optim.Adam(unrolled.parameters(), lr=chosen.rate, betas=(0.9, 0.99))
         self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
-        self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
+        self.best, self.best_weights = math.inf, copy.deepcopy(unrolled.state_dict())
         self.history: list[dict[str, float]] = []
 
     def go(self, check: Outset, epochs: int, seconds: float | None, title: str) -> None:
@@ -175,30 +178,31 @@ class _Run:
         falling = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate * falling * min(1.0, 0.05 + progress / WARM_UP)
-        model = self.network.model
+        model = self.unrolled.model
         # a generator of its own for every step: a training that goes on draws what it would have drawn
         generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, self.step]))
         outset = model.outset(draw(model.case, model.bound, model.response.fine, self.batch, generator))
-        outcomes = self.network(outset)
-        price = self.price * FIRST_PRICE ** (1.0 - progress)
-        judged = [self.loss(outset, outcome, MARGIN) for outcome in outcomes]
+        judged = self.loss(outset, self.unrolled(outset), MARGIN)
         self.step += 1
         used = torch.as_tensor(outset.served)
         if not used.any():
             return
         self.optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(total_loss(judged, price, used))
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
+        penalty = self.price * judged.penalty
+        torch.autograd.backward((judged.cost + penalty / (1.0 + penalty / HOPELESS))[used].mean())
+        norm = torch.nn.utils.clip_grad_norm_(self.unrolled.parameters(), CLIP_NORM)
         if not torch.isfinite(norm):
             return
         self.optimiser.step()
         keep = min(AVERAGE, 1.0 - 1.0 / (1.0 + self.step / 10.0))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - keep)
+            torch._foreach_lerp_(
+                list(self.average.parameters()), list(self.unrolled.parameters()), 1.0 - keep
+            )
 
     def _validate(self, check: Outset) -> dict[str, float]:
         with torch.no_grad():
-            outcome = self.average(check)[-1]
+            outcome = self.average(check)
             tight, own = (self.loss(check, outcome, margin) for margin in (MARGIN, 0.0))
         value = float((tight.cost + self.price * tight.penalty).mean())
         hertz = own.excess * self.loss.model.bound / (2 * math.pi)
@@ -218,7 +222,7 @@ class _Run:
 
     def _save(self) -> None:
         state: dict[str, Any] = {name: getattr(self, name) for name in PROGRESS}
-        state |= {name: getattr(self, name).state_dict() for name in ("network", "average", "optimiser")}
+        state |= {name: getattr(self, name).state_dict() for name in ("unrolled", "average", "optimiser")}
         save_checkpoint(self.checkpoint, state)
 
     def load(self) -> None:
@@ -228,7 +232,7 @@ class _Run:
             InputError: it is no checkpoint, or one of another training.
         """
         with reading_checkpoint(self.checkpoint, "cpu") as state:
-            for name in ("network", "average", "optimiser"):
+            for name in ("unrolled", "average", "optimiser"):
                 getattr(self, name).load_state_dict(state[name])
             for name in PROGRESS:
                 setattr(self, name, state[name])

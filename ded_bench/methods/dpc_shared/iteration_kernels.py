@@ -1,0 +1,410 @@
+"""All that Numba compiles of the policy itself: the grid's response and its transpose, and the iterations.
+
+Numba's cache on disk notices that a function's own file changed, not that a function which it calls did.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ded_bench.methods.dpc_shared.iteration_records import (
+    DOUBLING,
+    PRICE,
+    STRAIGHT,
+    Array32,
+    Floats,
+    Given,
+    Limits,
+    Modes,
+)
+from ded_bench.problem.case import Array
+from ded_bench.problem.compiled import compiled
+
+
+@compiled
+def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> None:
+    """Advance problems from one fine point to the next: q̈ + γ q̇ + λ q + δD q̇ + C(t) q = v.
+
+    Strang's splitting: half a kick by δD and C, the exact map of the rest, half a kick. Both are symmetric,
+    so that products add up rows.
+
+    Args:
+        modes: the grid; its arrays and the others are all of one precision.
+        change: C at the instants, linear between, (batch, n_instants, n_modes, n_modes), 1/s².
+        v: inputs, (batch, n_fine, n_modes).
+        q: coordinates, (batch, n_fine, n_modes); the first row is given.
+        speed: their derivatives, likewise.
+    """
+    n = v.shape[2]
+    kicked, kick, damped = np.empty(n, v.dtype), np.empty(n, v.dtype), np.any(modes.damping != 0.0)
+    shares = np.empty(3, v.dtype)  # of C before and after, and of δD, times half a step
+    for b in range(len(v)):
+        part = 0
+        for k in range(v.shape[1]):
+            if k > modes.instants[part + 1] and part + 2 < len(modes.instants):
+                part += 1
+            share = (k - modes.instants[part]) / (modes.instants[part + 1] - modes.instants[part])
+            if k > 0:
+                for i in range(n):
+                    a, before = modes.step[i], v[b, k - 1, i]
+                    q[b, k, i] = (
+                        a[0, 0] * q[b, k - 1, i]
+                        + a[0, 1] * kicked[i]
+                        + a[0, 2] * before
+                        + a[0, 3] * v[b, k, i]
+                    )
+                    speed[b, k, i] = (
+                        a[1, 0] * q[b, k - 1, i]
+                        + a[1, 1] * kicked[i]
+                        + a[1, 2] * before
+                        + a[1, 3] * v[b, k, i]
+                    )
+            shares[0], shares[1], shares[2] = modes.half * (1.0 - share), modes.half * share, modes.half
+            kick[:] = 0.0
+            for j in range(n):
+                now, later = shares[0] * q[b, k, j], shares[1] * q[b, k, j]
+                left, right = change[b, part, j], change[b, part + 1, j]
+                for i in range(n):
+                    kick[i] += now * left[i] + later * right[i]
+            if damped:
+                for j in range(n):
+                    loss, row = shares[2] * speed[b, k, j], modes.damping[j]
+                    for i in range(n):
+                        kick[i] += loss * row[i]
+            for i in range(n):
+                if k > 0:
+                    speed[b, k, i] -= kick[i]
+                kicked[i] = speed[b, k, i] - kick[i]
+
+
+@compiled
+def track_rows(targets: Array, low: Array, high: Array, step: Array) -> None:
+    """Follow targets within bounds and ramps, in place.
+
+    Args:
+        targets: of several schedules, (batch, n_knots, n_gen), pu; the first knot's are P_0.
+        low: (n_gen,), pu; likewise `high`.
+        step: largest change between two knots, (n_gen,), pu.
+    """
+    for b in range(len(targets)):
+        for j in range(1, targets.shape[1]):
+            for g in range(targets.shape[2]):
+                before = targets[b, j - 1, g]
+                target = min(max(targets[b, j, g], low[g]), high[g])
+                targets[b, j, g] = min(max(target, before - step[g]), before + step[g])
+
+
+@compiled
+def swing_adjoint(modes: Modes, change: Floats, on_q: Floats, on_speed: Floats, on_v: Floats) -> None:
+    """Gradient in the inputs of a function with these gradients in q and q̇; the transpose of `swing`.
+
+    The kick by damping after a step is taken with the speed before it; C and δD are symmetric.
+
+    Args:
+        modes: the grid; its arrays and the others are all of one precision.
+        change: see `swing`.
+        on_q: (batch, n_fine, n_modes).
+        on_speed: likewise.
+        on_v: receives the gradient, likewise.
+    """
+    n, damped = on_v.shape[2], np.any(modes.damping != 0.0)
+    by_q, by_speed, by_kicked = np.empty(n, on_v.dtype), np.empty(n, on_v.dtype), np.empty(n, on_v.dtype)
+    kick, loss, shares = np.empty(n, on_v.dtype), np.zeros(n, on_v.dtype), np.empty(3, on_v.dtype)
+    for b in range(len(on_v)):
+        by_q[:] = 0.0  # of q and of the kicked speed at this point, from what follows
+        by_kicked[:] = 0.0
+        on_v[b] = 0.0
+        part = len(modes.instants) - 2
+        for k in range(on_v.shape[1] - 1, 0, -1):
+            if k <= modes.instants[part] and part > 0:
+                part -= 1
+            share = (k - modes.instants[part]) / (modes.instants[part + 1] - modes.instants[part])
+            shares[0], shares[1], shares[2] = modes.half * (1.0 - share), modes.half * share, modes.half
+            # kicked = speed - kick(q, speed₀) and speed = speed₀ - kick(q, speed₀), where speed₀ came of the
+            # step; kicked takes the kick of both
+            for i in range(n):
+                by_speed[i] = on_speed[b, k, i] + by_kicked[i]
+            kick[:] = 0.0
+            for j in range(n):
+                both = by_speed[j] + by_kicked[j]
+                now, later = shares[0] * both, shares[1] * both
+                left, right = change[b, part, j], change[b, part + 1, j]
+                for i in range(n):
+                    kick[i] += now * left[i] + later * right[i]
+            if damped:
+                loss[:] = 0.0
+                for j in range(n):
+                    both, row = shares[2] * (by_speed[j] + by_kicked[j]), modes.damping[j]
+                    for i in range(n):
+                        loss[i] += both * row[i]
+            for i in range(n):
+                a, back = modes.step[i], by_speed[i] - loss[i]  # of speed₀
+                here = by_q[i] + on_q[b, k, i] - kick[i]
+                on_v[b, k, i] += a[0, 3] * here + a[1, 3] * back
+                on_v[b, k - 1, i] += a[0, 2] * here + a[1, 2] * back
+                by_q[i] = a[0, 0] * here + a[1, 0] * back
+                by_kicked[i] = a[0, 1] * here + a[1, 1] * back
+
+
+@compiled
+def answer(powers: Array, given: Given, limits: Limits, modes: Modes, settings: Array) -> None:
+    """Turn first schedules into answers by iterations of ADMM; see `unrolled_inference`.
+
+    An answer is the last schedule within its limits, or the first if that is better.
+
+    Args:
+        powers: (batch, n_knots, n_gen), pu; receives the answers.
+        given: the problems.
+        limits: of the case.
+        modes: of the case.
+        settings: of each iteration, (n_iterations, 7); the columns are those of `SETTINGS`.
+    """
+    batch, n, n_gen = powers.shape
+    n_fine = given.offset.shape[1]
+    omega, p_slack = np.empty((n_fine, n_gen), np.float32), np.empty(n_fine, np.float32)
+    p, gradient = np.empty((n, n_gen)), np.empty((n, n_gen))
+    # copies and duals
+    bounded, moved = np.empty((2, n, n_gen)), np.empty((2, n, n_gen))
+    speeds, slack = np.empty((2, n_fine, n_gen), np.float32), np.empty((2, n_fine))
+    for b in range(batch):
+        p[:] = powers[b]
+        _respond(p, given, b, limits, modes, omega, p_slack)
+        first = _loss(p, omega, p_slack, given, b, limits, modes)
+        bounded[0], speeds[0], slack[0] = p, omega, p_slack
+        moved[0, 0], moved[0, 1:] = 0.0, p[1:] - p[:-1]
+        bounded[1], moved[1], speeds[1], slack[1] = 0.0, 0.0, 0.0, 0.0
+        for i in range(len(settings)):
+            if i > 0:
+                _respond(p, given, b, limits, modes, omega, p_slack)
+            _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
+            _project_response(omega, p_slack, given, b, limits, modes, settings[i], speeds, slack, gradient)
+            _improve(p, gradient, given, b, limits, settings[i])
+        track_rows(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
+        _respond(p, given, b, limits, modes, omega, p_slack)
+        if _loss(p, omega, p_slack, given, b, limits, modes) <= first:
+            powers[b] = p
+
+
+@compiled
+def _project_powers(
+    p: Array, cost: Array, limits: Limits, setting: Array, bounded: Array, moved: Array, gradient: Array
+) -> None:
+    """Copies and duals of powers and their changes; `gradient` receives that of cost and both, in powers."""
+    (n, n_gen), relaxed = p.shape, setting[5]
+    for j in range(n):
+        share = (0.5 if j == n - 1 else 1.0) / (n - 1)
+        for g in range(n_gen):
+            gradient[j, g] = 0.0
+            if j == 0:
+                continue
+            weight = setting[0] / (limits.mass[g] * limits.unit**2)
+            wanted = relaxed * p[j, g] + (1.0 - relaxed) * bounded[0, j, g] + bounded[1, j, g] / weight
+            kept = min(max(wanted, limits.low[g]), limits.high[g])
+            bounded[0, j, g], bounded[1, j, g] = kept, weight * (wanted - kept)
+            gradient[j, g] = share * cost[1 + g] + bounded[1, j, g] + weight * (p[j, g] - kept)
+            weight = setting[1] / (limits.mass[g] * limits.unit**2)
+            change = p[j, g] - p[j - 1, g]
+            wanted = relaxed * change + (1.0 - relaxed) * moved[0, j, g] + moved[1, j, g] / weight
+            kept = min(max(wanted, -limits.step[g]), limits.step[g])
+            moved[0, j, g], moved[1, j, g] = kept, weight * (wanted - kept)
+            force = moved[1, j, g] + weight * (change - kept)
+            gradient[j, g] += force
+            gradient[j - 1, g] -= force
+
+
+@compiled
+def _project_response(
+    omega: Array32,
+    p_slack: Array32,
+    given: Given,
+    b: int,
+    limits: Limits,
+    modes: Modes,
+    setting: Array,
+    speeds: Array32,
+    slack: Array,
+    gradient: Array,
+) -> None:
+    """Copies and duals of ω and P_s; what they ask of powers is added to the gradient."""
+    (n_fine, n_gen), n, fine = omega.shape, len(gradient), (len(omega) - 1) // (len(gradient) - 1)
+    relaxed, tight = np.float32(setting[5]), np.float32(limits.bound * (1.0 - setting[6]))
+    weights = (setting[2] / (limits.bound**2 * fine) * limits.mass).astype(np.float32)
+    on_omega, on_v = np.empty((n_fine, n_gen), np.float32), np.empty((1, n_fine, n_gen), np.float32)
+    on_q, on_speed = np.empty_like(on_v), np.empty_like(on_v)
+    heavy, other = setting[3] / (limits.unit**2 * fine), np.float32(1.0) - relaxed
+    for k in range(n_fine):
+        for g in range(n_gen):
+            here, weight = omega[k, g], weights[g]
+            wanted = relaxed * here + other * speeds[0, k, g] + speeds[1, k, g] / weight
+            kept = min(max(wanted, -tight), tight)
+            speeds[0, k, g], speeds[1, k, g] = kept, weight * (wanted - kept)
+            on_omega[k, g] = speeds[1, k, g] + weight * (here - kept)
+        price = (0.5 if k == 0 or k == n_fine - 1 else 1.0) / (n_fine - 1) * given.cost[b, 0] / heavy
+        drawn = setting[5] * p_slack[k] + (1.0 - setting[5]) * slack[0, k] + slack[1, k] / heavy
+        least = max(drawn - price, 0.0) + min(drawn + price, 0.0)
+        slack[0, k], slack[1, k] = least, heavy * (drawn - least)
+        force = np.float32(slack[1, k] + heavy * (p_slack[k] - least))
+        for m in range(n_gen):
+            on_q[0, k, m] = -force * given.leverage[b, k, m]
+    np.dot(on_omega, limits.shape.T, on_speed[0])
+    swing_adjoint(modes, given.change[b : b + 1], on_q, on_speed, on_v)
+    np.dot(on_v[0], limits.gain.T, on_omega)
+    for j in range(n - 1):
+        for i in range(fine):
+            share = i / fine
+            for g in range(n_gen):
+                gradient[j, g] += (1.0 - share) * on_omega[j * fine + i, g]
+                gradient[j + 1, g] += share * on_omega[j * fine + i, g]
+    for g in range(n_gen):
+        gradient[n - 1, g] += on_omega[n_fine - 1, g]
+
+
+@compiled
+def _improve(p: Array, gradient: Array, given: Given, b: int, limits: Limits, setting: Array) -> None:
+    """Minimise the quadratic model around a schedule, in the modes of the mean stiffness."""
+    fine = (given.offset.shape[1] - 1) // (len(p) - 1)
+    per_unit = 1.0 / limits.unit**2
+    weights = np.empty(4)
+    weights[0], weights[1] = setting[0] * per_unit, setting[1] * per_unit
+    weights[2] = setting[2] / (limits.bound**2 * fine)
+    weights[3] = setting[3] * setting[4] * per_unit / fine
+    modes, change = given.mean_modes[b], np.empty_like(p)
+    modal = np.dot(gradient, modes)
+    modal_change(given.mean_step[b], given.mean_leverage[b], fine, weights, modal, change)
+    p += np.dot(change, modes.T)
+
+
+@compiled
+def modal_change(
+    step: Array, leverage: Array, fine: int, weights: Array, gradient: Array, change: Array
+) -> None:
+    """Minimise gradient · v + ½ v · A v mode by mode, by dynamic programming (a Riccati recursion).
+
+    A weighs, with `weights`: powers v at the knots, their changes, and at the fine points q̇ and P_s of each
+    mode alone. Before t = 0, and there, all is 0.
+
+    Args:
+        step: as `Modes.step`, (n_modes, 2, 4).
+        leverage: what a mode takes from the slack, (n_modes,), pu/rad.
+        fine: fine points per interval.
+        weights: (4,).
+        gradient: (n_knots, n_modes); the first knot's does not matter.
+        change: receives v, likewise; 0 at the first knot.
+    """
+    n, n_modes = gradient.shape
+    maps = interval_maps(step, fine)
+    to_q, to_s = maps[fine, 0].copy(), maps[fine, 1].copy()  # of (q, q̇, v, v⁺), (4, n_modes)
+    form = np.zeros((4, 4, n_modes))  # quadratic in them over one interval
+    for i in range(1, fine + 1):
+        for r in range(4):
+            for c in range(4):
+                form[r, c] += weights[2] * maps[i, 1, r] * maps[i, 1, c]
+                form[r, c] += weights[3] * leverage**2 * maps[i, 0, r] * maps[i, 0, c]
+    form[2, 2] += weights[1]
+    form[2, 3] -= weights[1]
+    form[3, 3] += weights[1] + weights[0]
+    gains, inverse = np.empty((n - 1, 3, n_modes)), np.empty((n - 1, n_modes))
+    value, linear, pull = np.zeros((6, n_modes)), np.zeros((3, n_modes)), np.empty((n - 1, n_modes))
+    for k in range(n - 2, -1, -1):
+        for m in range(n_modes):
+            a0, a1, a2, a3 = to_q[0, m], to_q[1, m], to_q[2, m], to_q[3, m]
+            b0, b1, b2, b3 = to_s[0, m], to_s[1, m], to_s[2, m], to_s[3, m]
+            v00, v01, v02 = value[0, m], value[1, m], value[2, m]
+            v11, v12, v22 = value[3, m], value[4, m], value[5, m]
+            # rows of q and q̇ of the value after the interval times the map of (q, q̇, v, v⁺) to (q⁺, q̇⁺, v⁺)
+            q0, s0 = v00 * a0 + v01 * b0, v01 * a0 + v11 * b0
+            q1, s1 = v00 * a1 + v01 * b1, v01 * a1 + v11 * b1
+            q2, s2 = v00 * a2 + v01 * b2, v01 * a2 + v11 * b2
+            q3, s3 = v00 * a3 + v01 * b3 + v02, v01 * a3 + v11 * b3 + v12
+            own = form[3, 3, m] + a3 * q3 + b3 * s3 + v02 * a3 + v12 * b3 + v22
+            u0 = form[0, 3, m] + a0 * q3 + b0 * s3
+            u1 = form[1, 3, m] + a1 * q3 + b1 * s3
+            u2 = form[2, 3, m] + a2 * q3 + b2 * s3
+            g0, g1, g2 = u0 / own, u1 / own, u2 / own
+            gains[k, 0, m], gains[k, 1, m], gains[k, 2, m], inverse[k, m] = g0, g1, g2, 1.0 / own
+            value[0, m] = form[0, 0, m] + a0 * q0 + b0 * s0 - u0 * g0
+            value[1, m] = form[0, 1, m] + a0 * q1 + b0 * s1 - u0 * g1
+            value[2, m] = form[0, 2, m] + a0 * q2 + b0 * s2 - u0 * g2
+            value[3, m] = form[1, 1, m] + a1 * q1 + b1 * s1 - u1 * g1
+            value[4, m] = form[1, 2, m] + a1 * q2 + b1 * s2 - u1 * g2
+            value[5, m] = form[2, 2, m] + a2 * q2 + b2 * s2 - u2 * g2
+            l0, l1 = linear[0, m], linear[1, m]
+            force = a3 * l0 + b3 * l1 + linear[2, m] + gradient[k + 1, m]
+            pull[k, m] = force
+            linear[0, m] = a0 * l0 + b0 * l1 - g0 * force
+            linear[1, m] = a1 * l0 + b1 * l1 - g1 * force
+            linear[2, m] = a2 * l0 + b2 * l1 - g2 * force
+    state = np.zeros((2, n_modes))
+    change[0] = 0.0
+    for k in range(n - 1):
+        for m in range(n_modes):
+            q, speed, before = state[0, m], state[1, m], change[k, m]
+            v = -(gains[k, 0, m] * q + gains[k, 1, m] * speed + gains[k, 2, m] * before)
+            v -= pull[k, m] * inverse[k, m]
+            change[k + 1, m] = v
+            state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
+            state[1, m] = to_s[0, m] * q + to_s[1, m] * speed + to_s[2, m] * before + to_s[3, m] * v
+
+
+@compiled
+def interval_maps(step: Array, fine: int) -> Array:
+    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the fine points between, (fine + 1, 2, 4, n_modes)."""
+    maps = np.zeros((fine + 1, 2, 4, len(step)))
+    maps[0, 0, 0] = maps[0, 1, 1] = 1.0
+    for i in range(fine):
+        for r in range(2):
+            for c in range(4):
+                maps[i + 1, r, c] = step[:, r, 0] * maps[i, 0, c] + step[:, r, 1] * maps[i, 1, c]
+            for c, share in ((2, 1.0 - i / fine), (3, i / fine)):
+                maps[i + 1, r, c] += step[:, r, 2] * share
+            for c, share in ((2, 1.0 - (i + 1) / fine), (3, (i + 1) / fine)):
+                maps[i + 1, r, c] += step[:, r, 3] * share
+    return maps
+
+
+@compiled
+def _loss(
+    p: Array, omega: Array32, p_slack: Array32, given: Given, b: int, limits: Limits, modes: Modes
+) -> float:
+    """Cost as a part of the static dispatch's, and the penalty; see `ScheduleLoss`."""
+    cost, penalty, (n, n_gen), n_fine = 0.0, 0.0, p.shape, len(p_slack)
+    for j in range(n):
+        for g in range(n_gen):
+            share = 0.5 if j == 0 or j == n - 1 else 1.0
+            cost += share * given.cost[b, 1 + g] * p[j, g] / (n - 1)
+    for k in range(n_fine):
+        share = 0.5 if k == 0 or k == n_fine - 1 else 1.0
+        cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_fine - 1)
+        for g in range(n_gen):
+            excess = abs(omega[k, g]) / limits.bound - 1.0
+            if excess > 0.0:
+                bent = min(excess, STRAIGHT)
+                penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
+    return float(cost + PRICE * penalty * 2.0 * modes.half)
+
+
+@compiled
+def _respond(
+    powers: Array, given: Given, b: int, limits: Limits, modes: Modes, omega: Array32, p_slack: Array32
+) -> None:
+    """What a schedule does: ω (n_fine, n_gen) and P_s (n_fine,); see `PathModel.respond`."""
+    (n, n_gen), n_fine = powers.shape, len(p_slack)
+    fine, force = (n_fine - 1) // (n - 1), np.empty((1, n_fine, n_gen), np.float32)
+    q, speed, p_fine = np.empty_like(force), np.empty_like(force), np.empty_like(omega)
+    for j in range(n - 1):
+        for i in range(fine):
+            share = i / fine
+            for g in range(n_gen):
+                here = powers[j, g] + share * (powers[j + 1, g] - powers[j, g])
+                p_fine[j * fine + i, g] = here + given.offset[b, j * fine + i, g]
+    for g in range(n_gen):
+        p_fine[n_fine - 1, g] = powers[n - 1, g] + given.offset[b, n_fine - 1, g]
+    np.dot(p_fine, limits.gain, force[0])
+    q[0, 0], speed[0, 0] = given.state[b, 0], given.state[b, 1]
+    swing(modes, given.change[b : b + 1], force, q, speed)
+    np.dot(speed[0], limits.shape, omega)
+    for k in range(n_fine):
+        drawn = given.slack[b, k]
+        for m in range(n_gen):
+            drawn -= given.leverage[b, k, m] * q[0, k, m]
+        p_slack[k] = drawn

@@ -87,6 +87,8 @@ COMMA      := ,
 REAL_TIME  := --settings real-time$(if $(filter two-area,$(CASE)),$(COMMA)reserve) --model trajectory
 # What is swept: knots that keep their places from plan to plan; the margin depends on the grid (docs/online.md).
 KNOTS      := --settings $(if $(filter 9bus,$(CASE)),receding,receding-wide) $(SURROGATE)
+# The sweeps: on 9bus by knots that keep their places, elsewhere by the refined policy.
+SWEEP       = $(call OPERATE,$(if $(filter 9bus,$(CASE)),ded-ko-knots,$(REFINED)),sweep) $(if $(filter 9bus,$(CASE)),$(KNOTS))
 OPERATED   := $(if $(ANSWERING),$(POLICIES) $(REFINED))
 VALIDATION = $(subst --split $(SPLIT),--split validation,$(CHOICE))
 
@@ -171,9 +173,9 @@ online: train-ko  ## the closed loop: all methods at their own latency, then swe
 	$(if $(SURROGATE),$(call OPERATE,ded-ko-knots,real-time) $(REAL_TIME) --period 0.1)
 	$(foreach m,$(OPERATED),$(call OPERATE,$m,period) --period 0.1$(NEWLINE))
 	$(call OPERATE,ded-ko-knots,period) $(KNOTS) --period 0.1
-	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency $(LATENCIES)
-	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency 0,1,7,30 --forecast perfect,worse,persistence
-	$(call OPERATE,ded-ko-knots,sweep) $(KNOTS) --latency 1,7,30 --state present
+	$(SWEEP) --latency $(LATENCIES)
+	$(SWEEP) --latency 0,1,7,30 --forecast perfect,worse,persistence
+	$(SWEEP) --latency 1,7,30 --state present
 
 suite:  ## the reports of all cases, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done

@@ -19,7 +19,7 @@ import pandas as pd
 from ded_bench import Case, Settings, score, solve
 from ded_bench.koopman.reference_run import search_folders
 from ded_bench.methods.dpc_shared.shared_policy import find_policy
-from ded_bench.methods.dpc_shared.shared_refined import Refiner, margin_of
+from ded_bench.methods.dpc_shared.shared_refined import Refiner
 from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.sampling import sample_instance
@@ -61,8 +61,7 @@ def policies_on(grid: Case, files: dict[str, tuple[Case, Path]]) -> dict:
         known = find_policy(own, REGIME, Settings(policy=path))
         found[name] = dataclasses.replace(known, scope=dataclasses.replace(known.scope, case=grid))
     first = next(iter(found.values()))
-    bound = (1.0 - margin_of(first.model.response)) * grid.omega_bound(REGIME)
-    return found | {f"{next(iter(found))}, refined": Refiner(first, True, bound)}
+    return found | {f"{next(iter(found))}, refined": Refiner.of(first, learned=True)}
 
 
 def judged(grid: Case, policies: dict, draws: int) -> list[dict]:
@@ -78,7 +77,9 @@ def judged(grid: Case, policies: dict, draws: int) -> list[dict]:
             continue
         least = score(instance, best.schedule, REGIME, case=grid).objective
         for name, policy in policies.items():
-            verdict = score(instance, policy(instance)[0], REGIME, case=grid)
+            answer = policy(instance)
+            schedule = answer[0] if isinstance(answer, list) else answer
+            verdict = score(instance, schedule, REGIME, case=grid)
             rows.append(
                 {
                     "weights": name,

@@ -11,7 +11,7 @@ import torch
 
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.iteration_kernels import modal_change
-from ded_bench.methods.dpc_shared.path_kernels import oscillators
+from ded_bench.methods.dpc_shared.path_kernels import interval_maps, oscillators
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import ModalChange, Transposed
 from ded_bench.methods.dpc_shared.unrolled_inference import (
@@ -45,7 +45,7 @@ def test_quadratic_model_is_minimised_by_its_recursion() -> None:
     squares, leverage = np.array([3.0, 60.0]), np.array([1.3, -0.4])
     weights, gradient = np.array([0.2, 0.5, 7.0, 3.0]), rng.standard_normal((n, 2))
     found = np.empty_like(gradient)
-    modal_change(oscillators(squares, rate, h), leverage, FINE, weights, gradient, found)
+    modal_change(interval_maps(oscillators(squares, rate, h), FINE), leverage, weights, gradient, found)
     times, knots = h * np.arange(FINE * (n - 1) + 1), h * FINE * np.arange(n)
     for m in range(2):
         system = scipy.signal.StateSpace([[0, 1], [-squares[m], -rate]], [[0], [1]], np.eye(2), [[0], [0]])

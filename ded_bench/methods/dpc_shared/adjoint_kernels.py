@@ -39,33 +39,30 @@ def track_rows_adjoint(
 
 
 @compiled
-def modal_products(step: Array, leverage: Array, fine: int, one: Array, other: Array, found: Array) -> None:
+def modal_products(maps: Array, leverage: Array, one: Array, other: Array, found: Array) -> None:
     """One · A_i other for the parts A_i of the matrix of `modal_change`, one for each weight.
 
     Args:
-        step: of the mean modes, (batch, n_modes, 2, 4).
+        maps: of the mean modes, (batch, fine + 1, 2, 4, n_modes).
         leverage: what a mode takes from the slack, (batch, n_modes), pu/rad.
-        fine: fine points per interval.
         one: modal powers at the knots, (batch, n_knots, n_modes); likewise `other`.
         other: to multiply it with.
         found: receives the sums over the batch, (4,).
     """
     found[:] = 0.0
-    state = np.empty((2, 2))
+    x, y = np.zeros(4), np.zeros(4)  # (q, q̇, v, v⁺)
     for b in range(len(one)):
         for m in range(one.shape[2]):
-            state[:] = 0.0
-            a = step[b, m]
+            x[:], y[:] = 0.0, 0.0
             for j in range(1, one.shape[1]):
-                x, y, x_before, y_before = one[b, j, m], other[b, j, m], one[b, j - 1, m], other[b, j - 1, m]
-                found[0] += x * y
-                found[1] += (x - x_before) * (y - y_before)
-                for i in range(fine):
-                    here, there = i / fine, (i + 1) / fine
-                    for side, v, before in ((0, x, x_before), (1, y, y_before)):
-                        q, speed = state[side, 0], state[side, 1]
-                        now, later = before + here * (v - before), before + there * (v - before)
-                        state[side, 0] = a[0, 0] * q + a[0, 1] * speed + a[0, 2] * now + a[0, 3] * later
-                        state[side, 1] = a[1, 0] * q + a[1, 1] * speed + a[1, 2] * now + a[1, 3] * later
-                    found[2] += state[0, 1] * state[1, 1]
-                    found[3] += leverage[b, m] ** 2 * state[0, 0] * state[1, 0]
+                x[2], x[3] = one[b, j - 1, m], one[b, j, m]
+                y[2], y[3] = other[b, j - 1, m], other[b, j, m]
+                found[0] += x[3] * y[3]
+                found[1] += (x[3] - x[2]) * (y[3] - y[2])
+                for i in range(1, maps.shape[1]):
+                    to_q, to_speed = maps[b, i, 0, :, m], maps[b, i, 1, :, m]
+                    found[2] += (to_speed * x).sum() * (to_speed * y).sum()
+                    found[3] += leverage[b, m] ** 2 * (to_q * x).sum() * (to_q * y).sum()
+                last_q, last_speed = maps[b, -1, 0, :, m], maps[b, -1, 1, :, m]
+                x[0], x[1] = (last_q * x).sum(), (last_speed * x).sum()
+                y[0], y[1] = (last_q * y).sum(), (last_speed * y).sum()

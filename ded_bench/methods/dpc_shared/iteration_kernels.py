@@ -177,7 +177,9 @@ def answer(powers: Array, given: Given, limits: Limits, modes: Modes, settings: 
             if i > 0:
                 _respond(p, given, b, limits, modes, omega, p_slack)
             _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
-            _project_response(omega, p_slack, given, b, limits, modes, settings[i], speeds, slack, gradient)
+            _project_response(
+                (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
+            )
             _improve(p, gradient, given, b, limits, settings[i])
         track_rows(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
         _respond(p, given, b, limits, modes, omega, p_slack)
@@ -214,18 +216,18 @@ def _project_powers(
 
 @compiled
 def _project_response(
-    omega: Array32,
-    p_slack: Array32,
+    outcome: tuple[Array32, Array32],
+    copies: tuple[Array32, Array],
     given: Given,
     b: int,
     limits: Limits,
     modes: Modes,
     setting: Array,
-    speeds: Array32,
-    slack: Array,
     gradient: Array,
 ) -> None:
     """Copies and duals of ω and P_s; what they ask of powers is added to the gradient."""
+    omega, p_slack = outcome
+    speeds, slack = copies
     (n_fine, n_gen), n, fine = omega.shape, len(gradient), (len(omega) - 1) // (len(gradient) - 1)
     relaxed, tight = np.float32(setting[5]), np.float32(limits.bound * (1.0 - setting[6]))
     weights = (setting[2] / (limits.bound**2 * fine) * limits.mass).astype(np.float32)
@@ -270,32 +272,28 @@ def _improve(p: Array, gradient: Array, given: Given, b: int, limits: Limits, se
     weights[3] = setting[3] * setting[4] * per_unit / fine
     modes, change = given.mean_modes[b], np.empty_like(p)
     modal = np.dot(gradient, modes)
-    modal_change(given.mean_step[b], given.mean_leverage[b], fine, weights, modal, change)
+    modal_change(given.mean_maps[b], given.mean_leverage[b], weights, modal, change)
     p += np.dot(change, modes.T)
 
 
 @compiled
-def modal_change(
-    step: Array, leverage: Array, fine: int, weights: Array, gradient: Array, change: Array
-) -> None:
+def modal_change(maps: Array, leverage: Array, weights: Array, gradient: Array, change: Array) -> None:
     """Minimise gradient · v + ½ v · A v mode by mode, by dynamic programming (a Riccati recursion).
 
     A weighs, with `weights`: powers v at the knots, their changes, and at the fine points q̇ and P_s of each
-    mode alone. Before t = 0, and there, all is 0.
+    mode alone. Up to t = 0 all is 0.
 
     Args:
-        step: as `Modes.step`, (n_modes, 2, 4).
+        maps: of `interval_maps`, (fine + 1, 2, 4, n_modes).
         leverage: what a mode takes from the slack, (n_modes,), pu/rad.
-        fine: fine points per interval.
         weights: (4,).
         gradient: (n_knots, n_modes); the first knot's does not matter.
         change: receives v, likewise; 0 at the first knot.
     """
     n, n_modes = gradient.shape
-    maps = interval_maps(step, fine)
-    to_q, to_s = maps[fine, 0].copy(), maps[fine, 1].copy()  # of (q, q̇, v, v⁺), (4, n_modes)
+    to_q, to_s = maps[-1, 0].copy(), maps[-1, 1].copy()  # of (q, q̇, v, v⁺), (4, n_modes)
     form = np.zeros((4, 4, n_modes))  # quadratic in them over one interval
-    for i in range(1, fine + 1):
+    for i in range(1, len(maps)):
         for r in range(4):
             for c in range(4):
                 form[r, c] += weights[2] * maps[i, 1, r] * maps[i, 1, c]
@@ -344,22 +342,6 @@ def modal_change(
             change[k + 1, m] = v
             state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
             state[1, m] = to_s[0, m] * q + to_s[1, m] * speed + to_s[2, m] * before + to_s[3, m] * v
-
-
-@compiled
-def interval_maps(step: Array, fine: int) -> Array:
-    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the fine points between, (fine + 1, 2, 4, n_modes)."""
-    maps = np.zeros((fine + 1, 2, 4, len(step)))
-    maps[0, 0, 0] = maps[0, 1, 1] = 1.0
-    for i in range(fine):
-        for r in range(2):
-            for c in range(4):
-                maps[i + 1, r, c] = step[:, r, 0] * maps[i, 0, c] + step[:, r, 1] * maps[i, 1, c]
-            for c, share in ((2, 1.0 - i / fine), (3, i / fine)):
-                maps[i + 1, r, c] += step[:, r, 2] * share
-            for c, share in ((2, 1.0 - (i + 1) / fine), (3, (i + 1) / fine)):
-                maps[i + 1, r, c] += step[:, r, 3] * share
-    return maps
 
 
 @compiled

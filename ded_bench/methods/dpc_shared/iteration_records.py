@@ -16,7 +16,7 @@ Indices = NDArray[np.int_]
 
 #: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
 #: exact penalty, above nearly all of the optimum's multipliers.
-PRICE = 0.08
+PRICE = 0.2
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
 DOUBLING = 0.05
 #: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
@@ -59,5 +59,5 @@ class Given(NamedTuple):
     change: Array32  # (batch, n_instants, n_modes, n_modes), 1/s²
     state: Array32  # (batch, 2, n_modes)
     mean_modes: Array  # of the mean stiffness, powers by column, (batch, n_gen, n_modes)
-    mean_step: Array  # as `Modes.step`, (batch, n_modes, 2, 4)
+    mean_maps: Array  # of `interval_maps`, (batch, fine + 1, 2, 4, n_modes)
     mean_leverage: Array  # what a mean mode takes from the slack, (batch, n_modes), pu/rad

@@ -67,6 +67,22 @@ def oscillators(squares: Array, rate: float, h: float) -> Array:
 
 
 @compiled
+def interval_maps(step: Array, fine: int) -> Array:
+    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the fine points between, (fine + 1, 2, 4, n_modes)."""
+    maps = np.zeros((fine + 1, 2, 4, len(step)))
+    maps[0, 0, 0] = maps[0, 1, 1] = 1.0
+    for i in range(fine):
+        for r in range(2):
+            for c in range(4):
+                maps[i + 1, r, c] = step[:, r, 0] * maps[i, 0, c] + step[:, r, 1] * maps[i, 1, c]
+            for c, share in ((2, 1.0 - i / fine), (3, i / fine)):
+                maps[i + 1, r, c] += step[:, r, 2] * share
+            for c, share in ((2, 1.0 - (i + 1) / fine), (3, (i + 1) / fine)):
+                maps[i + 1, r, c] += step[:, r, 3] * share
+    return maps
+
+
+@compiled
 def start_angles(
     lines: Lines, unknown: Indices, nominal: Array, inverse: Array, wanted: Array, theta: Array
 ) -> bool:

@@ -67,11 +67,11 @@ class ModalChange(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         """Another solution with the same, symmetric, matrix; for the weights, its parts between both."""
-        modes, step, leverage = ctx.modes
+        modes, maps, leverage = ctx.modes
         on_gradient = _changes(_double(gradients[0]), ctx.weights, ctx.modes)
         back = np.linalg.inv(modes.swapaxes(1, 2))
         on_weights = np.zeros(4)
-        modal_products(step, leverage, FINE, on_gradient @ back, ctx.change @ back, on_weights)
+        modal_products(maps, leverage, on_gradient @ back, ctx.change @ back, on_weights)
         return _single(on_gradient), _single(on_weights), None
 
 
@@ -117,10 +117,10 @@ def _transposed(model: PathModel, linear: Linear, on_x: Array, on_omega: Array, 
 
 def _changes(gradient: Array, weights: Array, modes: tuple[Array, Array, Array]) -> Array:
     """`modal_change` of a batch, in powers."""
-    into, step, leverage = modes
+    into, maps, leverage = modes
     found = np.empty_like(gradient)
     for b in range(len(gradient)):
-        modal_change(step[b], leverage[b], FINE, weights, gradient[b] @ into[b], found[b])
+        modal_change(maps[b], leverage[b], weights, gradient[b] @ into[b], found[b])
     return np.asarray(found @ into.swapaxes(1, 2))
 
 

@@ -17,7 +17,7 @@ MARGINS = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.2, 0.25)
 #: The first margin that keeps so large a part of the instances within the scorer's tolerance is taken.
 WANTED = 0.98
 #: Most instances that are simulated with each margin.
-SIMULATED = 50
+SIMULATED = 100
 
 
 def with_margin(policy: SharedPolicy, instances: Sequence[Instance]) -> SharedPolicy:

@@ -25,8 +25,9 @@ from ded_bench.solvers.status import Status
 METHOD = "ded-dpc-shared-refined"
 #: Whether weights are those of the policy; else they are those where training starts.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {"learned": True}, "unlearned": {"learned": False}}
-#: Iterations after those of the policy.
-ITERATIONS = 80
+#: Iterations after those of the policy, and by what part of it they keep away from the bound on |ω|: their
+#: schedules ride it, and the linearised grid errs (docs/model.md).
+ITERATIONS, MARGIN = 80, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class Refiner:
     """Improves a policy's answers."""
 
     policy: SharedPolicy
-    model: PathModel  # whose bound is not tightened
+    model: PathModel  # its bound is tighter by `MARGIN`, not by the policy's margin
     more: CompiledIterations
 
     @staticmethod
@@ -44,7 +45,7 @@ class Refiner:
             unlearned = {name: np.zeros_like(values) for name, values in policy.weights.items()}
             policy = dataclasses.replace(policy, weights=unlearned)
         case, regime = policy.scope.case, policy.scope.regime
-        model = PathModel(case, case.omega_bound(regime), policy.model.response)
+        model = PathModel(case, (1.0 - MARGIN) * case.omega_bound(regime), policy.model.response)
         return Refiner(policy, model, CompiledIterations(model, policy.weights, ITERATIONS))
 
     def __call__(self, instance: Instance) -> Schedule:

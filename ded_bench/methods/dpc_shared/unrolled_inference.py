@@ -20,7 +20,7 @@ import numpy as np
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.iteration_kernels import answer
 from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST, Given, Limits
-from ded_bench.methods.dpc_shared.path_kernels import oscillators
+from ded_bench.methods.dpc_shared.path_kernels import interval_maps, oscillators
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.problem.case import Array
 
@@ -98,7 +98,7 @@ def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
     """What compiled iterations know of problems."""
     response = model.response
     shape32 = response.shape.astype(np.float32)
-    mean_modes, mean_step, mean_leverage = mean_modes_of(model, linear)
+    mean_modes, mean_maps, mean_leverage = mean_modes_of(model, linear)
     return Given(
         cost=outset.problems.cost / static_cost(outset)[:, None],
         offset=linear.offset.astype(np.float32),
@@ -107,7 +107,7 @@ def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
         change=linear.change.astype(np.float32),
         state=outset.state.astype(np.float32),
         mean_modes=mean_modes,
-        mean_step=mean_step,
+        mean_maps=mean_maps,
         mean_leverage=mean_leverage,
     )
 
@@ -116,8 +116,8 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
     """Modes of the mean stiffness along paths, in which powers weigh by inertia.
 
     Returns:
-        Powers by column (batch, n_gen, n_modes), maps as `Modes.step` (batch, n_modes, 2, 4), and what a
-        mode takes from the slack (batch, n_modes), pu/rad.
+        Powers by column (batch, n_gen, n_modes), `interval_maps` (batch, fine + 1, 2, 4, n_modes), and
+        what a mode takes from the slack (batch, n_modes), pu/rad.
     """
     inertia = model.response.network.m
     root = np.sqrt(inertia / inertia.mean())
@@ -126,10 +126,10 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
     mean = model.response.stiffness + np.einsum("i,bign->bgn", share / share.sum(), linear.stiffness)
     squares, u = np.linalg.eigh(mean / np.outer(root, root))
     rate, h = model.response.rate, float(model.response.fine[1])
-    step = np.stack([oscillators(row / inertia.mean(), rate, h) for row in squares])
-    step[..., 2:] /= inertia.mean()
+    maps = np.stack([interval_maps(oscillators(row / inertia.mean(), rate, h), FINE) for row in squares])
+    maps[:, :, :, 2:] /= inertia.mean()
     leverage = np.einsum("bg,bgm->bm", mean.sum(axis=1) / root, u)
-    return np.ascontiguousarray(root[:, None] * u), step, leverage
+    return np.ascontiguousarray(root[:, None] * u), maps, leverage
 
 
 def static_cost(outset: Outset) -> Array:

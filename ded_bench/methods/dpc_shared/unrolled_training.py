@@ -36,7 +36,7 @@ from ded_bench.problem.sampling import POLICY_SEED
 #: Iterations of an answer: the fewest, and times generators on small grids, where they take less time.
 FEWEST, ROUNDS = 10, 60
 #: Steps of an epoch, epochs.
-STEPS, EPOCHS = 100, 15
+STEPS, EPOCHS = 100, 10
 #: Problems of a step: so many that generators times knots of all are near the first number.
 ROWS, SMALLEST_BATCH = 4000, 8
 LEARNING_RATE, CLIP_NORM = 3e-2, 1.0
@@ -45,7 +45,7 @@ WARM_UP, LAST = 0.02, 1e-3
 AVERAGE = 0.998  # of the weights, exponentially
 #: Penalty, as a part of an instance's cost, of which half counts: a few instances have no feasible schedule,
 #: and would else be all that is learned from.
-HOPELESS = 0.03
+HOPELESS = 0.1
 #: Most instances on which weights are compared.
 HELD_OUT = 100
 PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")

@@ -16,14 +16,16 @@ from ded_bench.truth.simulate import SimulationError
 MARGINS = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.2, 0.25)
 #: The first margin that keeps so large a part of the instances within the scorer's tolerance is taken.
 WANTED = 0.98
+#: So many margins after the best so far, none better, end the search.
+PATIENCE = 3
 #: Most instances that are simulated with each margin.
-SIMULATED = 100
+SIMULATED = 50
 
 
 def with_margin(policy: SharedPolicy, instances: Sequence[Instance]) -> SharedPolicy:
     """The policy with the least margin that makes enough of its schedules feasible on the true system.
 
-    Where no margin does, the one with most feasible schedules, and of several the least.
+    Where no margin does, the one with most feasible schedules of those tried, and of several the least.
 
     Args:
         policy: trained; its margin so far counts for nothing.
@@ -35,9 +37,10 @@ def with_margin(policy: SharedPolicy, instances: Sequence[Instance]) -> SharedPo
         share = _feasible_share(tried, instances[:SIMULATED])
         facts = tried.training | {"margin_feasible": share, "margin_instances": len(instances[:SIMULATED])}
         found.append((share, dataclasses.replace(tried, training=facts)))
-        if share >= WANTED:
+        best = max(found, key=lambda pair: pair[0])
+        if share >= WANTED or len(found) - found.index(best) > PATIENCE:
             break
-    return max(found, key=lambda pair: pair[0])[1]
+    return best[1]
 
 
 def _feasible_share(policy: SharedPolicy, instances: Sequence[Instance]) -> float:

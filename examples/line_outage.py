@@ -2,8 +2,8 @@
 
     python examples/line_outage.py --out results/line-outage
 
-One of the two lines 7-8 of two-area goes. Weights of the reference run, after eight more epochs on the grid
-as it is, and after eight epochs without the line answer draws of both grids. Four minutes on one core;
+One of the two lines 7-8 of two-area goes. Weights of the reference run, after three more epochs on the grid
+as it is, and after three epochs without the line answer draws of both grids. Some minutes on one core;
 weights that are there are not made again.
 """
 
@@ -97,7 +97,7 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--case", default="two-area")
     parser.add_argument("--line", type=int, default=10, help="its place in the case's list of lines")
-    parser.add_argument("--epochs", type=int, default=8)
+    parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--draws", type=int, default=10)
     parser.add_argument("--out", type=Path, default=Path("results/line-outage"))
     chosen = parser.parse_args(words)

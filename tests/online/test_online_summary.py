@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from ded_bench.online.online_results import OnlineResults, OnlineRow
@@ -97,6 +99,16 @@ def test_sweeps_are_about_the_same_scenarios(results):
     assert wide["increase_percent_mean_announced"].tolist() == pytest.approx([1.5, 2.0, 2.5, 4.5])
     assert wide["increase_percent_mean_present"].isna().tolist() == [True, True, True, False]
     assert wide["max_excess_mhz_mean_announced"].tolist() == pytest.approx([0.0, 0.5, 1.0, 3.0])
+
+
+def test_a_sweep_has_one_period(tmp_path):
+    """Ten plans a second at one latency are no part of a sweep of one plan a second."""
+    results = OnlineResults(tmp_path)
+    once = [row("a", latency, 102.0) for latency in (0.0, 0.5, 1.0, 3.0)]
+    results.table.add([*once, dataclasses.replace(row("a", 0.5, 150.0), period_s=0.1)])
+    lines = sweeps(online_rows(results, "here"))
+    assert lines["latency_s"].tolist() == [0.0, 0.5, 1.0, 3.0]
+    assert lines["increase_percent_mean"].nunique() == 1
 
 
 def test_nothing_gives_empty_tables(tmp_path):

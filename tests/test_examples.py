@@ -89,3 +89,19 @@ def test_stretches_around_ramps_that_nobody_announces(monkeypatch: pytest.Monkey
     # The fluctuation is linear between other points; its standard deviation is 5e-4 of the load.
     then = scenarios[1].p_load(case, ramp.start - 20.0 + stretch.grid)
     assert np.allclose(stretch.p_load(case), then, atol=2e-3)
+
+
+def test_choices_of_the_unrolled_policy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """More iterations cost less; the table by price has a row for each, trained by a step."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import unrolled_choices
+
+    monkeypatch.setattr(unrolled_choices, "ITERATIONS", (5, 80))
+    monkeypatch.setattr(unrolled_choices, "PRICES", (0.1, 0.2))
+    monkeypatch.setattr(unrolled_choices.unrolled_training, "STEPS", 1)
+    for choice in ("iterations", "price"):
+        unrolled_choices.main([choice, "--case", "two-area", "--draws", "2", "--out", str(tmp_path)])
+    by_iterations = pd.read_csv(tmp_path / "iterations-two-area.csv")
+    assert by_iterations["gap_percent"].is_monotonic_decreasing
+    assert (by_iterations["n"] == 2).all()
+    assert pd.read_csv(tmp_path / "price-two-area.csv")["price"].tolist() == [0.1, 0.2]

@@ -42,10 +42,10 @@ def test_oscillators_are_matrix_exponentials(square: float) -> None:
 def test_quadratic_model_is_minimised_by_its_recursion() -> None:
     """Against the dense normal equations, with responses by scipy."""
     rng, n, h, rate = np.random.default_rng(0), 12, 0.1, 0.3
-    squares, leverage = np.array([3.0, 60.0]), np.array([1.3, -0.4])
+    squares, outputs = np.array([3.0, 60.0]), np.array([[0.6, 2.0], [1.7, 0.2]])
     weights, gradient = np.array([0.2, 0.5, 7.0, 3.0]), rng.standard_normal((n, 2))
     found = np.empty_like(gradient)
-    modal_change(interval_maps(oscillators(squares, rate, h), FINE), leverage, weights, gradient, found)
+    modal_change(interval_maps(oscillators(squares, rate, h), FINE), outputs, weights, gradient, found)
     times, knots = h * np.arange(FINE * (n - 1) + 1), h * FINE * np.arange(n)
     for m in range(2):
         system = scipy.signal.StateSpace([[0, 1], [-squares[m], -rate]], [[0], [1]], np.eye(2), [[0], [0]])
@@ -53,10 +53,34 @@ def test_quadratic_model_is_minimised_by_its_recursion() -> None:
         responses = np.stack([scipy.signal.lsim(system, hat, times)[1] for hat in hats], axis=2)
         changes = np.diff(np.eye(n), axis=0)[:, 1:]
         matrix = weights[0] * np.eye(n - 1) + weights[1] * changes.T @ changes
-        matrix += weights[2] * responses[:, 1].T @ responses[:, 1]
-        matrix += weights[3] * leverage[m] ** 2 * responses[:, 0].T @ responses[:, 0]
+        matrix += weights[2] * outputs[0, m] * responses[:, 1].T @ responses[:, 1]
+        matrix += weights[3] * outputs[1, m] * responses[:, 0].T @ responses[:, 0]
         np.testing.assert_allclose(found[1:, m], -np.linalg.solve(matrix, gradient[1:, m]), rtol=1e-8)
     assert (found[0] == 0.0).all()
+
+
+def test_mean_modes_say_what_a_mode_does_alone(case: Case) -> None:
+    """Against the response to one mode's constant powers, from rest, where stiffness keeps its mean."""
+    model = path_model(case)
+    outset = drawn(model, 1)
+    linear = linearised(model, outset)
+    mean = mean_modes_of(model, linear)
+    network = model.response.network
+    into, maps, outputs = (part[0] for part in mean)
+    share = np.gradient(model.response.instants.astype(float)) * np.array([0.5, *[1.0] * 3, 0.5])
+    stiffness = model.response.stiffness + np.average(linear.stiffness[0], axis=0, weights=share)
+    h, n_gen = float(model.response.fine[1]), len(network.m)
+    inverse = 1.0 / network.m
+    for m in range(n_gen):
+        system = np.zeros((2 * n_gen + 1, 2 * n_gen + 1))
+        system[:n_gen, n_gen : 2 * n_gen] = np.eye(n_gen)
+        system[n_gen:-1, :n_gen] = -inverse[:, None] * stiffness
+        system[n_gen:-1, n_gen:-1] = -model.response.rate * np.eye(n_gen)
+        system[n_gen:-1, -1] = inverse * into[:, m]
+        state = scipy.linalg.expm(system * FINE * h)[:-1, -1]  # x and ω after one interval between knots
+        q, speed = maps[FINE, :, 2, m] + maps[FINE, :, 3, m]
+        assert outputs[0, m] * speed**2 == pytest.approx((state[n_gen:] ** 2).sum(), rel=1e-6)
+        assert outputs[1, m] * q**2 == pytest.approx((stiffness @ state[:n_gen]).sum() ** 2, rel=1e-6)
 
 
 def test_derivatives_of_the_quadratic_model_by_differences(case: Case) -> None:
@@ -176,5 +200,5 @@ def test_weights_move_settings_within_their_range(ninebus: Case) -> None:
     found = settings_of(unrolled.nodes.detach().numpy(), 9)
     np.testing.assert_allclose(unrolled.settings().detach().numpy(), found, rtol=1e-4)
     assert (found > 0.0).all()
-    assert (found[:, 5] < 2.0).all()
-    assert (found[:, 6] < 0.1).all()
+    assert (found[:, 6] < 2.0).all()
+    assert (found[:, 7] < 0.1).all()

@@ -39,12 +39,12 @@ def track_rows_adjoint(
 
 
 @compiled
-def modal_products(maps: Array, leverage: Array, one: Array, other: Array, found: Array) -> None:
+def modal_products(maps: Array, outputs: Array, one: Array, other: Array, found: Array) -> None:
     """One · A_i other for the parts A_i of the matrix of `modal_change`, one for each weight.
 
     Args:
         maps: of the mean modes, (batch, fine + 1, 2, 4, n_modes).
-        leverage: what a mode takes from the slack, (batch, n_modes), pu/rad.
+        outputs: see `modal_change`, (batch, 2, n_modes).
         one: modal powers at the knots, (batch, n_knots, n_modes); likewise `other`.
         other: to multiply it with.
         found: receives the sums over the batch, (4,).
@@ -61,8 +61,8 @@ def modal_products(maps: Array, leverage: Array, one: Array, other: Array, found
                 found[1] += (x[3] - x[2]) * (y[3] - y[2])
                 for i in range(1, maps.shape[1]):
                     to_q, to_speed = maps[b, i, 0, :, m], maps[b, i, 1, :, m]
-                    found[2] += (to_speed * x).sum() * (to_speed * y).sum()
-                    found[3] += leverage[b, m] ** 2 * (to_q * x).sum() * (to_q * y).sum()
+                    found[2] += outputs[b, 0, m] * (to_speed * x).sum() * (to_speed * y).sum()
+                    found[3] += outputs[b, 1, m] * (to_q * x).sum() * (to_q * y).sum()
                 last_q, last_speed = maps[b, -1, 0, :, m], maps[b, -1, 1, :, m]
                 x[0], x[1] = (last_q * x).sum(), (last_speed * x).sum()
                 y[0], y[1] = (last_q * y).sum(), (last_speed * y).sum()

@@ -157,7 +157,7 @@ def answer(powers: Array, given: Given, limits: Limits, modes: Modes, settings: 
         given: the problems.
         limits: of the case.
         modes: of the case.
-        settings: of each iteration, (n_iterations, 7); the columns are those of `SETTINGS`.
+        settings: of each iteration, (n_iterations, 8); the columns are those of `SETTINGS`.
     """
     batch, n, n_gen = powers.shape
     n_fine = given.offset.shape[1]
@@ -192,7 +192,7 @@ def _project_powers(
     p: Array, cost: Array, limits: Limits, setting: Array, bounded: Array, moved: Array, gradient: Array
 ) -> None:
     """Copies and duals of powers and their changes; `gradient` receives that of cost and both, in powers."""
-    (n, n_gen), relaxed = p.shape, setting[5]
+    (n, n_gen), relaxed = p.shape, setting[6]
     for j in range(n):
         share = (0.5 if j == n - 1 else 1.0) / (n - 1)
         for g in range(n_gen):
@@ -229,20 +229,20 @@ def _project_response(
     omega, p_slack = outcome
     speeds, slack = copies
     (n_fine, n_gen), n, fine = omega.shape, len(gradient), (len(omega) - 1) // (len(gradient) - 1)
-    relaxed, tight = np.float32(setting[5]), np.float32(limits.bound * (1.0 - setting[6]))
-    weights = (setting[2] / (limits.bound**2 * fine) * limits.mass).astype(np.float32)
+    relaxed, tight = np.float32(setting[6]), np.float32(limits.bound * (1.0 - setting[7]))
+    weight = np.float32(setting[2] / (limits.bound**2 * fine))
     on_omega, on_v = np.empty((n_fine, n_gen), np.float32), np.empty((1, n_fine, n_gen), np.float32)
     on_q, on_speed = np.empty_like(on_v), np.empty_like(on_v)
     heavy, other = setting[3] / (limits.unit**2 * fine), np.float32(1.0) - relaxed
     for k in range(n_fine):
         for g in range(n_gen):
-            here, weight = omega[k, g], weights[g]
+            here = omega[k, g]
             wanted = relaxed * here + other * speeds[0, k, g] + speeds[1, k, g] / weight
             kept = min(max(wanted, -tight), tight)
             speeds[0, k, g], speeds[1, k, g] = kept, weight * (wanted - kept)
             on_omega[k, g] = speeds[1, k, g] + weight * (here - kept)
         price = (0.5 if k == 0 or k == n_fine - 1 else 1.0) / (n_fine - 1) * given.cost[b, 0] / heavy
-        drawn = setting[5] * p_slack[k] + (1.0 - setting[5]) * slack[0, k] + slack[1, k] / heavy
+        drawn = setting[6] * p_slack[k] + (1.0 - setting[6]) * slack[0, k] + slack[1, k] / heavy
         least = max(drawn - price, 0.0) + min(drawn + price, 0.0)
         slack[0, k], slack[1, k] = least, heavy * (drawn - least)
         force = np.float32(slack[1, k] + heavy * (p_slack[k] - least))
@@ -250,15 +250,15 @@ def _project_response(
             on_q[0, k, m] = -force * given.leverage[b, k, m]
     np.dot(on_omega, limits.shape.T, on_speed[0])
     swing_adjoint(modes, given.change[b : b + 1], on_q, on_speed, on_v)
-    np.dot(on_v[0], limits.gain.T, on_omega)
+    on_knots = np.zeros((n, n_gen), np.float32)
     for j in range(n - 1):
         for i in range(fine):
-            share = i / fine
-            for g in range(n_gen):
-                gradient[j, g] += (1.0 - share) * on_omega[j * fine + i, g]
-                gradient[j + 1, g] += share * on_omega[j * fine + i, g]
-    for g in range(n_gen):
-        gradient[n - 1, g] += on_omega[n_fine - 1, g]
+            later = np.float32(i / fine)
+            for m in range(n_gen):
+                on_knots[j, m] += (np.float32(1.0) - later) * on_v[0, j * fine + i, m]
+                on_knots[j + 1, m] += later * on_v[0, j * fine + i, m]
+    on_knots[n - 1] += on_v[0, n_fine - 1]
+    gradient += np.dot(on_knots, limits.gain.T)
 
 
 @compiled
@@ -268,24 +268,24 @@ def _improve(p: Array, gradient: Array, given: Given, b: int, limits: Limits, se
     per_unit = 1.0 / limits.unit**2
     weights = np.empty(4)
     weights[0], weights[1] = setting[0] * per_unit, setting[1] * per_unit
-    weights[2] = setting[2] / (limits.bound**2 * fine)
-    weights[3] = setting[3] * setting[4] * per_unit / fine
+    weights[2] = setting[2] * setting[4] / (limits.bound**2 * fine)
+    weights[3] = setting[3] * setting[5] * per_unit / fine
     modes, change = given.mean_modes[b], np.empty_like(p)
     modal = np.dot(gradient, modes)
-    modal_change(given.mean_maps[b], given.mean_leverage[b], weights, modal, change)
+    modal_change(given.mean_maps[b], given.mean_outputs[b], weights, modal, change)
     p += np.dot(change, modes.T)
 
 
 @compiled
-def modal_change(maps: Array, leverage: Array, weights: Array, gradient: Array, change: Array) -> None:
+def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, change: Array) -> None:
     """Minimise gradient · v + ½ v · A v mode by mode, by dynamic programming (a Riccati recursion).
 
-    A weighs, with `weights`: powers v at the knots, their changes, and at the fine points q̇ and P_s of each
-    mode alone. Up to t = 0 all is 0.
+    A weighs, with `weights`: powers v at the knots, their changes, and at the fine points ω and P_s as if
+    each mode moved alone. Up to t = 0 all is 0.
 
     Args:
         maps: of `interval_maps`, (fine + 1, 2, 4, n_modes).
-        leverage: what a mode takes from the slack, (n_modes,), pu/rad.
+        outputs: Σ ω² over the generators for q̇ = 1, and P_s² for q = 1, (2, n_modes).
         weights: (4,).
         gradient: (n_knots, n_modes); the first knot's does not matter.
         change: receives v, likewise; 0 at the first knot.
@@ -296,8 +296,8 @@ def modal_change(maps: Array, leverage: Array, weights: Array, gradient: Array, 
     for i in range(1, len(maps)):
         for r in range(4):
             for c in range(4):
-                form[r, c] += weights[2] * maps[i, 1, r] * maps[i, 1, c]
-                form[r, c] += weights[3] * leverage**2 * maps[i, 0, r] * maps[i, 0, c]
+                form[r, c] += weights[2] * outputs[0] * maps[i, 1, r] * maps[i, 1, c]
+                form[r, c] += weights[3] * outputs[1] * maps[i, 0, r] * maps[i, 0, c]
     form[2, 2] += weights[1]
     form[2, 3] -= weights[1]
     form[3, 3] += weights[1] + weights[0]
@@ -372,16 +372,16 @@ def _respond(
     """What a schedule does: ω (n_fine, n_gen) and P_s (n_fine,); see `PathModel.respond`."""
     (n, n_gen), n_fine = powers.shape, len(p_slack)
     fine, force = (n_fine - 1) // (n - 1), np.empty((1, n_fine, n_gen), np.float32)
-    q, speed, p_fine = np.empty_like(force), np.empty_like(force), np.empty_like(omega)
+    q, speed = np.empty_like(force), np.empty_like(force)
+    at_knots = np.dot(powers.astype(np.float32), limits.gain)
+    force[0] = given.offset[b]
     for j in range(n - 1):
         for i in range(fine):
-            share = i / fine
-            for g in range(n_gen):
-                here = powers[j, g] + share * (powers[j + 1, g] - powers[j, g])
-                p_fine[j * fine + i, g] = here + given.offset[b, j * fine + i, g]
-    for g in range(n_gen):
-        p_fine[n_fine - 1, g] = powers[n - 1, g] + given.offset[b, n_fine - 1, g]
-    np.dot(p_fine, limits.gain, force[0])
+            later = np.float32(i / fine)
+            for m in range(n_gen):
+                here = at_knots[j, m] + later * (at_knots[j + 1, m] - at_knots[j, m])
+                force[0, j * fine + i, m] += here
+    force[0, n_fine - 1] += at_knots[n - 1]
     q[0, 0], speed[0, 0] = given.state[b, 0], given.state[b, 1]
     swing(modes, given.change[b : b + 1], force, q, speed)
     np.dot(speed[0], limits.shape, omega)

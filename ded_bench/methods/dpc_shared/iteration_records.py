@@ -15,8 +15,8 @@ Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int_]
 
 #: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
-#: exact penalty, above nearly all of the optimum's multipliers.
-PRICE = 0.2
+#: exact penalty. docs/model.md tells how it was chosen.
+PRICE = 0.1
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
 DOUBLING = 0.05
 #: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
@@ -53,11 +53,11 @@ class Given(NamedTuple):
     """What is known of a batch before the first iteration."""
 
     cost: Array  # (slack, generators), as parts of the static dispatch's mean cost, (batch, 1 + n_gen), 1/pu
-    offset: Array32  # see `Linear`: (batch, n_fine, n_gen), pu
+    offset: Array32  # see `Linear`: (batch, n_fine, n_modes)
     slack: Array32  # (batch, n_fine), pu
     leverage: Array32  # what a mode takes from the slack, (batch, n_fine, n_modes), pu/rad
     change: Array32  # (batch, n_instants, n_modes, n_modes), 1/s²
     state: Array32  # (batch, 2, n_modes)
     mean_modes: Array  # of the mean stiffness, powers by column, (batch, n_gen, n_modes)
     mean_maps: Array  # of `interval_maps`, (batch, fine + 1, 2, 4, n_modes)
-    mean_leverage: Array  # what a mean mode takes from the slack, (batch, n_modes), pu/rad
+    mean_outputs: Array  # squares of ω and P_s in a mean mode, see `modal_change`, (batch, 2, n_modes)

@@ -35,7 +35,7 @@ class Outset:
 class Linear:
     """The grid linearised along a path: what is not P in the modes' inputs, and how stiffness changes."""
 
-    offset: Array  # -T (L - L_0) - r + ΔS x_ref at the fine points, less P_0, (batch, n_fine, n_gen), pu
+    offset: Array  # of -T (L - L_0) - r + ΔS x_ref less P_0 at the fine points, (batch, n_fine, n_modes)
     change: Array  # ΔS of the modes at the instants, (batch, n_instants, n_modes, n_modes), 1/s²
     slack: Array  # P_s at x = 0, at the fine points, (batch, n_fine), pu
     stiffness: Array  # ΔS at the instants, (batch, n_instants, n_gen, n_gen), pu/rad
@@ -137,7 +137,7 @@ class PathModel:
         by_change = np.einsum("ns,bsng->bng", self.between[::points], slow[:, None] @ change)
         taken = outset.fixed + linear_between(rest - by_change, points)
         modal = response.gain.T @ change @ response.shape.T
-        return Linear(-taken, modal, self._slack(outset, taken), change)
+        return Linear(-taken @ response.gain, modal, self._slack(outset, taken), change)
 
     @staticmethod
     def _slack(outset: Outset, taken: Array) -> Array:
@@ -150,7 +150,7 @@ class PathModel:
         Returns:
             At the fine points: x (batch, n_fine, n_gen), rad, ω likewise, rad/s, P_s (batch, n_fine), pu.
         """
-        v = (linear_between(powers, FINE) + linear.offset) @ self.response.gain
+        v = linear_between(powers @ self.response.gain, FINE) + linear.offset
         q, speed = np.empty_like(v), np.empty_like(v)
         q[:, 0], speed[:, 0] = outset.state[:, 0], outset.state[:, 1]
         swing(self.modes, linear.change, v, q, speed)

@@ -46,7 +46,7 @@ class Transposed(torch.autograd.Function):
         """The response itself, from rest and without loads."""
         model, linear = ctx.model, ctx.linear
         response = model.response
-        v = linear_between(_double(gradients[0]), FINE) @ response.gain
+        v = linear_between(_double(gradients[0]) @ response.gain, FINE)
         q, speed = np.zeros_like(v), np.zeros_like(v)
         swing(model.modes, linear.change, v, q, speed)
         on_slack = -(model.slack_stiffness(linear) * (q @ response.shape)).sum(axis=2)
@@ -67,11 +67,11 @@ class ModalChange(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         """Another solution with the same, symmetric, matrix; for the weights, its parts between both."""
-        modes, maps, leverage = ctx.modes
+        modes, maps, outputs = ctx.modes
         on_gradient = _changes(_double(gradients[0]), ctx.weights, ctx.modes)
         back = np.linalg.inv(modes.swapaxes(1, 2))
         on_weights = np.zeros(4)
-        modal_products(maps, leverage, on_gradient @ back, ctx.change @ back, on_weights)
+        modal_products(maps, outputs, on_gradient @ back, ctx.change @ back, on_weights)
         return _single(on_gradient), _single(on_weights), None
 
 
@@ -104,23 +104,22 @@ class FollowTargets(torch.autograd.Function):
 def _transposed(model: PathModel, linear: Linear, on_x: Array, on_omega: Array, on_slack: Array) -> Array:
     """Gradient in powers at the knots from those in x, ω and P_s at the fine points."""
     on_x = on_x - on_slack[:, :, None] * model.slack_stiffness(linear)
-    shape, gain = model.response.shape, model.response.gain
+    shape = model.response.shape
     on_v = np.empty_like(on_omega)
     swing_adjoint(model.modes, linear.change, on_x @ shape.T, on_omega @ shape.T, on_v)
-    fine = on_v @ gain.T
-    found = fine[:, ::FINE].copy()
+    found = on_v[:, ::FINE].copy()
     for i in range(1, FINE):
-        found[:, :-1] += (1 - i / FINE) * fine[:, i::FINE]
-        found[:, 1:] += (i / FINE) * fine[:, i::FINE]
-    return np.asarray(found)
+        found[:, :-1] += (1 - i / FINE) * on_v[:, i::FINE]
+        found[:, 1:] += (i / FINE) * on_v[:, i::FINE]
+    return np.asarray(found @ model.response.gain.T)
 
 
 def _changes(gradient: Array, weights: Array, modes: tuple[Array, Array, Array]) -> Array:
     """`modal_change` of a batch, in powers."""
-    into, maps, leverage = modes
+    into, maps, outputs = modes
     found = np.empty_like(gradient)
     for b in range(len(gradient)):
-        modal_change(maps[b], leverage[b], weights, gradient[b] @ into[b], found[b])
+        modal_change(maps[b], outputs[b], weights, gradient[b] @ into[b], found[b])
     return np.asarray(found @ into.swapaxes(1, 2))
 
 

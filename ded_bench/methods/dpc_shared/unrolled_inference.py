@@ -6,9 +6,9 @@ The linear program along the path of a problem is
 
 Each iteration of the alternating direction method of multipliers (Boyd et al. 2011) projects copies of P, its
 changes, ω and P_s on their limits (for P_s: the proximal map of its price), and then moves P to the least of
-a quadratic model. Norms weigh generators by inertia, so that in the modes of the mean stiffness the model
-falls apart into one small recursion per mode. A few iterations are far from convergence: how they weigh what
-they minimise is learned, and the only weights of the policy.
+a quadratic model. Powers weigh by the inverse of inertia and frequencies alike; with each mode of the mean
+stiffness taken to move alone, the model falls apart into one small recursion per mode. A few iterations are
+far from convergence: how they weigh what they minimise is learned, and the only weights of the policy.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.problem.case import Array
 
 #: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
-#: bounds, ramps, ω and P_s, in the case's `price`; what part of the last the quadratic model has; relaxation;
-#: tightening of the bound on |ω|.
+#: bounds, ramps, ω and P_s, in the case's `price`; how often the quadratic model counts the last two;
+#: relaxation; tightening of the bound on |ω|.
 SETTINGS = {
     "bounds": (0.1, 400.0),
-    "ramps": (20.0, 1000.0),
-    "frequency": (20.0, 1000.0),
-    "slack": (0.1, 20.0),
-    "slack_model": (2.0, 0.2),
-    "relaxation": (1.5, 1.7),
-    "tightening": (0.08, 0.03),
+    "ramps": (40.0, 1500.0),
+    "frequency": (60.0, 4000.0),
+    "slack": (0.1, 15.0),
+    "frequency_model": (1.2, 1.2),
+    "slack_model": (2.5, 0.4),
+    "relaxation": (1.4, 1.7),
+    "tightening": (0.09, 0.03),
 }
 #: How many of them are penalties.
 PENALTIES = 4
@@ -52,7 +53,7 @@ def weight_shapes() -> dict[str, tuple[int, ...]]:
 
 
 def starting_settings(iterations: int) -> Array:
-    """Settings where training starts, (iterations, 7)."""
+    """Settings where training starts, (iterations, 8)."""
     return np.stack([np.geomspace(*ends, iterations) for ends in SETTINGS.values()], axis=1)
 
 
@@ -63,7 +64,7 @@ def between_nodes(iterations: int) -> Array:
 
 
 def settings_of(weights: Array, iterations: int) -> Array:
-    """Settings of each iteration, (iterations, 7), from weights, which are 0 where training starts.
+    """Settings of each iteration, (iterations, 8), from weights, which are 0 where training starts.
 
     Penalties are multiplied by e^w; what has a largest value moves to it along a logistic curve.
     """
@@ -98,7 +99,7 @@ def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
     """What compiled iterations know of problems."""
     response = model.response
     shape32 = response.shape.astype(np.float32)
-    mean_modes, mean_maps, mean_leverage = mean_modes_of(model, linear)
+    mean_modes, mean_maps, mean_outputs = mean_modes_of(model, linear)
     return Given(
         cost=outset.problems.cost / static_cost(outset)[:, None],
         offset=linear.offset.astype(np.float32),
@@ -108,7 +109,7 @@ def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
         state=outset.state.astype(np.float32),
         mean_modes=mean_modes,
         mean_maps=mean_maps,
-        mean_leverage=mean_leverage,
+        mean_outputs=mean_outputs,
     )
 
 
@@ -117,7 +118,7 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
 
     Returns:
         Powers by column (batch, n_gen, n_modes), `interval_maps` (batch, fine + 1, 2, 4, n_modes), and
-        what a mode takes from the slack (batch, n_modes), pu/rad.
+        `outputs` of `modal_change` (batch, 2, n_modes).
     """
     inertia = model.response.network.m
     root = np.sqrt(inertia / inertia.mean())
@@ -128,8 +129,9 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
     rate, h = model.response.rate, float(model.response.fine[1])
     maps = np.stack([interval_maps(oscillators(row / inertia.mean(), rate, h), FINE) for row in squares])
     maps[:, :, :, 2:] /= inertia.mean()
-    leverage = np.einsum("bg,bgm->bm", mean.sum(axis=1) / root, u)
-    return np.ascontiguousarray(root[:, None] * u), maps, leverage
+    angles = u / root[:, None]
+    outputs = np.stack([(angles**2).sum(axis=1), np.einsum("bg,bgm->bm", mean.sum(axis=1), angles) ** 2], axis=1)
+    return np.ascontiguousarray(root[:, None] * u), maps, outputs
 
 
 def static_cost(outset: Outset) -> Array:

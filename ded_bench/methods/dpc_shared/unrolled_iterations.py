@@ -61,19 +61,19 @@ class UnrolledIterations(nn.Module):
         p = _single(outset.start)
         copies: list[Tensor] = []
         duals = [torch.zeros(())] * 4
-        for setting in self.settings() * torch.tensor([limits.price] * PENALTIES + [1.0] * 3):
+        for setting in self.settings() * torch.tensor([limits.price] * PENALTIES + [1.0] * 4):
             _, omega, p_slack = Respond.apply(p, model, outset, linear)  # type: ignore[no-untyped-call]
             heavy = setting[3] / (limits.unit**2 * FINE)
             weights = (
                 setting[0] * by_mass,
                 setting[1] * by_mass,
-                setting[2] / (limits.bound**2 * FINE) * mass,
+                setting[2] / (limits.bound**2 * FINE),
                 heavy,
             )
             now = [p[:, 1:], p.diff(dim=1), omega, p_slack]
             if not copies:
                 copies = [values.detach() for values in now]
-            relaxed, tight = setting[5], limits.bound * (1.0 - setting[6])
+            relaxed, tight = setting[6], limits.bound * (1.0 - setting[7])
             wanted = [
                 relaxed * a + (1.0 - relaxed) * z + y / w
                 for a, z, y, w in zip(now, copies, duals, weights, strict=True)
@@ -94,8 +94,8 @@ class UnrolledIterations(nn.Module):
                 [
                     setting[0] / limits.unit**2,
                     setting[1] / limits.unit**2,
-                    setting[2] / (limits.bound**2 * FINE),
-                    heavy * setting[4],
+                    setting[2] * setting[4] / (limits.bound**2 * FINE),
+                    heavy * setting[5],
                 ]
             )
             p = p + ModalChange.apply(gradient, quadratic, modes)  # type: ignore[no-untyped-call]

@@ -36,10 +36,10 @@ from ded_bench.problem.sampling import POLICY_SEED
 #: Iterations of an answer: the fewest, and times generators on small grids, where they take less time.
 FEWEST, ROUNDS = 10, 60
 #: Steps of an epoch, epochs.
-STEPS, EPOCHS = 100, 10
+STEPS, EPOCHS = 100, 8
 #: Problems of a step: so many that generators times knots of all are near the first number.
 ROWS, SMALLEST_BATCH = 4000, 8
-LEARNING_RATE, CLIP_NORM = 3e-2, 1.0
+LEARNING_RATE, CLIP_NORM = 0.1, 1.0
 #: Fractions of the training: warm-up of the learning rate, then a cosine down to `LAST` of it.
 WARM_UP, LAST = 0.02, 1e-3
 AVERAGE = 0.998  # of the weights, exponentially

@@ -56,6 +56,7 @@ def judged(policy: SharedPolicy, instances: Sequence[Instance], best: Sequence[f
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table, and write it to the folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("choice", choices=("price", "iterations"))
     parser.add_argument("--case", default="39bus", help="a shipped case (default: %(default)s)")
@@ -64,9 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     case, folder = Case.load(asked.case), Path(asked.out)
     instances = validation_instances(case, asked.draws or DRAWS[asked.choice], FIRST, servable=servable)
-    best = [
-        score(i, solve(i, "ded-slp", regime=REGIME).schedule, regime=REGIME).objective for i in instances
-    ]
+    best = [score(i, solve(i, "ded-slp", regime=REGIME).schedule, regime=REGIME).objective for i in instances]
     if asked.choice == "price":
         policies = {price: priced(case, price, folder) for price in PRICES}
     else:

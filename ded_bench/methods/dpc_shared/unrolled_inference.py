@@ -130,7 +130,9 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
     maps = np.stack([interval_maps(oscillators(row / inertia.mean(), rate, h), FINE) for row in squares])
     maps[:, :, :, 2:] /= inertia.mean()
     angles = u / root[:, None]
-    outputs = np.stack([(angles**2).sum(axis=1), np.einsum("bg,bgm->bm", mean.sum(axis=1), angles) ** 2], axis=1)
+    outputs = np.stack(
+        [(angles**2).sum(axis=1), np.einsum("bg,bgm->bm", mean.sum(axis=1), angles) ** 2], axis=1
+    )
     return np.ascontiguousarray(root[:, None] * u), maps, outputs
 
 

@@ -153,8 +153,8 @@ def train(
     response = Response.make(case, case.knot_times(first.horizon_s))
     stride = coarse_stride(first.dt_s, first.steps)
     generator = torch.Generator().manual_seed(seed)
-    drawn, held_out = _split(case, instances, fresh, options, generator)
-    inputs = [Inputs.of(case, part) for part in (drawn, held_out)]
+    parts = _split(case, instances, fresh, options, generator)
+    inputs = [Inputs.of(case, part) for part in parts]
     channels = [Channels.of(case, part, response, chosen.prior) for part in inputs]
     free = [coarse_free_response(Network(case), model, part, first.grid, stride) for part in inputs]
     data, check = (
@@ -162,29 +162,17 @@ def train(
     )
     condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
     loss = Loss(Objective.make(condensed).to(device), case.omega_bound(regime), stride * first.dt_s)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        network = StagedNetwork(case, response, chosen.stages, chosen.width, chosen.dilations)
-    if chosen.normalise:
-        network.normalise(channels[0])
-    network.hide(chosen.blind)
-    network.to(device)
+    network = _untrained(case, response, channels[0], chosen, seed).to(device)
     run = _Run(network, loss, generator, chosen, checkpoint_file(out), len(data))
     if options.resume and run.checkpoint.is_file():
         run.load(device)
     run.go(data, check, epochs, options.seconds, f"{METHOD} {regime}")
     network.load_state_dict(run.best_weights)
-    training = {
+    training = run.facts() | {
         "seed": seed,
-        "epochs": run.epoch,
-        "steps": run.step,
-        "seconds": run.spent,
-        "cpu_seconds": run.busy,
         "instances": len(data),
         "fresh": bool(fresh),
         "held_out": len(check),
-        "held_out_loss": run.best,
-        "parameters": sum(p.numel() for p in network.parameters()),
         "prior": chosen.prior,
         "variant": {k: v for k, v in asdict(chosen).items() if v != getattr(Variant(), k)},
         "model": model.kind,
@@ -197,6 +185,19 @@ def train(
     policy.save(out)
     write_history(out, run.history)
     return policy
+
+
+def _untrained(
+    case: Case, response: Response, channels: Channels, chosen: Variant, seed: int
+) -> StagedNetwork:
+    """The network before the first step; `channels` give the scale of its inputs."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = StagedNetwork(case, response, chosen.stages, chosen.width, chosen.dilations)
+    if chosen.normalise:
+        network.normalise(channels)
+    network.hide(chosen.blind)
+    return network
 
 
 def _split(
@@ -260,6 +261,17 @@ class _Run:
                     row = self._validate(check)
                     bar.set_postfix_str(f"cost {row['cost']:.5f}, excess {row['max excess']:.4f}")
                     self._save()
+
+    def facts(self) -> dict[str, Any]:
+        """What the policy's file tells of it."""
+        return {
+            "epochs": self.epoch,
+            "steps": self.step,
+            "seconds": self.spent,
+            "cpu_seconds": self.busy,
+            "held_out_loss": self.best,
+            "parameters": sum(p.numel() for p in self.network.parameters()),
+        }
 
     def _order(self) -> Tensor:
         """Rows of the next epoch: all, the hard ones repeatedly, shuffled."""

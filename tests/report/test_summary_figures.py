@@ -113,6 +113,19 @@ def test_labels_cover_neither_each_other_nor_points(tmp_path) -> None:
     assert not any(box.contains(*dot) for box in boxes for dot in dots)
 
 
+def test_labels_keep_off_curves(tmp_path) -> None:
+    """A word at a point just below a curve through the whole axes goes below its point."""
+    with new_figure(4.0, 3.0) as figure:
+        ax = figure.subplots()
+        ax.plot([0.0, 1.0], [0.53, 0.53])
+        ax.plot([0.5], [0.5], "o", markersize=4)
+        ax.set_xlim(0, 1)
+        ax.set_ylim(0, 1)
+        place_labels(figure, ax, [Label("a long word", 0.5, 0.5, "k")])
+    box = Text.get_window_extent(ax.texts[0], figure.canvas.get_renderer())  # type: ignore[attr-defined]
+    assert box.y1 < ax.transData.transform((0.5, 0.53))[1]
+
+
 def test_many_methods_and_settings_stay_readable(tmp_path) -> None:
     """Every method with every setting it has: one entry each in the legend, which covers nothing."""
     keys = [(name, settings) for name, method in METHODS.items() for settings in method.settings]

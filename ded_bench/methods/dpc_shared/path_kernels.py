@@ -1,4 +1,4 @@
-"""Angles along a path, compiled: power flow at t = 0, and what the network asks for at every knot.
+"""Angles along a path, compiled: power flow at t = 0, electrical power, stiffness, and samples of loads.
 
 Numba's cache on disk notices that a function's own file changed, not that a function which it calls did.
 """

@@ -1,7 +1,7 @@
-"""DED-DPC (`ded-dpc`): a learned optimiser looks at what a schedule would do and corrects it, in stages.
+"""DED-DPC with shared weights (`ded-dpc-shared`): a few iterations of ADMM whose settings are learned.
 
-Its weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
-and P_0 hold for any weights.
+The weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
+and P_0 hold for any weights. See `unrolled_inference` for the iterations.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CHUNK = 50
 
 @dataclass(frozen=True, eq=False)
 class SharedPolicy:
-    """A trained network with all that is needed to apply it."""
+    """Learned settings of the iterations with all that is needed to apply them."""
 
     scope: Scope
     weights: Weights

@@ -1,4 +1,4 @@
-"""Words beside points of a figure that cover neither each other nor a point."""
+"""Words beside points of a figure where they cover least of each other, of points and of curves."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
+from ded_bench.problem.case import Array
 from ded_bench.report.figures.style import plain
 
 _Place = tuple[float, float, Literal["left", "center", "right"], Literal["bottom", "center", "top"]]
@@ -32,6 +33,8 @@ _PLACES: list[_Place] = [
 _LINE: dict[str, Any] = {"arrowstyle": "-", "linewidth": 0.4, "shrinkA": 0, "shrinkB": 3}
 #: Half the size of a marker, points.
 _MARKER = 4.0
+#: Half the width of a curve, and the distance of places along it, points.
+_HALF_LINE, _SPACING = 1.0, 2.0
 
 
 class Label(NamedTuple):
@@ -50,9 +53,13 @@ def place_labels(figure: Figure, ax: Axes, labels: Sequence[Label], size: float 
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)
     scale = figure.dpi / 72
-    points = [place for line in ax.get_lines() for place in ax.transData.transform(line.get_xydata())]
-    half = _MARKER * scale
-    taken = [Bbox.from_extents(x - half, y - half, x + half, y + half) for x, y in points]
+    taken = []
+    for line in ax.get_lines():
+        points = ax.transData.transform(line.get_xydata())
+        points = points[np.isfinite(points).all(axis=1)]
+        taken += [_around(point, _MARKER * scale) for point in points]
+        if line.get_linestyle() != "None":
+            taken += [_around(point, _HALF_LINE * scale) for point in _between(points, scale)]
     for label in sorted(labels, key=lambda label: (-label.y, label.x)):
         note = ax.annotate(
             plain(label.text),
@@ -84,6 +91,19 @@ def _moved(note: Annotation, place: _Place, canvas: FigureCanvasAgg) -> Bbox:
     note.set_verticalalignment(place[3])
     note.update_positions(canvas.get_renderer())  # type: ignore[no-untyped-call]
     return super(Annotation, note).get_window_extent(canvas.get_renderer())  # type: ignore[no-untyped-call]
+
+
+def _between(points: Array, scale: float) -> Array:
+    """Points along the straight lines from each pixel position (n, 2) to the next."""
+    lengths = np.hypot(*np.diff(points, axis=0).T)
+    way = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = np.arange(0.0, way[-1], _SPACING * scale)
+    return np.stack([np.interp(at, way, column) for column in points.T], axis=1)
+
+
+def _around(point: Array, half: float) -> Bbox:
+    """A square around a pixel position."""
+    return Bbox.from_extents(*(point - half), *(point + half))
 
 
 def _common(a: Bbox, b: Bbox) -> float:

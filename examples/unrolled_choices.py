@@ -1,14 +1,17 @@
-"""What the constants of `ded-dpc-shared` were chosen on: the price of its penalty, and its iterations.
+"""What the constants of `ded-dpc-shared` were chosen on: those of its loss, and its iterations.
 
     python examples/unrolled_choices.py price --case 39bus
+    python examples/unrolled_choices.py hopeless --case 39bus
     python examples/unrolled_choices.py iterations --case 39bus
 
-The first trains the policy with several prices, some minutes each on one core; weights that are there are
-not made again. Both judge by simulating draws that no other choice has seen, and print a table.
+The first two train the policy with several prices of the penalty, or several sizes from which it counts less,
+some minutes each on one core; weights that are there are not made again. All judge by simulating draws that
+no other choice has seen, and print a table.
 """
 
 import argparse
 import dataclasses
+import unittest.mock
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,19 +27,26 @@ from ded_bench.problem.benchmark import validation_instances
 from ded_bench.truth.servable import servable
 
 REGIME = "TO"
-PRICES = (0.05, 0.1, 0.2)
-ITERATIONS = (5, 10, 20, 40, 80, 160)
+VALUES = {
+    "price": (0.05, 0.1, 0.2),
+    "hopeless": (0.03, 0.1, 0.3),
+    "iterations": (5, 10, 20, 40, 80, 160),
+}
 #: First validation instance that is judged on, and how many.
-FIRST, DRAWS = 20_000, {"price": 100, "iterations": 32}
+FIRST = {"price": 20_000, "hopeless": 20_200, "iterations": 20_000}
+DRAWS = {"price": 100, "hopeless": 100, "iterations": 32}
 
 
-def priced(case: Case, price: float, folder: Path) -> SharedPolicy:
-    """The policy trained with a price, in a file of its own."""
-    out = folder / f"{case.id}-{price:g}.safetensors"
+def trained(case: Case, choice: str, value: float, folder: Path) -> SharedPolicy:
+    """The policy trained with a constant of its loss, in a file of its own."""
+    out = folder / f"{case.id}-{choice}-{value:g}.safetensors"
     if not out.exists():
         folder.mkdir(parents=True, exist_ok=True)
         instances = load_instances(case.id, split="train")
-        unrolled_training.train(case, REGIME, instances, None, out, TrainingOptions(), price=price)
+        variant = {"price": value} if choice == "price" else {}
+        hopeless = value if choice == "hopeless" else unrolled_training.HOPELESS
+        with unittest.mock.patch.object(unrolled_training, "HOPELESS", hopeless):
+            unrolled_training.train(case, REGIME, instances, None, out, TrainingOptions(), **variant)
     return SharedPolicy.load(out, case, REGIME)
 
 
@@ -58,23 +68,25 @@ def judged(policy: SharedPolicy, instances: Sequence[Instance], best: Sequence[f
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table, and write it to the folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("choice", choices=("price", "iterations"))
+    parser.add_argument("choice", choices=tuple(VALUES))
     parser.add_argument("--case", default="39bus", help="a shipped case (default: %(default)s)")
-    parser.add_argument("--draws", type=int, help="judge so many (default: 100 by price, 32 by iterations)")
+    parser.add_argument("--draws", type=int, help="judge so many (default: 32 by iterations, else 100)")
     parser.add_argument("--out", default="results/unrolled-choices", help="folder (default: %(default)s)")
     asked = parser.parse_args(arguments)
     case, folder = Case.load(asked.case), Path(asked.out)
-    instances = validation_instances(case, asked.draws or DRAWS[asked.choice], FIRST, servable=servable)
+    instances = validation_instances(
+        case, asked.draws or DRAWS[asked.choice], FIRST[asked.choice], servable=servable
+    )
     best = [score(i, solve(i, "ded-slp", regime=REGIME).schedule, regime=REGIME).objective for i in instances]
-    if asked.choice == "price":
-        policies = {price: priced(case, price, folder) for price in PRICES}
-    else:
+    values = VALUES[asked.choice]
+    if asked.choice == "iterations":
         own = find_policy(case, REGIME, Settings(search=search_folders(case)))
-        policies = {
-            n: dataclasses.replace(own, training=own.training | {"iterations": n}) for n in ITERATIONS
-        }
+        policies = [dataclasses.replace(own, training=own.training | {"iterations": n}) for n in values]
+    else:
+        policies = [trained(case, asked.choice, value, folder) for value in values]
     table = pd.DataFrame(
-        {asked.choice: n} | judged(policy, instances, best) for n, policy in policies.items()
+        {asked.choice: value} | judged(policy, instances, best)
+        for value, policy in zip(values, policies, strict=True)
     )
     folder.mkdir(parents=True, exist_ok=True)
     table.to_csv(folder / f"{asked.choice}-{case.id}.csv", index=False)

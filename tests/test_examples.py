@@ -92,16 +92,56 @@ def test_stretches_around_ramps_that_nobody_announces(monkeypatch: pytest.Monkey
 
 
 def test_choices_of_the_unrolled_policy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """More iterations cost less; the table by price has a row for each, trained by a step."""
+    """More iterations cost less; tables of what is trained have a row for each, which differ after a step."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     import unrolled_choices
 
-    monkeypatch.setattr(unrolled_choices, "ITERATIONS", (5, 80))
-    monkeypatch.setattr(unrolled_choices, "PRICES", (0.1, 0.2))
+    values = {"iterations": (5, 80), "price": (0.1, 0.2), "hopeless": (0.01, 0.1)}
+    monkeypatch.setattr(unrolled_choices, "VALUES", values)
     monkeypatch.setattr(unrolled_choices.unrolled_training, "STEPS", 1)
-    for choice in ("iterations", "price"):
+    for choice in values:
         unrolled_choices.main([choice, "--case", "two-area", "--draws", "2", "--out", str(tmp_path)])
     by_iterations = pd.read_csv(tmp_path / "iterations-two-area.csv")
     assert by_iterations["gap_percent"].is_monotonic_decreasing
     assert (by_iterations["n"] == 2).all()
-    assert pd.read_csv(tmp_path / "price-two-area.csv")["price"].tolist() == [0.1, 0.2]
+    for choice in ("price", "hopeless"):
+        table = pd.read_csv(tmp_path / f"{choice}-two-area.csv").set_index(choice)
+        assert table.index.tolist() == list(values[choice])
+        assert table["gap_percent"].nunique() == 2
+
+
+def test_one_policy_for_several_grids(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A step of training on two grids; its weights answer on each, and on one that they have not seen."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import one_policy
+
+    monkeypatch.setattr(one_policy, "TRAINED", ("9bus", "two-area"))
+    monkeypatch.setattr(one_policy, "DRAWS", {"two-area": 2, "39bus": 2})
+    one_policy.main(["--steps", "1", "--regime", "NO", "--out", str(tmp_path)])
+    assert np.abs(one_policy.read_start(tmp_path / "weights-NO.safetensors")["nodes"]).max() > 1e-4
+    table = pd.read_csv(tmp_path / "table-NO.csv").set_index(["grid", "weights"])
+    assert (table["feasible"] == 2).all()
+    assert (table["gap_percent"] < 3.0).all()  # where training starts it is 1 % on 39bus
+    for grid in ("two-area", "39bus"):
+        assert table.loc[(grid, "its own"), "gap_percent"] < table.loc[(grid, "of all"), "gap_percent"]
+
+
+def test_better_announcements(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notice tells the ramps as they are; a wait puts off what has not begun, and nothing else."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    from better_announcements import Announcements, forecast
+
+    scenario = sample_scenario(ninebus, 4242, 0)
+    load, number = scenario.load[ninebus.loads[0]], 0
+    ramp = next(r for r in load.ramps if r.announced_start is not None and r.start > 5.0)
+    now, after = ramp.start - 1.0, ramp.start + np.array([0.0, 0.2])
+
+    def slope(announcements: Announcements) -> float:
+        told = announcements(scenario, ninebus, "announced", now, now + 60.0).at(after)[:, number]
+        return float(np.diff(told)[0]) / 0.2
+
+    assert slope(Announcements(2.0, 0.0)) == pytest.approx(ramp.rate, abs=5e-4)  # fluctuations decay slowly
+    assert slope(Announcements(0.0, 30.0)) == pytest.approx(0.0, abs=5e-4)
+    given = (scenario, ninebus, "announced", now, now + 60.0)
+    times = np.linspace(now, now + 60.0, 50)
+    assert np.array_equal(Announcements(0.0, 0.0)(*given).at(times), forecast(*given).at(times))

@@ -55,7 +55,7 @@ def place_labels(figure: Figure, ax: Axes, labels: Sequence[Label], size: float 
     scale = figure.dpi / 72
     taken = []
     for line in ax.get_lines():
-        points = ax.transData.transform(line.get_xydata())
+        points = line.get_transform().transform(line.get_xydata())
         points = points[np.isfinite(points).all(axis=1)]
         taken += [_around(point, _MARKER * scale) for point in points]
         if line.get_linestyle() != "None":

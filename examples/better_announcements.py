@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("announcements.csv"), help="(default: %(default)s)")
     asked = parser.parse_args(arguments)
     case = Case.load("9bus")
-    files = asked.scenario or sorted(scenario_folder(SHIPPED_CASES / case.id).glob("*.json"))
+    files = asked.scenario or sorted(scenario_folder(SHIPPED_CASES / case.id).glob(f"{case.id}-s*.json"))
     rows = []
     for scenario in load_scenarios(files, case):
         loop.forecast = forecast

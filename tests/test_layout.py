@@ -30,6 +30,8 @@ FLOORS = (
     "cli",
 )
 MAX_LINES = 400
+#: Compiled functions call only those of their own file, for the sake of Numba's cache.
+MORE_LINES = {"ded_bench.methods.dpc_shared.iteration_kernels": 450}
 MAX_FUNCTION, MAX_ARGUMENTS = 80, 9
 #: Twelve hexadecimal digits or more.
 FINGERPRINT = re.compile(r"\b[0-9a-f]{12,}\b")
@@ -153,7 +155,8 @@ def test_ground_floors_use_no_solver():
 @pytest.mark.parametrize("module", MODULES)
 def test_modules_stay_small(module):
     """What does not fit on a few screens is two things."""
-    assert len(MODULES[module].read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+    lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+    assert lines <= MORE_LINES.get(module, MAX_LINES)
 
 
 def test_no_two_modules_share_a_name() -> None:

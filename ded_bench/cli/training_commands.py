@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 #: Kind of model that only AC trajectories are identified with.
 SWING = "swing"
-#: The method whose weights fit every grid, so that a training can start from another's.
-STARTS_ANYWHERE = "ded-dpc-shared"
+#: The method whose weights fit every grid: training can start from another's, and takes no Koopman model.
+FITS_EVERY_GRID = "ded-dpc-shared"
 
 
 def add_commands(commands: Any) -> None:
@@ -167,8 +167,8 @@ def _train_dpc(a: argparse.Namespace) -> int:
     ]
     if not jobs:
         raise InputError("--settings", a.settings, "matches no settings of a method that is trained")
-    if a.start and {name for name, _, _ in jobs} != {STARTS_ANYWHERE}:
-        raise InputError("--start", str(a.start), f"is for {STARTS_ANYWHERE} alone")
+    if a.start and {name for name, _, _ in jobs} != {FITS_EVERY_GRID}:
+        raise InputError("--start", str(a.start), f"is for {FITS_EVERY_GRID} alone")
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method, settings and regime with --out")
     for method in methods:
@@ -209,7 +209,8 @@ def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
         return f"{out} is there already (--force trains anew)"
     with _needing_torch():
         train = method.train
-    model = find_model(case, a.model, search_folders(case, results))
+    name_of_model = "linear" if name == FITS_EVERY_GRID else a.model  # which every case has
+    model = find_model(case, name_of_model, search_folders(case, results))
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)
     code = code_of(method.trainer) if method.trainer.startswith("ded_bench.") else ""

@@ -17,6 +17,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.cli.arguments import matching
 from ded_bench.cli.outputs import sweep
+from ded_bench.problem.case import Case
 from ded_bench.run.results import Results, Row
 from tests.cli.command_line import SOLVE, run_cli
 from tests.conftest import CASE_FILES
@@ -198,3 +199,16 @@ def test_settings_are_named_or_matched() -> None:
     assert matching("steps*,default,steps25", known) == ["steps25", "steps100", "default"]
     assert matching("nope", known) == ["nope"]  # its method says what is wrong
     assert matching("nope*", known) == []
+
+
+def test_only_policies_that_need_a_koopman_model_ask_for_one(
+    problem: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """`ded-dpc-shared` is trained on the grid itself."""
+    monkeypatch.setattr("ded_bench.methods.dpc_shared.unrolled_training.STEPS", 1)
+    regime = next(iter(Case.load(str(problem)).regimes))
+    where = ("--case", str(problem), "--regime", regime, "--epochs", "1", "--results", str(tmp_path))
+    assert main(["train-dpc", "--method", "ded-dpc", *where]) == 2
+    assert "not identified yet" in capsys.readouterr().err
+    assert main(["train-dpc", "--method", "ded-dpc-shared", *where]) == 0
+    assert (tmp_path / "policies" / f"ded-dpc-shared-{regime}.safetensors").is_file()

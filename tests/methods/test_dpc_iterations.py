@@ -11,7 +11,7 @@ import torch
 
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.iteration_kernels import modal_change
-from ded_bench.methods.dpc_shared.path_kernels import interval_maps, oscillators
+from ded_bench.methods.dpc_shared.mode_kernels import interval_maps, oscillators
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import ModalChange, Transposed
 from ded_bench.methods.dpc_shared.unrolled_inference import (

@@ -19,7 +19,7 @@ from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.methods.dpc_shared.plant_gradient import FollowTargets, Respond
 from ded_bench.methods.dpc_shared.shared_margin import with_margin
 from ded_bench.methods.dpc_shared.shared_policy import METHOD, SharedPolicy, prepare
-from ded_bench.methods.dpc_shared.unrolled_inference import static_cost, weight_shapes
+from ded_bench.methods.dpc_shared.unrolled_inference import weight_shapes
 from ded_bench.methods.dpc_shared.unrolled_iterations import UnrolledIterations
 from ded_bench.methods.dpc_shared.unrolled_loss import ScheduleLoss
 from ded_bench.methods.dpc_shared.unrolled_training import read_start, train
@@ -237,7 +237,7 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     loss = ScheduleLoss(model)
     judged = loss(outset, (tensors[0], tensors[1], tensors[2]))
     truth = score(ninebus, instance, Schedule(model.response.knots, outset.start[0]), "TO")
-    cost = float(judged.cost[0] * static_cost(outset)[0]) * len(instance.grid)
+    cost = float(judged.cost[0] * outset.scale[0]) * len(instance.grid)
     assert cost == pytest.approx(truth.objective, rel=5e-4)
     excess = truth.freq_violation_hz * 2 * np.pi / model.bound
     assert float(judged.excess[0]) == pytest.approx(excess, abs=0.02)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from ded_bench.methods import ded_slp
 from ded_bench.methods.dpc_shared import shared_refined
-from ded_bench.methods.dpc_shared.shared_refined import prepare
+from ded_bench.methods.dpc_shared.shared_refined import Refiner, prepare
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
@@ -57,3 +58,13 @@ def test_without_training_it_is_near_the_optimum(name: str, tmp_path: Path) -> N
         ours, best = (score(case, instance, method(instance).schedule, "TO") for method in (solve, optimal))
         assert ours.feasible
         assert ours.objective < 1.005 * best.objective
+
+
+def test_weights_learned_for_few_iterations_do_not_serve_many(ninebus: Case) -> None:
+    """A policy of less than ten iterations answers with its weights; those where training starts follow."""
+    policy = random_policy(ninebus)
+    for iterations, few in ((6, True), (12, False)):
+        changed = dataclasses.replace(policy, training=policy.training | {"iterations": iterations})
+        learned, start = (Refiner.of(changed, learned) for learned in (True, False))
+        assert np.array_equal(learned.more._settings, start.more._settings) == few
+        assert learned.policy.weights is policy.weights

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.dpc_shared.path_kernels import sample_paths
+from ded_bench.methods.dpc_shared.start_kernels import sample_paths
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp

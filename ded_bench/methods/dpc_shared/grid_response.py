@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.methods.dpc_shared.iteration_records import Indices, Modes
-from ded_bench.methods.dpc_shared.path_kernels import oscillators
+from ded_bench.methods.dpc_shared.mode_kernels import oscillators
 from ded_bench.problem.case import Array, Case
 from ded_bench.truth.network import Network
 
@@ -48,7 +48,6 @@ class GridResponse:
     instants: Indices  # knots, all stations, at which stiffness along a path is taken, (n_instants,)
     network: Network
     theta: Array  # angles of the nominal point, (n_bus,), rad
-    inverse: Array  # of ∂f/∂θ there, without the slack, (n_bus - 1, n_bus - 1)
 
     @staticmethod
     def make(case: Case, knots: Array) -> GridResponse:
@@ -62,8 +61,6 @@ class GridResponse:
         other = linear.d / linear.m - rate
         other[np.abs(other) < ROUND_OFF * rate] = 0.0
         fine = np.linspace(knots[0], knots[-1], FINE * (len(knots) - 1) + 1)
-        weights = network.coupling * np.cos(theta @ network.incidence.T)
-        full = network.incidence.T @ (weights[:, None] * network.incidence)
         every = largest_divisor(len(knots) - 1, FLOWS_S / (knots[1] - knots[0]))
         stations = (len(knots) - 1) // every + 1
         return GridResponse(
@@ -81,13 +78,13 @@ class GridResponse:
             instants=every * np.linspace(0, stations - 1, min(INSTANTS, stations)).round().astype(np.int64),
             network=network,
             theta=theta,
-            inverse=np.linalg.inv(full[np.ix_(network.unknown, network.unknown)]),
         )
 
     @property
     def modes(self) -> Modes:
         """What compiled functions see of it."""
-        return Modes(self.step, self.damping, 0.5 * float(self.fine[1]), self.instants * FINE)
+        step, half = np.ascontiguousarray(np.moveaxis(self.step, 0, 2)), 0.5 * float(self.fine[1])
+        return Modes(step, half * self.damping, half, self.instants * FINE)
 
 
 def largest_divisor(count: int, most: float) -> int:

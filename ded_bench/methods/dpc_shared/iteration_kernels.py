@@ -5,6 +5,7 @@ Numba's cache on disk notices that a function's own file changed, not that a fun
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from ded_bench.methods.dpc_shared.iteration_records import (
@@ -19,6 +20,16 @@ from ded_bench.methods.dpc_shared.iteration_records import (
 )
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
+
+inlined = numba.njit(inline="always")
+
+#: Fine points for which C is held: it changes over many seconds.
+HELD = 4
+#: `modal_change` treats so many modes at once, each in a column of an array of constant shape, without which
+#: loops over modes are not vectorised. First rows of: maps to q and q̇; the quadratic form of an interval and
+#: the value function, upper triangles; the linear part of the latter; the gradient; gains; and (q, q̇, v).
+LANES = 8
+MAP, STAGE, VALUE, LINEAR, FORCE, GAIN, STATE, ROWS = 0, 8, 18, 24, 27, 28, 32, 35
 
 
 @compiled
@@ -35,46 +46,71 @@ def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> 
         q: coordinates, (batch, n_fine, n_modes); the first row is given.
         speed: their derivatives, likewise.
     """
-    n = v.shape[2]
-    kicked, kick, damped = np.empty(n, v.dtype), np.empty(n, v.dtype), np.any(modes.damping != 0.0)
-    shares = np.empty(3, v.dtype)  # of C before and after, and of δD, times half a step
+    n, step, damping = v.shape[2], modes.step, modes.damping
+    kicked, kick, held = np.empty(n, v.dtype), np.empty(n, v.dtype), np.empty((n, n), v.dtype)
+    damped, shares = np.any(damping != 0.0), np.empty(2, v.dtype)
     for b in range(len(v)):
-        part = 0
         for k in range(v.shape[1]):
-            if k > modes.instants[part + 1] and part + 2 < len(modes.instants):
-                part += 1
-            share = (k - modes.instants[part]) / (modes.instants[part + 1] - modes.instants[part])
+            if k % HELD == 0:
+                _hold(modes, change, b, k, shares, held)
             if k > 0:
                 for i in range(n):
-                    a, before = modes.step[i], v[b, k - 1, i]
                     q[b, k, i] = (
-                        a[0, 0] * q[b, k - 1, i]
-                        + a[0, 1] * kicked[i]
-                        + a[0, 2] * before
-                        + a[0, 3] * v[b, k, i]
+                        step[0, 0, i] * q[b, k - 1, i]
+                        + step[0, 1, i] * kicked[i]
+                        + step[0, 2, i] * v[b, k - 1, i]
+                        + step[0, 3, i] * v[b, k, i]
                     )
-                    speed[b, k, i] = (
-                        a[1, 0] * q[b, k - 1, i]
-                        + a[1, 1] * kicked[i]
-                        + a[1, 2] * before
-                        + a[1, 3] * v[b, k, i]
-                    )
-            shares[0], shares[1], shares[2] = modes.half * (1.0 - share), modes.half * share, modes.half
-            kick[:] = 0.0
-            for j in range(n):
-                now, later = shares[0] * q[b, k, j], shares[1] * q[b, k, j]
-                left, right = change[b, part, j], change[b, part + 1, j]
                 for i in range(n):
-                    kick[i] += now * left[i] + later * right[i]
+                    speed[b, k, i] = (
+                        step[1, 0, i] * q[b, k - 1, i]
+                        + step[1, 1, i] * kicked[i]
+                        + step[1, 2, i] * v[b, k - 1, i]
+                        + step[1, 3, i] * v[b, k, i]
+                    )
+            kick[:] = 0.0
+            _add_product(held, q, b, k, kick)
             if damped:
-                for j in range(n):
-                    loss, row = shares[2] * speed[b, k, j], modes.damping[j]
-                    for i in range(n):
-                        kick[i] += loss * row[i]
-            for i in range(n):
-                if k > 0:
+                _add_product(damping, speed, b, k, kick)
+            if k > 0:
+                for i in range(n):
                     speed[b, k, i] -= kick[i]
+            for i in range(n):
                 kicked[i] = speed[b, k, i] - kick[i]
+
+
+@inlined
+def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Floats) -> None:
+    """Half a kick by C, for the fine points from k on: C in the middle of them."""
+    middle, part = k + 0.5 * (HELD - 1), 0
+    while part + 2 < len(modes.instants) and middle > modes.instants[part + 1]:
+        part += 1
+    later = (middle - modes.instants[part]) / (modes.instants[part + 1] - modes.instants[part])
+    shares[1] = modes.half * min(later, 1.0)
+    shares[0] = modes.half - shares[1]
+    for j in range(len(held)):
+        for i in range(len(held)):
+            held[j, i] = shares[0] * change[b, part, j, i] + shares[1] * change[b, part + 1, j, i]
+
+
+@inlined
+def _add_product(matrix: Floats, rows: Floats, b: int, k: int, found: Floats) -> None:
+    """Add a symmetric matrix times one of the rows, four columns at a time."""
+    n = len(found)
+    whole = n - n % 4
+    for j in range(0, whole, 4):
+        one, two, three, four = rows[b, k, j], rows[b, k, j + 1], rows[b, k, j + 2], rows[b, k, j + 3]
+        for i in range(n):
+            found[i] += (
+                one * matrix[j, i]
+                + two * matrix[j + 1, i]
+                + three * matrix[j + 2, i]
+                + four * matrix[j + 3, i]
+            )
+    for j in range(whole, n):
+        one = rows[b, k, j]
+        for i in range(n):
+            found[i] += one * matrix[j, i]
 
 
 @compiled
@@ -107,43 +143,36 @@ def swing_adjoint(modes: Modes, change: Floats, on_q: Floats, on_speed: Floats, 
         on_speed: likewise.
         on_v: receives the gradient, likewise.
     """
-    n, damped = on_v.shape[2], np.any(modes.damping != 0.0)
+    n, step, damping = on_v.shape[2], modes.step, modes.damping
     by_q, by_speed, by_kicked = np.empty(n, on_v.dtype), np.empty(n, on_v.dtype), np.empty(n, on_v.dtype)
-    kick, loss, shares = np.empty(n, on_v.dtype), np.zeros(n, on_v.dtype), np.empty(3, on_v.dtype)
+    kick, loss, held = np.empty(n, on_v.dtype), np.zeros(n, on_v.dtype), np.empty((n, n), on_v.dtype)
+    both, shares, damped = np.empty((1, 1, n), on_v.dtype), np.empty(2, on_v.dtype), np.any(damping != 0.0)
     for b in range(len(on_v)):
         by_q[:] = 0.0  # of q and of the kicked speed at this point, from what follows
         by_kicked[:] = 0.0
         on_v[b] = 0.0
-        part = len(modes.instants) - 2
         for k in range(on_v.shape[1] - 1, 0, -1):
-            if k <= modes.instants[part] and part > 0:
-                part -= 1
-            share = (k - modes.instants[part]) / (modes.instants[part + 1] - modes.instants[part])
-            shares[0], shares[1], shares[2] = modes.half * (1.0 - share), modes.half * share, modes.half
+            if k % HELD == HELD - 1 or k == on_v.shape[1] - 1:
+                _hold(modes, change, b, k - k % HELD, shares, held)
             # kicked = speed - kick(q, speed₀) and speed = speed₀ - kick(q, speed₀), where speed₀ came of the
             # step; kicked takes the kick of both
             for i in range(n):
                 by_speed[i] = on_speed[b, k, i] + by_kicked[i]
+                both[0, 0, i] = by_speed[i] + by_kicked[i]
             kick[:] = 0.0
-            for j in range(n):
-                both = by_speed[j] + by_kicked[j]
-                now, later = shares[0] * both, shares[1] * both
-                left, right = change[b, part, j], change[b, part + 1, j]
-                for i in range(n):
-                    kick[i] += now * left[i] + later * right[i]
+            _add_product(held, both, 0, 0, kick)
             if damped:
                 loss[:] = 0.0
-                for j in range(n):
-                    both, row = shares[2] * (by_speed[j] + by_kicked[j]), modes.damping[j]
-                    for i in range(n):
-                        loss[i] += both * row[i]
+                _add_product(damping, both, 0, 0, loss)
             for i in range(n):
-                a, back = modes.step[i], by_speed[i] - loss[i]  # of speed₀
-                here = by_q[i] + on_q[b, k, i] - kick[i]
-                on_v[b, k, i] += a[0, 3] * here + a[1, 3] * back
-                on_v[b, k - 1, i] += a[0, 2] * here + a[1, 2] * back
-                by_q[i] = a[0, 0] * here + a[1, 0] * back
-                by_kicked[i] = a[0, 1] * here + a[1, 1] * back
+                by_q[i] += on_q[b, k, i] - kick[i]
+                by_speed[i] -= loss[i]  # of speed₀
+            for i in range(n):
+                on_v[b, k, i] += step[0, 3, i] * by_q[i] + step[1, 3, i] * by_speed[i]
+                on_v[b, k - 1, i] = step[0, 2, i] * by_q[i] + step[1, 2, i] * by_speed[i]
+            for i in range(n):
+                by_kicked[i] = step[0, 1, i] * by_q[i] + step[1, 1, i] * by_speed[i]
+                by_q[i] = step[0, 0, i] * by_q[i] + step[1, 0, i] * by_speed[i]
 
 
 @compiled
@@ -193,20 +222,21 @@ def _project_powers(
 ) -> None:
     """Copies and duals of powers and their changes; `gradient` receives that of cost and both, in powers."""
     (n, n_gen), relaxed = p.shape, setting[6]
-    for j in range(n):
+    unit = limits.mass * limits.unit**2
+    on_powers, on_moves = setting[0] / unit, setting[1] / unit
+    per_powers, per_moves = 1.0 / on_powers, 1.0 / on_moves
+    gradient[0] = 0.0
+    for j in range(1, n):
         share = (0.5 if j == n - 1 else 1.0) / (n - 1)
         for g in range(n_gen):
-            gradient[j, g] = 0.0
-            if j == 0:
-                continue
-            weight = setting[0] / (limits.mass[g] * limits.unit**2)
-            wanted = relaxed * p[j, g] + (1.0 - relaxed) * bounded[0, j, g] + bounded[1, j, g] / weight
+            weight = on_powers[g]
+            wanted = relaxed * p[j, g] + (1.0 - relaxed) * bounded[0, j, g] + bounded[1, j, g] * per_powers[g]
             kept = min(max(wanted, limits.low[g]), limits.high[g])
             bounded[0, j, g], bounded[1, j, g] = kept, weight * (wanted - kept)
             gradient[j, g] = share * cost[1 + g] + bounded[1, j, g] + weight * (p[j, g] - kept)
-            weight = setting[1] / (limits.mass[g] * limits.unit**2)
+            weight = on_moves[g]
             change = p[j, g] - p[j - 1, g]
-            wanted = relaxed * change + (1.0 - relaxed) * moved[0, j, g] + moved[1, j, g] / weight
+            wanted = relaxed * change + (1.0 - relaxed) * moved[0, j, g] + moved[1, j, g] * per_moves[g]
             kept = min(max(wanted, -limits.step[g]), limits.step[g])
             moved[0, j, g], moved[1, j, g] = kept, weight * (wanted - kept)
             force = moved[1, j, g] + weight * (change - kept)
@@ -231,19 +261,21 @@ def _project_response(
     (n_fine, n_gen), n, fine = omega.shape, len(gradient), (len(omega) - 1) // (len(gradient) - 1)
     relaxed, tight = np.float32(setting[6]), np.float32(limits.bound * (1.0 - setting[7]))
     weight = np.float32(setting[2] / (limits.bound**2 * fine))
+    per_weight = np.float32(1.0) / weight
     on_omega, on_v = np.empty((n_fine, n_gen), np.float32), np.empty((1, n_fine, n_gen), np.float32)
     on_q, on_speed = np.empty_like(on_v), np.empty_like(on_v)
     heavy, other = setting[3] / (limits.unit**2 * fine), np.float32(1.0) - relaxed
+    price, per_heavy = given.cost[b, 0] / heavy / (n_fine - 1), 1.0 / heavy
     for k in range(n_fine):
         for g in range(n_gen):
             here = omega[k, g]
-            wanted = relaxed * here + other * speeds[0, k, g] + speeds[1, k, g] / weight
+            wanted = relaxed * here + other * speeds[0, k, g] + speeds[1, k, g] * per_weight
             kept = min(max(wanted, -tight), tight)
             speeds[0, k, g], speeds[1, k, g] = kept, weight * (wanted - kept)
             on_omega[k, g] = speeds[1, k, g] + weight * (here - kept)
-        price = (0.5 if k == 0 or k == n_fine - 1 else 1.0) / (n_fine - 1) * given.cost[b, 0] / heavy
-        drawn = setting[6] * p_slack[k] + (1.0 - setting[6]) * slack[0, k] + slack[1, k] / heavy
-        least = max(drawn - price, 0.0) + min(drawn + price, 0.0)
+        own = 0.5 * price if k == 0 or k == n_fine - 1 else price
+        drawn = setting[6] * p_slack[k] + (1.0 - setting[6]) * slack[0, k] + slack[1, k] * per_heavy
+        least = max(drawn - own, 0.0) + min(drawn + own, 0.0)
         slack[0, k], slack[1, k] = least, heavy * (drawn - least)
         force = np.float32(slack[1, k] + heavy * (p_slack[k] - least))
         for m in range(n_gen):
@@ -291,57 +323,79 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
         change: receives v, likewise; 0 at the first knot.
     """
     n, n_modes = gradient.shape
-    to_q, to_s = maps[-1, 0].copy(), maps[-1, 1].copy()  # of (q, q̇, v, v⁺), (4, n_modes)
-    form = np.zeros((4, 4, n_modes))  # quadratic in them over one interval
-    for i in range(1, len(maps)):
-        for r in range(4):
-            for c in range(4):
-                form[r, c] += weights[2] * outputs[0] * maps[i, 1, r] * maps[i, 1, c]
-                form[r, c] += weights[3] * outputs[1] * maps[i, 0, r] * maps[i, 0, c]
-    form[2, 2] += weights[1]
-    form[2, 3] -= weights[1]
-    form[3, 3] += weights[1] + weights[0]
-    gains, inverse = np.empty((n - 1, 3, n_modes)), np.empty((n - 1, n_modes))
-    value, linear, pull = np.zeros((6, n_modes)), np.zeros((3, n_modes)), np.empty((n - 1, n_modes))
-    for k in range(n - 2, -1, -1):
-        for m in range(n_modes):
-            a0, a1, a2, a3 = to_q[0, m], to_q[1, m], to_q[2, m], to_q[3, m]
-            b0, b1, b2, b3 = to_s[0, m], to_s[1, m], to_s[2, m], to_s[3, m]
-            v00, v01, v02 = value[0, m], value[1, m], value[2, m]
-            v11, v12, v22 = value[3, m], value[4, m], value[5, m]
-            # rows of q and q̇ of the value after the interval times the map of (q, q̇, v, v⁺) to (q⁺, q̇⁺, v⁺)
-            q0, s0 = v00 * a0 + v01 * b0, v01 * a0 + v11 * b0
-            q1, s1 = v00 * a1 + v01 * b1, v01 * a1 + v11 * b1
-            q2, s2 = v00 * a2 + v01 * b2, v01 * a2 + v11 * b2
-            q3, s3 = v00 * a3 + v01 * b3 + v02, v01 * a3 + v11 * b3 + v12
-            own = form[3, 3, m] + a3 * q3 + b3 * s3 + v02 * a3 + v12 * b3 + v22
-            u0 = form[0, 3, m] + a0 * q3 + b0 * s3
-            u1 = form[1, 3, m] + a1 * q3 + b1 * s3
-            u2 = form[2, 3, m] + a2 * q3 + b2 * s3
-            g0, g1, g2 = u0 / own, u1 / own, u2 / own
-            gains[k, 0, m], gains[k, 1, m], gains[k, 2, m], inverse[k, m] = g0, g1, g2, 1.0 / own
-            value[0, m] = form[0, 0, m] + a0 * q0 + b0 * s0 - u0 * g0
-            value[1, m] = form[0, 1, m] + a0 * q1 + b0 * s1 - u0 * g1
-            value[2, m] = form[0, 2, m] + a0 * q2 + b0 * s2 - u0 * g2
-            value[3, m] = form[1, 1, m] + a1 * q1 + b1 * s1 - u1 * g1
-            value[4, m] = form[1, 2, m] + a1 * q2 + b1 * s2 - u1 * g2
-            value[5, m] = form[2, 2, m] + a2 * q2 + b2 * s2 - u2 * g2
-            l0, l1 = linear[0, m], linear[1, m]
-            force = a3 * l0 + b3 * l1 + linear[2, m] + gradient[k + 1, m]
-            pull[k, m] = force
-            linear[0, m] = a0 * l0 + b0 * l1 - g0 * force
-            linear[1, m] = a1 * l0 + b1 * l1 - g1 * force
-            linear[2, m] = a2 * l0 + b2 * l1 - g2 * force
-    state = np.zeros((2, n_modes))
-    change[0] = 0.0
-    for k in range(n - 1):
-        for m in range(n_modes):
-            q, speed, before = state[0, m], state[1, m], change[k, m]
-            v = -(gains[k, 0, m] * q + gains[k, 1, m] * speed + gains[k, 2, m] * before)
-            v -= pull[k, m] * inverse[k, m]
-            change[k + 1, m] = v
-            state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
-            state[1, m] = to_s[0, m] * q + to_s[1, m] * speed + to_s[2, m] * before + to_s[3, m] * v
+    s = np.empty((ROWS, LANES))
+    gains = np.empty((n - 1, 4, LANES))
+    for first in range(0, n_modes, LANES):
+        used = min(LANES, n_modes - first)
+        s[:] = 0.0
+        for m in range(used):
+            _load_mode(maps, outputs, weights, first + m, m, s)
+        s[STAGE + 7] += weights[1]
+        s[STAGE + 8] -= weights[1]
+        s[STAGE + 9] += weights[1] + weights[0]
+        for k in range(n - 2, -1, -1):
+            for m in range(used):
+                s[FORCE, m] = gradient[k + 1, first + m]
+            for m in range(LANES):
+                a0, a1, a2, a3 = s[MAP, m], s[MAP + 1, m], s[MAP + 2, m], s[MAP + 3, m]
+                b0, b1, b2, b3 = s[MAP + 4, m], s[MAP + 5, m], s[MAP + 6, m], s[MAP + 7, m]
+                v00, v01, v02 = s[VALUE, m], s[VALUE + 1, m], s[VALUE + 2, m]
+                v11, v12, v22 = s[VALUE + 3, m], s[VALUE + 4, m], s[VALUE + 5, m]
+                l0, l1, l2 = s[LINEAR, m], s[LINEAR + 1, m], s[LINEAR + 2, m]
+                # rows of q and q̇ of the value after the interval, times the map to (q⁺, q̇⁺, v⁺)
+                q0, s0 = v00 * a0 + v01 * b0, v01 * a0 + v11 * b0
+                q1, s1 = v00 * a1 + v01 * b1, v01 * a1 + v11 * b1
+                q2, s2 = v00 * a2 + v01 * b2, v01 * a2 + v11 * b2
+                q3, s3 = v00 * a3 + v01 * b3 + v02, v01 * a3 + v11 * b3 + v12
+                own = np.divide(1.0, s[STAGE + 9, m] + a3 * q3 + b3 * s3 + v02 * a3 + v12 * b3 + v22)
+                u0 = s[STAGE + 3, m] + a0 * q3 + b0 * s3
+                u1 = s[STAGE + 6, m] + a1 * q3 + b1 * s3
+                u2 = s[STAGE + 8, m] + a2 * q3 + b2 * s3
+                g0, g1, g2 = u0 * own, u1 * own, u2 * own
+                force = a3 * l0 + b3 * l1 + l2 + s[FORCE, m]
+                s[GAIN, m], s[GAIN + 1, m], s[GAIN + 2, m], s[GAIN + 3, m] = g0, g1, g2, force * own
+                s[VALUE, m] = s[STAGE, m] + a0 * q0 + b0 * s0 - u0 * g0
+                s[VALUE + 1, m] = s[STAGE + 1, m] + a0 * q1 + b0 * s1 - u0 * g1
+                s[VALUE + 2, m] = s[STAGE + 2, m] + a0 * q2 + b0 * s2 - u0 * g2
+                s[VALUE + 3, m] = s[STAGE + 4, m] + a1 * q1 + b1 * s1 - u1 * g1
+                s[VALUE + 4, m] = s[STAGE + 5, m] + a1 * q2 + b1 * s2 - u1 * g2
+                s[VALUE + 5, m] = s[STAGE + 7, m] + a2 * q2 + b2 * s2 - u2 * g2
+                s[LINEAR, m] = a0 * l0 + b0 * l1 - g0 * force
+                s[LINEAR + 1, m] = a1 * l0 + b1 * l1 - g1 * force
+                s[LINEAR + 2, m] = a2 * l0 + b2 * l1 - g2 * force
+            for r in range(4):
+                for m in range(LANES):
+                    gains[k, r, m] = s[GAIN + r, m]
+        change[0, first : first + used] = 0.0
+        for k in range(n - 1):
+            for r in range(4):
+                for m in range(LANES):
+                    s[GAIN + r, m] = gains[k, r, m]
+            for m in range(LANES):
+                q, speed, before = s[STATE, m], s[STATE + 1, m], s[STATE + 2, m]
+                v = -(s[GAIN, m] * q + s[GAIN + 1, m] * speed + s[GAIN + 2, m] * before) - s[GAIN + 3, m]
+                s[STATE, m] = (
+                    s[MAP, m] * q + s[MAP + 1, m] * speed + s[MAP + 2, m] * before + s[MAP + 3, m] * v
+                )
+                s[STATE + 1, m] = (
+                    s[MAP + 4, m] * q + s[MAP + 5, m] * speed + s[MAP + 6, m] * before + s[MAP + 7, m] * v
+                )
+                s[STATE + 2, m] = v
+            for m in range(used):
+                change[k + 1, first + m] = s[STATE + 2, m]
+
+
+@inlined
+def _load_mode(maps: Array, outputs: Array, weights: Array, mode: int, m: int, s: Array) -> None:
+    """Write one mode's map over an interval, and what ω and P_s weigh there, to a lane of `modal_change`."""
+    at = STAGE
+    for r in range(4):
+        s[MAP + r, m], s[MAP + 4 + r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
+        for c in range(r, 4):
+            for i in range(1, len(maps)):
+                s[at, m] += weights[2] * outputs[0, mode] * maps[i, 1, r, mode] * maps[i, 1, c, mode]
+                s[at, m] += weights[3] * outputs[1, mode] * maps[i, 0, r, mode] * maps[i, 0, c, mode]
+            at += 1
 
 
 @compiled
@@ -358,8 +412,8 @@ def _loss(
         share = 0.5 if k == 0 or k == n_fine - 1 else 1.0
         cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_fine - 1)
         for g in range(n_gen):
-            excess = abs(omega[k, g]) / limits.bound - 1.0
-            if excess > 0.0:
+            if abs(omega[k, g]) > limits.bound:
+                excess = abs(omega[k, g]) / limits.bound - 1.0
                 bent = min(excess, STRAIGHT)
                 penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
     return float(cost + PRICE * penalty * 2.0 * modes.half)

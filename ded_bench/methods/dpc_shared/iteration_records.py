@@ -29,8 +29,8 @@ SMALLEST_COST = 0.05
 class Modes(NamedTuple):
     """The grid in modal coordinates; see `GridResponse`."""
 
-    step: Floats  # per mode: (q, q̇, v, v⁺) -> (q⁺, q̇⁺), (n_modes, 2, 4)
-    damping: Floats  # what is left of it, (n_modes, n_modes), 1/s
+    step: Floats  # (q, q̇, v, v⁺) -> (q⁺, q̇⁺) of each mode, (2, 4, n_modes)
+    damping: Floats  # what is left of it, for half a step, (n_modes, n_modes)
     half: float  # half the spacing of fine points, s
     instants: Indices  # fine points at which stiffness changes are given, (n_instants,)
 

@@ -1,4 +1,4 @@
-"""Angles along a path, compiled: power flow at t = 0, electrical power, stiffness, and samples of loads.
+"""The network along a path, compiled: power flow at t = 0, electrical power, stiffness, inputs of the modes.
 
 Numba's cache on disk notices that a function's own file changed, not that a function which it calls did.
 """
@@ -8,15 +8,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ded_bench.methods.dpc_shared.elimination import Elimination
+from ded_bench.methods.dpc_shared.iteration_records import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
-Indices = NDArray[np.int_]
-
 #: Mismatch of a power flow that is good enough here, pu, and the steps after which it is given up.
-MISMATCH, STEPS = 1e-8, 60
+MISMATCH, STEPS = 1e-5, 60
 #: The Jacobian is renewed where a step makes the mismatch smaller by less than this factor.
 CONTRACTION = 0.3
 
@@ -27,105 +26,38 @@ class Lines(NamedTuple):
     ends: Indices  # (n_line, 2)
     coupling: Array  # (n_line,), pu
     generators: Indices  # buses, (n_gen,)
-    algebraic: Indices  # load and junction buses, (n_algebraic,)
     loads: Indices  # buses, (n_load,)
 
 
 @compiled
-def oscillators(squares: Array, rate: float, h: float) -> Array:
-    """Exact maps of q̈ + rate q̇ + square q = v over h, v linear: (q, q̇, v, v⁺) -> (q⁺, q̇⁺).
-
-    Args:
-        squares: of angular frequencies, (n_modes,), 1/s².
-        rate: of damping, 1/s.
-        h: time, s.
-
-    Returns:
-        (n_modes, 2, 4).
-    """
-    maps, column, term = np.empty((len(squares), 2, 4)), np.empty(4), np.empty(4)
-    for m in range(len(squares)):
-        halvings = 0
-        while (abs(squares[m]) * h + rate + 1.0) * h > 0.5 * 2.0**halvings:
-            halvings += 1
-        short, exact = h / 2.0**halvings, np.zeros((4, 4))  # of (q, q̇, v, v̇)
-        for c in range(4):
-            column[:], term[:] = 0.0, 0.0
-            column[c] = term[c] = 1.0
-            for power in range(1, 15):
-                part = short / power
-                fall = -(squares[m] * term[0] + rate * term[1]) + term[2]
-                term[0], term[1], term[2], term[3] = part * term[1], part * fall, part * term[3], 0.0
-                column += term
-            exact[:, c] = column
-        for _ in range(halvings):
-            exact = np.dot(exact, exact)
-        maps[m, :, :2] = exact[:2, :2]
-        maps[m, :, 3] = exact[:2, 3] / h
-        maps[m, :, 2] = exact[:2, 2] - maps[m, :, 3]
-    return maps
-
-
-@compiled
-def interval_maps(step: Array, fine: int) -> Array:
-    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the fine points between, (fine + 1, 2, 4, n_modes)."""
-    maps = np.zeros((fine + 1, 2, 4, len(step)))
-    maps[0, 0, 0] = maps[0, 1, 1] = 1.0
-    for i in range(fine):
-        for r in range(2):
-            for c in range(4):
-                maps[i + 1, r, c] = step[:, r, 0] * maps[i, 0, c] + step[:, r, 1] * maps[i, 1, c]
-            for c, share in ((2, 1.0 - i / fine), (3, i / fine)):
-                maps[i + 1, r, c] += step[:, r, 2] * share
-            for c, share in ((2, 1.0 - (i + 1) / fine), (3, (i + 1) / fine)):
-                maps[i + 1, r, c] += step[:, r, 3] * share
-    return maps
-
-
-@compiled
-def start_angles(
-    lines: Lines, unknown: Indices, nominal: Array, inverse: Array, wanted: Array, theta: Array
-) -> bool:
-    """Solve the power flow of one instance by Newton's method with a kept inverse.
+def start_angles(lines: Lines, plan: Elimination, nominal: Array, wanted: Array, theta: Array) -> bool:
+    """Solve the power flow of one instance by Newton's method.
 
     Args:
         lines: the network.
-        unknown: all buses but the slack, (n_unknown,).
+        plan: eliminates all buses but the slack.
         nominal: angles to start from, (n_bus,), rad.
-        inverse: of the Jacobian there, (n_unknown, n_unknown).
         wanted: injections at all buses, (n_bus,), pu.
         theta: receives the angles, (n_bus,), rad.
 
     Returns:
         Whether there is a solution, a stable one.
     """
-    n, f = len(unknown), np.empty(len(theta))
-    off, last, kept = np.empty(n), np.inf, inverse.copy()
     theta[:] = nominal
-    for _ in range(STEPS):
-        _injections(lines, theta, f)
-        for i in range(n):
-            off[i] = f[unknown[i]] - wanted[unknown[i]]
-        worst = np.abs(off).max()
-        if worst < MISMATCH:
-            for i in range(len(lines.coupling)):
-                if abs(theta[lines.ends[i, 0]] - theta[lines.ends[i, 1]]) > 0.5 * np.pi:
-                    return False
-            return True
-        if not worst < 1e6:
+    f, off = np.empty(len(theta)), np.empty(len(theta))
+    weights, totals = np.empty(len(plan.neighbours)), np.empty(len(plan.buses))
+    if not _solve_flow(lines, plan, wanted, theta, f, off, weights, totals, False):
+        return False
+    for i in range(len(lines.coupling)):
+        if abs(theta[lines.ends[i, 0]] - theta[lines.ends[i, 1]]) > 0.5 * np.pi:
             return False
-        if worst > CONTRACTION * last:
-            kept[:] = np.linalg.inv(_jacobian(lines, unknown, theta))
-        last = worst
-        step = np.dot(kept, off)
-        for i in range(n):
-            theta[unknown[i]] -= step[i]
-    return False
+    return True
 
 
 @compiled
 def follow_path(
     lines: Lines,
+    plan: Elimination,
     path: Array,
     p_load: Array,
     theta: Array,
@@ -137,6 +69,7 @@ def follow_path(
 
     Args:
         lines: the network.
+        plan: eliminates all buses but generators and slack.
         path: angles of the generators at the knots, (n_knots, n_gen), rad.
         p_load: load injections there, (n_knots, n_load), pu.
         theta: angles of all buses near the first ones, (n_bus,), rad.
@@ -147,47 +80,83 @@ def follow_path(
     Returns:
         Whether there is a solution all along.
     """
-    n, n_gen, n_bus = len(lines.algebraic), path.shape[1], len(theta)
-    angle, injection, wanted = theta.copy(), np.empty(n_bus), np.zeros(n_bus)
-    before, change = np.empty(n), np.zeros(n)
-    for i in range(n):
-        before[i] = angle[lines.algebraic[i]]
-    off, inverse, at, known = np.empty(n), np.empty((n, n)), 0, False
+    n, n_bus = len(plan.buses), len(theta)
+    angle, injection, wanted, off = theta.copy(), np.empty(n_bus), np.zeros(n_bus), np.empty(n_bus)
+    before, change, at, known = theta.copy(), np.zeros(n_bus), 0, False
+    weights, totals = np.empty(len(plan.neighbours)), np.empty(n)
     for k in range(len(path)):
-        for g in range(n_gen):
+        for g in range(path.shape[1]):
             angle[lines.generators[g]] = path[k, g]
         for i in range(len(lines.loads)):
             wanted[lines.loads[i]] = p_load[k, i]
         for i in range(n):
-            angle[lines.algebraic[i]] = before[i] + change[i]
-        last = np.inf
-        for step in range(STEPS):
-            _injections(lines, angle, injection)
-            worst = 0.0
-            for i in range(n):
-                off[i] = injection[lines.algebraic[i]] - wanted[lines.algebraic[i]]
-                worst = max(worst, abs(off[i]))
-            if worst < MISMATCH:
-                break
-            if not worst < 1e6 or step == STEPS - 1:
-                return False
-            if not known or worst > CONTRACTION * last:
-                inverse[:], known = np.linalg.inv(_jacobian(lines, lines.algebraic, angle)), True
-            last = worst
-            correction = np.dot(inverse, off)
-            for i in range(n):
-                angle[lines.algebraic[i]] -= correction[i]
+            bus = plan.buses[i]
+            angle[bus] = before[bus] + change[bus]
+        if not _solve_flow(lines, plan, wanted, angle, injection, off, weights, totals, known):
+            return False
+        known = True
         for i in range(n):
-            found = angle[lines.algebraic[i]]
-            change[i], before[i] = found - before[i], found
-        if k == 0:
-            change[:] = 0.0
-        for g in range(n_gen):
+            bus = plan.buses[i]
+            change[bus] = angle[bus] - before[bus] if k > 0 else 0.0
+            before[bus] = angle[bus]
+        for g in range(path.shape[1]):
             f[k, g] = injection[lines.generators[g]]
         if at < len(instants) and instants[at] == k:
-            _reduced(lines, angle, stiffness[at])
+            if not _factorise(lines, plan, angle, weights, totals):
+                return False
+            _reduce(lines, plan, angle, weights, totals, stiffness[at])
             at += 1
     return True
+
+
+@compiled
+def _solve_flow(
+    lines: Lines,
+    plan: Elimination,
+    wanted: Array,
+    theta: Array,
+    f: Array,
+    off: Array,
+    weights: Array,
+    totals: Array,
+    known: bool,
+) -> bool:
+    """Angles of the eliminated buses for injections wanted there, by Newton's method; whether it converges.
+
+    The Jacobian is that of the last call, if it is known, until a step does not contract.
+
+    Args:
+        lines: the network.
+        plan: which buses are solved for.
+        wanted: at all buses, (n_bus,), pu.
+        theta: where to start; receives the angles, (n_bus,), rad.
+        f: receives the injections, (n_bus,), pu.
+        off: for intermediate values, (n_bus,).
+        weights: of `_factorise`, likewise.
+        totals: likewise.
+        known: whether weights and totals hold a Jacobian.
+    """
+    last = np.inf
+    for _ in range(STEPS):
+        _injections(lines, theta, f)
+        worst = 0.0
+        for i in range(len(plan.buses)):
+            bus = plan.buses[i]
+            off[bus] = f[bus] - wanted[bus]
+            if not abs(off[bus]) < 1e6:  # nor NaN
+                return False
+            worst = max(worst, abs(off[bus]))
+        if worst < MISMATCH:
+            return True
+        if not known or worst > CONTRACTION * last:
+            if not _factorise(lines, plan, theta, weights, totals):
+                return False
+            known = True
+        last = worst
+        _substitute(plan, weights, totals, off)
+        for i in range(len(plan.buses)):
+            theta[plan.buses[i]] -= off[plan.buses[i]]
+    return False
 
 
 @compiled
@@ -202,75 +171,131 @@ def _injections(lines: Lines, theta: Array, f: Array) -> None:
 
 
 @compiled
-def _jacobian(lines: Lines, buses: Indices, theta: Array) -> Array:
-    """∂f/∂θ of some buses in their own angles, pu/rad."""
-    place = np.full(len(theta), -1)
-    for i in range(len(buses)):
-        place[buses[i]] = i
-    jacobian = np.zeros((len(buses), len(buses)))
-    for i in range(len(lines.coupling)):
-        near, far = place[lines.ends[i, 0]], place[lines.ends[i, 1]]
-        slope = lines.coupling[i] * np.cos(theta[lines.ends[i, 0]] - theta[lines.ends[i, 1]])
-        if near >= 0:
-            jacobian[near, near] += slope
-        if far >= 0:
-            jacobian[far, far] += slope
-        if near >= 0 and far >= 0:
-            jacobian[near, far] -= slope
-            jacobian[far, near] -= slope
-    return jacobian
-
-
-@compiled
-def _reduced(lines: Lines, theta: Array, stiffness: Array) -> None:
-    """∂f/∂θ of the generators where the loads fix the other angles, pu/rad."""
-    n_gen, n = len(lines.generators), len(lines.algebraic)
-    place, own = np.full(len(theta), -1), np.full(len(theta), -1)
-    for i in range(n):
-        place[lines.algebraic[i]] = i
-    for g in range(n_gen):
-        own[lines.generators[g]] = g
-    across = np.zeros((n, n_gen))
-    stiffness[:] = 0.0
-    for i in range(len(lines.coupling)):
-        near, far = lines.ends[i, 0], lines.ends[i, 1]
-        slope = lines.coupling[i] * np.cos(theta[near] - theta[far])
-        if own[near] >= 0:
-            stiffness[own[near], own[near]] += slope
-        if own[far] >= 0:
-            stiffness[own[far], own[far]] += slope
-        if own[near] >= 0 and own[far] >= 0:
-            stiffness[own[near], own[far]] -= slope
-            stiffness[own[far], own[near]] -= slope
-        if own[near] >= 0 and place[far] >= 0:
-            across[place[far], own[near]] -= slope
-        if own[far] >= 0 and place[near] >= 0:
-            across[place[near], own[far]] -= slope
-    others = np.linalg.solve(_jacobian(lines, lines.algebraic, theta), across)
-    stiffness -= np.dot(across.T, others)
-
-
-@compiled
-def sample_paths(segments: Array, spacing: float, values: Array) -> None:
-    """Loads at the fine points; around a kink as means weighted by hat functions, which keep the area.
+def _factorise(lines: Lines, plan: Elimination, theta: Array, weights: Array, totals: Array) -> bool:
+    """Eliminate buses from ∂f/∂θ.
 
     Args:
-        segments: (start in s, value there, slope) of each linear piece, (batch, n_load, n_segments, 3).
-        spacing: of the fine points, s.
-        values: receives the loads, (batch, n_fine, n_load), pu.
+        lines: the network.
+        plan: of elimination.
+        theta: angles, (n_bus,), rad.
+        weights: receives those of all edges when one of their buses is eliminated, (n_edges,), pu/rad.
+        totals: receives the inverse of the sum at each eliminated bus, (n,), rad/pu.
+
+    Returns:
+        Whether there is a factorisation.
     """
-    for b in range(len(values)):
-        for i in range(values.shape[2]):
-            path, last = segments[b, i], len(segments[b, i]) - 1
-            at = 0
-            for k in range(values.shape[1]):
-                while at < last and path[at + 1, 0] <= k * spacing:
-                    at += 1
-                values[b, k, i] = path[at, 1] + path[at, 2] * (k * spacing - path[at, 0])
-            for s in range(1, len(path)):
-                start, bend = path[s, 0], path[s, 2] - path[s - 1, 2]
-                before = int(start / spacing) if start < spacing * values.shape[1] else values.shape[1]
-                for k in range(max(before, 1), min(before + 2, values.shape[1] - 1)):
-                    u = (k * spacing - start) / spacing
-                    mean = (max(u + 1.0, 0.0) ** 3 - 2.0 * max(u, 0.0) ** 3) / 6.0
-                    values[b, k, i] += bend * spacing * (mean - max(u, 0.0))
+    weights[:] = 0.0
+    for i in range(len(lines.coupling)):
+        if plan.of_line[i] >= 0:
+            apart = theta[lines.ends[i, 0]] - theta[lines.ends[i, 1]]
+            weights[plan.of_line[i]] += lines.coupling[i] * np.cos(apart)
+    at = 0
+    for k in range(len(plan.buses)):
+        total = 0.0
+        for e in range(plan.first[k], plan.first[k + 1]):
+            total += weights[e]
+        if total == 0.0:
+            return False
+        totals[k] = 1.0 / total
+        for e in range(plan.first[k], plan.kept[k]):
+            share = weights[e] * totals[k]
+            for other in range(e + 1, plan.first[k + 1]):
+                weights[plan.fill[at]] += share * weights[other]
+                at += 1
+    return True
+
+
+@compiled
+def _substitute(plan: Elimination, weights: Array, totals: Array, values: Array) -> None:
+    """Powers at eliminated buses to their angles, with those of `_factorise`, in place; (n_bus,)."""
+    for k in range(len(plan.buses)):
+        values[plan.buses[k]] *= totals[k]
+        for e in range(plan.first[k], plan.kept[k]):
+            values[plan.neighbours[e]] += weights[e] * values[plan.buses[k]]
+    for k in range(len(plan.buses) - 1, -1, -1):
+        for e in range(plan.first[k], plan.kept[k]):
+            values[plan.buses[k]] += totals[k] * weights[e] * values[plan.neighbours[e]]
+
+
+@compiled
+def _reduce(
+    lines: Lines, plan: Elimination, theta: Array, weights: Array, totals: Array, stiffness: Array
+) -> None:
+    """∂f/∂θ of the generators where the loads fix the other angles, pu/rad: Kron reduction."""
+    own = np.full(len(theta), -1)
+    for g in range(len(lines.generators)):
+        own[lines.generators[g]] = g
+    stiffness[:] = 0.0
+    for i in range(len(lines.coupling)):
+        near, far = own[lines.ends[i, 0]], own[lines.ends[i, 1]]
+        if near >= 0 or far >= 0:
+            slope = lines.coupling[i] * np.cos(theta[lines.ends[i, 0]] - theta[lines.ends[i, 1]])
+            if near >= 0:
+                stiffness[near, near] += slope
+            if far >= 0:
+                stiffness[far, far] += slope
+            if near >= 0 and far >= 0:
+                stiffness[near, far] -= slope
+                stiffness[far, near] -= slope
+    for k in range(len(plan.buses)):
+        for e in range(plan.kept[k], plan.first[k + 1]):
+            g = own[plan.neighbours[e]]
+            if g >= 0:
+                share = weights[e] * totals[k]
+                for other in range(plan.kept[k], plan.first[k + 1]):
+                    h = own[plan.neighbours[other]]
+                    if h >= 0:
+                        stiffness[g, h] -= share * weights[other]
+
+
+@compiled
+def path_inputs(
+    path: Array,
+    f: Array,
+    change: Array,
+    taken: Array,
+    load: Array,
+    constants: tuple[Array, Array, Array, Array],
+    offset: Array,
+    modal: Array,
+    slack: Array,
+) -> None:
+    """What is not P in the modes' inputs, once the power flow along the paths is known.
+
+    What f says that neither S nor ΔS do is linear between the stations, where the flow was solved.
+
+    Args:
+        path: x at the stations, (batch, n_stations, n_gen), rad.
+        f: electrical powers there, likewise, pu.
+        change: ΔS at the instants, (batch, n_instants, n_gen, n_gen), pu/rad.
+        taken: T (L - L_0) at the fine points, (batch, n_fine, n_gen), pu.
+        load: there, (batch, n_fine, n_load), pu.
+        constants: S (n_gen, n_gen), pu/rad, linear interpolation from instants to fine points
+            (n_fine, n_instants), `gain` and `shape` of `GridResponse`.
+        offset: receives the inputs, (batch, n_fine, n_modes).
+        modal: receives ΔS of the modes, (batch, n_instants, n_modes, n_modes), 1/s².
+        slack: receives P_s at x = 0, (batch, n_fine), pu.
+    """
+    stiffness, between, gain, shape = constants
+    n_stations, n_fine = path.shape[1], taken.shape[1]
+    points = (n_fine - 1) // (n_stations - 1)
+    for b in range(len(path)):
+        rest, whole = f[b] - np.dot(path[b], stiffness), taken[b].copy()
+        for s in range(len(change[b])):
+            moved = np.dot(path[b], change[b, s])
+            for k in range(n_stations):
+                rest[k] -= between[k * points, s] * moved[k]
+            modal[b, s] = np.dot(np.dot(gain.T, change[b, s]), shape.T)
+        for k in range(n_stations):
+            rest[k] -= taken[b, k * points]
+        for k in range(n_fine):
+            station = min(k // points, n_stations - 2)
+            later = (k - station * points) / points
+            total = 0.0
+            for g in range(whole.shape[1]):
+                whole[k, g] += (1.0 - later) * rest[station, g] + later * rest[station + 1, g]
+                total += whole[k, g]
+            for i in range(load.shape[2]):
+                total += load[b, k, i]
+            slack[b, k] = -total
+        offset[b] = -np.dot(whole, gain)

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.dpc_shared.drawn_problems import Problems, averaged
+from ded_bench.methods.dpc_shared.elimination import plan_elimination
 from ded_bench.methods.dpc_shared.grid_response import FINE, GridResponse
-from ded_bench.methods.dpc_shared.iteration_kernels import swing, track_rows
-from ded_bench.methods.dpc_shared.path_kernels import Lines, follow_path, start_angles
+from ded_bench.methods.dpc_shared.iteration_kernels import swing
+from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST
+from ded_bench.methods.dpc_shared.path_kernels import Lines, follow_path, path_inputs, start_angles
+from ded_bench.methods.dpc_shared.start_kernels import first_schedules
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.dispatch import merit_order
 
 #: Part of the bound on |ω| at which angles move in the start schedule.
 START_RATE = 0.9
@@ -27,7 +29,7 @@ class Outset:
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0, (batch, 2, n_modes)
     fixed: Array  # T (L - L_0) at the fine points, (batch, n_fine, n_gen), pu
-    static: Array  # static dispatch at the knots, (batch, n_knots, n_gen), pu
+    scale: Array  # what costs are relative to: mean cost of the static dispatch, (batch,)
     start: Array  # first schedule, (batch, n_knots, n_gen), pu
 
 
@@ -47,17 +49,22 @@ class PathModel:
     def __init__(self, case: Case, bound: float, response: GridResponse) -> None:
         network = response.network
         self.case, self.bound, self.response, self.network = case, bound, response, network
-        places = network.generators, network.algebraic, network.loads
-        self.lines = Lines(network.ends, network.coupling, *places)
+        self.lines = Lines(network.ends, network.coupling, network.generators, network.loads)
+        slack, machines = [network.slack], [network.slack, *network.generators.tolist()]
+        self.to_slack, self.to_machines = (
+            plan_elimination(network.ends, network.n_bus, kept) for kept in (slack, machines)
+        )
         self.spacing = float(response.knots[1] - response.knots[0])
         self.ramp = case.ramp * self.spacing
         self.modes = response.modes
         self.inverse = np.linalg.inv(response.shape)
+        self.mass = network.m / network.m.mean()
         at = response.instants
-        #: Linear interpolation from the instants to the fine points.
+        #: Linear interpolation from the instants to the fine points, and their shares of a mean over time.
         self.between = np.stack(
             [np.interp(response.fine, response.knots[at], row) for row in np.eye(len(at))], axis=1
         )
+        self.shares = np.trapezoid(self.between, response.fine, axis=0) / response.fine[-1]
 
     def outset(self, problems: Problems) -> Outset:
         """Angles at t = 0 and the first schedule."""
@@ -67,27 +74,22 @@ class PathModel:
         wanted[:, network.generators] = problems.p_initial
         wanted[:, network.loads] = problems.load[:, 0]
         for b in range(batch):
-            served[b] = start_angles(
-                self.lines, network.unknown, response.theta, response.inverse, wanted[b], theta[b]
-            )
+            served[b] = start_angles(self.lines, self.to_slack, response.theta, wanted[b], theta[b])
         fixed = (problems.load - problems.load[:, :1]) @ response.share.T
         state = np.stack([problems.delta @ self.inverse, problems.omega @ self.inverse], axis=1)
-        at_knots = problems.load[:, ::FINE]
-        static = merit_order(self.case, problems.cost[:, None, 1:], problems.cost[:, :1], at_knots)
-        start = self._start(problems, static, fixed[:, ::FINE])
-        return Outset(problems, served, theta, state, fixed, static, start)
-
-    def _start(self, problems: Problems, static: Array, fixed: Array) -> Array:
-        """A schedule whose steady angles go to those of the static dispatch, at a rate below the bound."""
-        angles = (static - problems.p_initial[:, None] - fixed) @ self.response.compliance
-        angles[:, 0] = 0.0
-        rate = np.full(angles.shape[2], START_RATE * self.bound * self.spacing)
-        free = np.full(angles.shape[2], np.inf)
-        track_rows(angles, -free, free, rate)
-        powers = angles @ self.response.stiffness + problems.p_initial[:, None] + fixed
-        powers[:, 0] = problems.p_initial
-        track_rows(powers, self.case.p_min, self.case.p_max, self.ramp)
-        return np.asarray(powers)
+        n_knots, n_gen = len(response.knots), len(response.gain)
+        mean_cost, start = np.empty(batch), np.empty((batch, n_knots, n_gen))
+        first_schedules(
+            (problems.load, problems.cost, problems.p_initial),
+            fixed,
+            (response.compliance, response.stiffness),
+            (self.case.p_min, self.case.p_max, self.ramp),
+            START_RATE * self.bound * self.spacing,
+            mean_cost,
+            start,
+        )
+        scale = np.maximum(mean_cost, SMALLEST_COST * max(1.0, n_gen / 2))
+        return Outset(problems, served, theta, state, fixed, scale, start)
 
     def start_path(self, outset: Outset) -> Array:
         """Steady x under the first schedules at the stations, (batch, n_stations, n_gen), rad."""
@@ -123,26 +125,19 @@ class PathModel:
         for b in range(batch):
             if outset.served[b]:
                 angles = outset.theta[b, generators] + slow[b]
+                network = self.lines, self.to_machines
                 place = outset.theta[b], instants
-                try:
-                    outset.served[b] = follow_path(self.lines, angles, loads[b], *place, f[b], stiffness[b])
-                except np.linalg.LinAlgError:  # a singular Jacobian, or a path without end
-                    outset.served[b] = False
+                outset.served[b] = follow_path(*network, angles, loads[b], *place, f[b], stiffness[b])
         if not outset.served.all():
             bad = np.logical_not(outset.served)
             f[bad], stiffness[bad] = problems.p_initial[bad][:, None], response.stiffness
             slow = np.where(bad[:, None, None], 0.0, slow)
         change = stiffness - response.stiffness
-        rest = f - slow @ response.stiffness - outset.fixed[:, ::points]
-        by_change = np.einsum("ns,bsng->bng", self.between[::points], slow[:, None] @ change)
-        taken = outset.fixed + linear_between(rest - by_change, points)
-        modal = response.gain.T @ change @ response.shape.T
-        return Linear(-taken @ response.gain, modal, self._slack(outset, taken), change)
-
-    @staticmethod
-    def _slack(outset: Outset, taken: Array) -> Array:
-        """What is left for the slack of what loads and generators take."""
-        return np.asarray(-taken.sum(axis=2) - outset.problems.load.sum(axis=2))
+        offset, modal = np.empty((batch, len(response.fine), n_gen)), np.empty_like(change)
+        slack = np.empty(offset.shape[:2])
+        constants = response.stiffness, self.between, response.gain, response.shape
+        path_inputs(slow, f, change, outset.fixed, problems.load, constants, offset, modal, slack)
+        return Linear(offset, modal, slack, change)
 
     def respond(self, powers: Array, outset: Outset, linear: Linear) -> tuple[Array, Array, Array]:
         """What the linearised grid does under powers at the knots, (batch, n_knots, n_gen), pu.

@@ -28,6 +28,9 @@ SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {"learned": True}, "unle
 #: Iterations after those of the policy, and by what part of it they keep away from the bound on |ω|: their
 #: schedules ride it, and the linearised grid errs (docs/model.md).
 ITERATIONS, MARGIN = 80, 0.01
+#: Weights that were learned for fewer iterations take long steps and do not serve so many: the policy answers
+#: with them, and goes on with those where training starts.
+LEARNED_FOR = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +44,13 @@ class Refiner:
     @staticmethod
     def of(policy: SharedPolicy, learned: bool) -> Refiner:
         """The refiner of a policy, or of one with the weights where training starts."""
+        start = {name: np.zeros_like(values) for name, values in policy.weights.items()}
         if not learned:
-            unlearned = {name: np.zeros_like(values) for name, values in policy.weights.items()}
-            policy = dataclasses.replace(policy, weights=unlearned)
+            policy = dataclasses.replace(policy, weights=start)
+        weights = policy.weights if policy.training["iterations"] >= LEARNED_FOR else start
         case, regime = policy.scope.case, policy.scope.regime
         model = PathModel(case, (1.0 - MARGIN) * case.omega_bound(regime), policy.model.response)
-        return Refiner(policy, model, CompiledIterations(model, policy.weights, ITERATIONS))
+        return Refiner(policy, model, CompiledIterations(model, weights, ITERATIONS))
 
     def __call__(self, instance: Instance) -> Schedule:
         """A schedule on the policy's knots.

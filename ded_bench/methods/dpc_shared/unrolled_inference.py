@@ -19,8 +19,8 @@ import numpy as np
 
 from ded_bench.methods.dpc_shared.grid_response import FINE
 from ded_bench.methods.dpc_shared.iteration_kernels import answer
-from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST, Given, Limits
-from ded_bench.methods.dpc_shared.path_kernels import interval_maps, oscillators
+from ded_bench.methods.dpc_shared.iteration_records import Given, Limits
+from ded_bench.methods.dpc_shared.mode_kernels import mean_modes
 from ded_bench.methods.dpc_shared.path_model import Linear, Outset, PathModel
 from ded_bench.problem.case import Array
 
@@ -79,14 +79,14 @@ def settings_of(weights: Array, iterations: int) -> Array:
 def limits_of(model: PathModel) -> Limits:
     """Limits of a model's case, and what makes them comparable."""
     case, response = model.case, model.response
-    inertia, by_bound = response.network.m, np.diag(response.stiffness) * model.bound * model.spacing
+    by_bound = np.diag(response.stiffness) * model.bound * model.spacing
     unit = float(np.exp(np.log(np.minimum(model.ramp, by_bound)).mean()))
     return Limits(
         low=case.p_min,
         high=case.p_max,
         step=model.ramp,
         bound=model.bound,
-        mass=inertia / inertia.mean(),
+        mass=model.mass,
         unit=unit,
         price=unit
         / ((len(response.knots) - 1) * float(np.maximum(np.abs(case.p_min), np.abs(case.p_max)).sum())),
@@ -97,19 +97,19 @@ def limits_of(model: PathModel) -> Limits:
 
 def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
     """What compiled iterations know of problems."""
-    response = model.response
-    shape32 = response.shape.astype(np.float32)
-    mean_modes, mean_maps, mean_outputs = mean_modes_of(model, linear)
+    taken = model.response.stiffness.sum(axis=0), linear.stiffness.sum(axis=2)
+    nominal, changes = (part @ model.response.shape.T for part in taken)
+    into, maps, outputs = mean_modes_of(model, linear)
     return Given(
-        cost=outset.problems.cost / static_cost(outset)[:, None],
+        cost=outset.problems.cost / outset.scale[:, None],
         offset=linear.offset.astype(np.float32),
         slack=linear.slack.astype(np.float32),
-        leverage=model.slack_stiffness(linear).astype(np.float32) @ shape32.T,
+        leverage=(nominal + model.between @ changes).astype(np.float32),
         change=linear.change.astype(np.float32),
         state=outset.state.astype(np.float32),
-        mean_modes=mean_modes,
-        mean_maps=mean_maps,
-        mean_outputs=mean_outputs,
+        mean_modes=into,
+        mean_maps=maps,
+        mean_outputs=outputs,
     )
 
 
@@ -120,28 +120,12 @@ def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array
         Powers by column (batch, n_gen, n_modes), `interval_maps` (batch, fine + 1, 2, 4, n_modes), and
         `outputs` of `modal_change` (batch, 2, n_modes).
     """
-    inertia = model.response.network.m
-    root = np.sqrt(inertia / inertia.mean())
-    share = np.gradient(model.response.instants.astype(float))
-    share[[0, -1]] *= 0.5
-    mean = model.response.stiffness + np.einsum("i,bign->bgn", share / share.sum(), linear.stiffness)
-    squares, u = np.linalg.eigh(mean / np.outer(root, root))
-    rate, h = model.response.rate, float(model.response.fine[1])
-    maps = np.stack([interval_maps(oscillators(row / inertia.mean(), rate, h), FINE) for row in squares])
-    maps[:, :, :, 2:] /= inertia.mean()
-    angles = u / root[:, None]
-    outputs = np.stack(
-        [(angles**2).sum(axis=1), np.einsum("bg,bgm->bm", mean.sum(axis=1), angles) ** 2], axis=1
-    )
-    return np.ascontiguousarray(root[:, None] * u), maps, outputs
-
-
-def static_cost(outset: Outset) -> Array:
-    """Mean cost of the static dispatch, what costs are relative to, (batch,)."""
-    problems, static = outset.problems, outset.static
-    p_slack = problems.load[:, ::FINE].sum(axis=2) + static.sum(axis=2)
-    cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(p_slack)
-    return np.asarray(np.maximum(cost.mean(axis=1), SMALLEST_COST * max(1.0, static.shape[2] / 2)))
+    response, n = model.response, len(model.mass)
+    mean = response.stiffness + np.tensordot(linear.stiffness, model.shares, axes=(1, 0))
+    into, maps, outputs = (np.empty((len(mean), *shape)) for shape in ((n, n), (FINE + 1, 2, 4, n), (2, n)))
+    inertia, h = float(response.network.m.mean()), float(response.fine[1])
+    mean_modes(mean, model.mass, inertia, response.rate, h, into, maps, outputs)
+    return into, maps, outputs
 
 
 class CompiledIterations:

@@ -17,7 +17,6 @@ from ded_bench.methods.dpc_shared.unrolled_inference import (
     limits_of,
     mean_modes_of,
     starting_settings,
-    static_cost,
     weight_shapes,
 )
 
@@ -54,7 +53,7 @@ class UnrolledIterations(nn.Module):
         modes = mean_modes_of(model, linear)
         low, high, step, mass = map(_single, (limits.low, limits.high, limits.step, limits.mass))
         by_mass, n = 1.0 / (mass * limits.unit**2), outset.start.shape[1]
-        cost = _single(outset.problems.cost / static_cost(outset)[:, None])
+        cost = _single(outset.problems.cost / outset.scale[:, None])
         at_knots, at_fine = means_over_time(n), means_over_time(FINE * (n - 1) + 1)
         price = cost[:, :1] * at_fine
         own = at_knots[1:, None] * cost[:, None, 1:]

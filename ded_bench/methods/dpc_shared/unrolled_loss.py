@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ded_bench.methods.dpc_shared.iteration_records import DOUBLING, STRAIGHT
 from ded_bench.methods.dpc_shared.path_model import Outset, PathModel
-from ded_bench.methods.dpc_shared.unrolled_inference import static_cost
 from ded_bench.methods.dpc_shared.unrolled_iterations import Outcome, means_over_time
 
 #: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
@@ -52,5 +51,5 @@ class ScheduleLoss:
         excess = (omega.abs() / self.model.bound - (1.0 - margin)).relu()
         bent = excess.clamp_max(STRAIGHT)
         penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * self.spacing
-        scale = torch.as_tensor(static_cost(outset), dtype=torch.float32)
+        scale = torch.as_tensor(outset.scale, dtype=torch.float32)
         return Judged(total / scale, penalty, excess.amax(dim=(1, 2)))

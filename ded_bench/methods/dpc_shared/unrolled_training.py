@@ -33,8 +33,11 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
-#: Iterations of an answer: the fewest, and times generators on small grids, where they take less time.
-FEWEST, ROUNDS = 10, 60
+#: Iterations of an answer: the fewest, and times generators on small grids, where they take less time. Where
+#: the bound on |ω| is loose, schedules are shaped by ramps, and a few iterations go almost as far.
+TIGHT, LOOSE = (14, 60), (3, 30)
+#: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
+RAMPING = 0.1
 #: Steps of an epoch, epochs.
 STEPS, EPOCHS = 100, 8
 #: Problems of a step: so many that generators times knots of all are near the first number.
@@ -55,14 +58,16 @@ PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
 class Variant:
     """What a training may choose."""
 
-    iterations: int | None = None  # by the size of the case
+    iterations: int | None = None  # see `iterations_of`
     rate: float = LEARNING_RATE
     price: float = PRICE  # of the penalty
 
 
-def iterations_of(case: Case) -> int:
-    """Iterations of an answer, by the size of a case."""
-    return max(FEWEST, ROUNDS // len(case.generators))
+def iterations_of(model: PathModel) -> int:
+    """Iterations of an answer, by the size of a case and how tight its bound is."""
+    rates = model.ramp / (np.diag(model.response.stiffness) * model.spacing)
+    fewest, rounds = LOOSE if np.median(rates) < RAMPING * model.bound else TIGHT
+    return max(fewest, rounds // len(rates))
 
 
 def batch_of(case: Case) -> int:
@@ -96,7 +101,7 @@ def train(
     horizon = instances[0].horizon_s
     response = GridResponse.make(case, case.knot_times(horizon))
     path_model = PathModel(case, case.omega_bound(regime), response)
-    unrolled = UnrolledIterations(path_model, chosen.iterations or iterations_of(case))
+    unrolled = UnrolledIterations(path_model, chosen.iterations or iterations_of(path_model))
     start = read_start(options.start) if options.start else None
     if start is not None:
         unrolled.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
@@ -104,7 +109,8 @@ def train(
     run = _Run(unrolled, options.seed, chosen, batch_of(case), checkpoint_file(out))
     if options.resume and run.checkpoint.is_file():
         run.load()
-    run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
+    with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
+        run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
     unrolled.load_state_dict(run.best_weights)
     training = {
         "seed": options.seed,

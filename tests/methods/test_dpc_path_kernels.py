@@ -1,0 +1,90 @@
+"""Elimination, power flows and first schedules of the shared policy, compiled; against NumPy and the case."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.methods.dpc_shared.elimination import plan_elimination
+from ded_bench.methods.dpc_shared.grid_response import FINE
+from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST
+from ded_bench.methods.dpc_shared.path_kernels import MISMATCH, follow_path, start_angles
+from ded_bench.methods.dpc_shared.unrolled_training import LOOSE, TIGHT, iterations_of
+from ded_bench.problem.case import Case
+from ded_bench.problem.dispatch import merit_order
+from tests.methods.test_dpc_shared import drawn, path_model
+
+GRIDS = ("9bus", "two-area", "39bus")
+
+
+def test_elimination_of_a_ring_makes_its_mesh_lines() -> None:
+    """Four buses in a ring, one kept: each elimination leaves a smaller ring, and no line twice."""
+    ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [0, 1]])  # two lines in parallel
+    plan = plan_elimination(ends, 4, [3])
+    assert set(plan.buses.tolist()) == {0, 1, 2}
+    edges = [
+        {bus, int(other)}
+        for bus, first, last in zip(plan.buses.tolist(), plan.first[:-1], plan.first[1:], strict=True)
+        for other in plan.neighbours[first:last]
+    ]
+    assert len(edges) == len({frozenset(edge) for edge in edges}) == 5  # four of the ring and one mesh line
+    assert [edges[e] for e in plan.of_line] == [set(line) for line in ends.tolist()]
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_power_flows_and_stiffness_along_a_path_are_the_networks(name: str) -> None:
+    """Angles to the mismatch that is accepted, stiffness by the network's own, dense, linearisation."""
+    model = path_model(Case.load(name))
+    outset, network = drawn(model, 2), model.network
+    problems, generators = outset.problems, network.generators
+    path = outset.theta[0, generators] + model.start_path(outset)[0]
+    loads = np.ascontiguousarray(problems.load[0, :: model.response.every * FINE])
+    f, stiffness = np.empty_like(path), np.empty((2, len(generators), len(generators)))
+    instants = np.array([0, len(path) - 1])
+    place = outset.theta[0], instants
+    assert follow_path(model.lines, model.to_machines, path, loads, *place, f, stiffness)
+    theta = network.power_flow(problems.p_initial[0], loads[0])
+    np.testing.assert_allclose(outset.theta[0], theta, atol=10 * MISMATCH)
+    last = np.zeros(network.n_bus)
+    last[generators] = path[-1]
+    ends, injections = network.solve_loads(last, network.load_injections(loads[-1]))
+    np.testing.assert_allclose(f[-1], injections[generators], atol=10 * MISMATCH)
+    for found, angles in zip(stiffness, (theta, ends), strict=True):
+        np.testing.assert_allclose(found, network.linearise(angles).stiffness, rtol=1e-4, atol=1e-4)
+
+
+def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
+    """Powers that no line can carry."""
+    model = path_model(case)
+    wanted, theta = np.full(model.network.n_bus, 1e3), np.empty(model.network.n_bus)
+    assert not start_angles(model.lines, model.to_slack, model.response.theta, wanted, theta)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_first_schedules_follow_the_static_dispatch(name: str) -> None:
+    """Costs are relative to it; schedules start at P_0 and keep bounds and ramps."""
+    model = path_model(Case.load(name))
+    outset, case = drawn(model, 4), model.case
+    problems = outset.problems
+    loads = problems.load[:, ::FINE]
+    static = merit_order(case, problems.cost[:, None, 1:], problems.cost[:, :1], loads)
+    slack = -(static.sum(axis=2) + loads.sum(axis=2))
+    cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(slack)
+    least = SMALLEST_COST * max(1.0, len(case.generators) / 2)
+    np.testing.assert_allclose(outset.scale, np.maximum(cost.mean(axis=1), least), rtol=1e-12)
+    np.testing.assert_array_equal(outset.start[:, 0], problems.p_initial)
+    assert (np.abs(np.diff(outset.start, axis=1)) <= model.ramp + 1e-12).all()
+    assert ((outset.start >= case.p_min) & (outset.start <= case.p_max))[:, 1:].all()
+
+
+def test_iterations_by_size_and_bound() -> None:
+    """Fewer on large grids, and where the bound is loose."""
+    found = {}
+    for name in ("9bus", "39bus"):
+        case = Case.load(name)
+        for regime in case.regimes:
+            model = path_model(case)
+            model.bound = case.omega_bound(regime)
+            found[name, regime] = iterations_of(model)
+    assert found["39bus", "TO"] == TIGHT[0] > found["39bus", "NO"] == LOOSE[0]
+    assert found["9bus", "TO"] == TIGHT[1] // 2 > found["9bus", "NO"] == LOOSE[1] // 2

@@ -1,12 +1,13 @@
-"""One set of weights for several grids: `ded-dpc-shared`, trained on them in turns, also judged on another.
+"""Weights of `ded-dpc-shared` on grids that they were not learned on, and one set learned on several grids.
 
     python examples/one_policy.py --regime TO --out results/one-policy
 
-Every step adds the gradients of one batch of each grid. Some ten minutes on one core; weights that are there
-are not made again. Judges by simulating validation draws that no choice has seen, and prints a table.
+Every step of the common training adds the gradients of one batch of each grid. Some ten minutes on one core;
+weights that are there are not made again. Judges by simulating validation draws, and prints a table.
 """
 
 import argparse
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,28 +31,30 @@ from ded_bench.methods.dpc_shared.unrolled_training import (
     LEARNING_RATE,
     PRICE,
     batch_of,
+    iterations_of,
     read_start,
 )
-from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.policy_file import Weights
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.truth.servable import servable
 
 #: Grids of the training, and on how many draws each grid is judged; the last is never trained on.
 TRAINED = ("two-area", "39bus", "68bus")
+#: Grids whose own weights are judged on the others.
+KNOWN = ("two-area", "39bus")
 DRAWS = {"two-area": 32, "39bus": 24, "68bus": 8, "140bus": 4}
 #: First validation instance that is judged on.
 FIRST = 20_100
 #: Steps of the training, as many as for one grid.
 STEPS = 800
-#: Iterations of an answer, the same on all grids.
-ITERATIONS = 10
 
 
 def unrolled(name: str, regime: str) -> UnrolledIterations:
     """The iterations on a grid, with the weights where training starts."""
     case = Case.load(name)
     response = GridResponse.make(case, case.knot_times(case.sampling.horizon_s))
-    return UnrolledIterations(PathModel(case, case.omega_bound(regime), response), ITERATIONS)
+    model = PathModel(case, case.omega_bound(regime), response)
+    return UnrolledIterations(model, iterations_of(model))
 
 
 def train(grids: Sequence[UnrolledIterations], steps: int) -> None:
@@ -82,21 +85,21 @@ def train(grids: Sequence[UnrolledIterations], steps: int) -> None:
         nodes.copy_(average)
 
 
-def policy_of(grid: UnrolledIterations, regime: str) -> SharedPolicy:
-    """A policy that answers on a grid with its weights."""
-    case = grid.model.case
-    return SharedPolicy.of(Scope(case, regime, case.sampling.horizon_s), grid, {})
+def find_own(name: str, regime: str) -> SharedPolicy:
+    """The policy of a grid's reference run."""
+    case = Case.load(name)
+    return find_policy(case, regime, Settings(search=search_folders(case)))
 
 
-def judged_on(name: str, regime: str, weights: Path, draws: int) -> list[dict]:
-    """Rows of the weights of all grids and of a grid's own, over `ded-slp`."""
-    grid = unrolled(name, regime)
-    case = grid.model.case
-    grid.load_state_dict({key: torch.as_tensor(value) for key, value in read_start(weights).items()})
-    known = {
-        "of all": policy_of(grid, regime),
-        "its own": find_policy(case, regime, Settings(search=search_folders(case))),
-    }
+def judged_on(name: str, regime: str, common: Weights, draws: int) -> list[dict]:
+    """Rows of the weights of all grids, of a grid's own and of others' on it, over `ded-slp`."""
+    own = find_own(name, regime)
+    facts = {"iterations": own.training["iterations"]}
+    known = {"of all": dataclasses.replace(own, weights=common, training=facts), "its own": own}
+    for other in KNOWN:
+        if other != name:  # with its number of iterations and its margin
+            known[f"of {other}"] = dataclasses.replace(find_own(other, regime), scope=own.scope)
+    case = own.scope.case
     instances = validation_instances(case, draws, FIRST, servable=servable)
     best = [score(i, solve(i, "ded-slp", regime=regime).schedule, regime=regime).objective for i in instances]
     rows = []
@@ -131,10 +134,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         grids = [unrolled(name, asked.regime) for name in TRAINED]
         train(grids, asked.steps)
-        policy_of(grids[0], asked.regime).save(weights)
+        scope = find_own(TRAINED[0], asked.regime).scope
+        SharedPolicy.of(scope, grids[0], {}).save(weights)
+    common = read_start(weights)
     rows: list[dict] = []
     for name, most in DRAWS.items():
-        rows += judged_on(name, asked.regime, weights, min(most, asked.draws or most))
+        rows += judged_on(name, asked.regime, common, min(most, asked.draws or most))
     table = pd.DataFrame(rows)
     table.to_csv(folder / f"table-{asked.regime}.csv", index=False)
     print(table.to_string(index=False, float_format="{:.3g}".format))

@@ -4,26 +4,29 @@
     python examples/unrolled_choices.py hopeless --case 39bus
     python examples/unrolled_choices.py iterations --case 39bus
     python examples/unrolled_choices.py learned-iterations --case 39bus --regime NO
+    python examples/unrolled_choices.py learned-for --case 39bus --regime NO
 
 The first two train the policy with several prices of the penalty, or several sizes from which it counts less,
 some minutes each on one core; weights that are there are not made again. The third gives the committed
-weights other numbers of iterations, the last learns weights for each number. All judge by simulating draws
-that no other choice has seen, and print a table.
+weights other numbers of iterations, the fourth learns weights for each number. The last refines answers with
+the committed weights only where these were learned for so many iterations. All judge by simulating draws that
+no other choice has seen, and print a table.
 """
 
 import argparse
 import dataclasses
 import unittest.mock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from ded_bench import Case, Instance, Settings, load_instances, score, solve
+from ded_bench import Case, Instance, Schedule, Settings, load_instances, score, solve
 from ded_bench.koopman.reference_run import search_folders
-from ded_bench.methods.dpc_shared import unrolled_training
+from ded_bench.methods.dpc_shared import shared_refined, unrolled_training
 from ded_bench.methods.dpc_shared.shared_policy import SharedPolicy, find_policy
+from ded_bench.methods.dpc_shared.shared_refined import Refiner
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.truth.servable import servable
@@ -33,10 +36,19 @@ VALUES = {
     "hopeless": (0.03, 0.1, 0.3),
     "iterations": (5, 10, 20, 40, 80, 160),
     "learned-iterations": (2, 3, 4, 6, 10),
+    "learned-for": (1, 10),
 }
 #: First validation instance that is judged on, and how many.
-FIRST = {"price": 20_000, "hopeless": 20_200, "iterations": 20_000, "learned-iterations": 20_000}
-DRAWS = {"price": 100, "hopeless": 100, "iterations": 32, "learned-iterations": 32}
+FIRST = {
+    "iterations": 20_000,
+    "price": 20_000,
+    "learned-iterations": 20_000,
+    "hopeless": 20_200,
+    "learned-for": 20_300,
+}
+DRAWS = {"price": 100, "hopeless": 100, "iterations": 32, "learned-iterations": 32, "learned-for": 32}
+#: What a policy answers to one instance.
+Answer = Callable[[Instance], Schedule]
 
 
 def trained(case: Case, regime: str, choice: str, value: float, folder: Path) -> SharedPolicy:
@@ -53,10 +65,28 @@ def trained(case: Case, regime: str, choice: str, value: float, folder: Path) ->
     return SharedPolicy.load(out, case, regime)
 
 
-def judged(policy: SharedPolicy, instances: Sequence[Instance], best: Sequence[float]) -> dict:
+def answers(case: Case, regime: str, choice: str, folder: Path) -> list[Answer]:
+    """One policy for each value of a choice."""
+    values = VALUES[choice]
+    if choice in ("iterations", "learned-for"):
+        own = find_policy(case, regime, Settings(search=search_folders(case)))
+        if choice == "learned-for":
+            return [refiner(own, value) for value in values]
+        policies = [dataclasses.replace(own, training=own.training | {"iterations": n}) for n in values]
+    else:
+        policies = [trained(case, regime, choice, value, folder) for value in values]
+    return [lambda instance, policy=policy: policy(instance)[0] for policy in policies]
+
+
+def refiner(policy: SharedPolicy, learned_for: int) -> Refiner:
+    """The refined policy with another rule of when its weights are taken."""
+    with unittest.mock.patch.object(shared_refined, "LEARNED_FOR", learned_for):
+        return Refiner.of(policy, learned=True)
+
+
+def judged(answer: Answer, regime: str, instances: Sequence[Instance], best: Sequence[float]) -> dict:
     """One row of a table: what simulated schedules cost over the best known, and what they violate."""
-    regime = policy.scope.regime
-    scores = [score(i, s, regime=regime) for i, s in zip(instances, policy(instances), strict=True)]
+    scores = [score(i, answer(i), regime=regime) for i in instances]
     gaps = 100.0 * (np.array([s.objective for s in scores]) / best - 1.0)
     excess = np.array([s.freq_violation_hz for s in scores])
     return {
@@ -75,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("choice", choices=tuple(VALUES))
     parser.add_argument("--case", default="39bus", help="a shipped case (default: %(default)s)")
     parser.add_argument("--regime", default="TO", help="of the case (default: %(default)s)")
-    parser.add_argument("--draws", type=int, help="judge so many (default: 32 by iterations, else 100)")
+    parser.add_argument("--draws", type=int, help="judge so many (default: 100 or 32)")
     parser.add_argument("--out", default="results/unrolled-choices", help="folder (default: %(default)s)")
     asked = parser.parse_args(arguments)
     case, regime, folder = Case.load(asked.case), asked.regime, Path(asked.out)
@@ -83,15 +113,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         case, asked.draws or DRAWS[asked.choice], FIRST[asked.choice], servable=servable
     )
     best = [score(i, solve(i, "ded-slp", regime=regime).schedule, regime=regime).objective for i in instances]
-    values = VALUES[asked.choice]
-    if asked.choice == "iterations":
-        own = find_policy(case, regime, Settings(search=search_folders(case)))
-        policies = [dataclasses.replace(own, training=own.training | {"iterations": n}) for n in values]
-    else:
-        policies = [trained(case, regime, asked.choice, value, folder) for value in values]
+    found = answers(case, regime, asked.choice, folder)
     table = pd.DataFrame(
-        {asked.choice: value} | judged(policy, instances, best)
-        for value, policy in zip(values, policies, strict=True)
+        {asked.choice: value} | judged(answer, regime, instances, best)
+        for value, answer in zip(VALUES[asked.choice], found, strict=True)
     )
     folder.mkdir(parents=True, exist_ok=True)
     table.to_csv(folder / f"{asked.choice}-{case.id}-{regime}.csv", index=False)

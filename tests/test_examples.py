@@ -109,6 +109,9 @@ def test_choices_of_the_unrolled_policy(monkeypatch: pytest.MonkeyPatch, tmp_pat
     by_iterations = pd.read_csv(tmp_path / "iterations-two-area-TO.csv")
     assert by_iterations["gap_percent"].is_monotonic_decreasing
     assert (by_iterations["n"] == 2).all()
+    monkeypatch.setitem(unrolled_choices.VALUES, "learned-for", (1, 10))
+    unrolled_choices.main(["learned-for", "--regime", "NO", "--draws", "2", "--out", str(tmp_path)])
+    assert pd.read_csv(tmp_path / "learned-for-39bus-NO.csv")["gap_percent"].nunique() == 2
     for choice in ("learned-iterations", "price", "hopeless"):
         table = pd.read_csv(tmp_path / f"{choice}-two-area-TO.csv").set_index(choice)
         assert table.index.tolist() == list(values[choice])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from ded_bench.methods.dpc_shared.elimination import plan_elimination
 from ded_bench.methods.dpc_shared.grid_response import FINE
@@ -11,7 +12,6 @@ from ded_bench.methods.dpc_shared.iteration_records import SMALLEST_COST
 from ded_bench.methods.dpc_shared.path_kernels import MISMATCH, follow_path, start_angles
 from ded_bench.methods.dpc_shared.unrolled_training import LOOSE, TIGHT, iterations_of
 from ded_bench.problem.case import Case
-from ded_bench.problem.dispatch import merit_order
 from tests.methods.test_dpc_shared import drawn, path_model
 
 GRIDS = ("9bus", "two-area", "39bus")
@@ -61,17 +61,26 @@ def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_first_schedules_follow_the_static_dispatch(name: str) -> None:
-    """Costs are relative to it; schedules start at P_0 and keep bounds and ramps."""
+def test_first_schedules_follow_a_dispatch_within_ramps(name: str) -> None:
+    """Its cost, knot by knot, is that of linear programs; schedules start at P_0, keep bounds and ramps."""
     model = path_model(Case.load(name))
     outset, case = drawn(model, 4), model.case
-    problems = outset.problems
-    loads = problems.load[:, ::FINE]
-    static = merit_order(case, problems.cost[:, None, 1:], problems.cost[:, :1], loads)
-    slack = -(static.sum(axis=2) + loads.sum(axis=2))
-    cost = (static * problems.cost[:, None, 1:]).sum(axis=2) + problems.cost[:, :1] * np.abs(slack)
-    least = SMALLEST_COST * max(1.0, len(case.generators) / 2)
-    np.testing.assert_allclose(outset.scale, np.maximum(cost.mean(axis=1), least), rtol=1e-12)
+    problems, n = outset.problems, len(case.generators)
+    costs = []
+    for cost, before, loads in zip(problems.cost, problems.p_initial, problems.load[:, ::FINE], strict=True):
+        prices, found = np.append(cost[1:], [cost[0], cost[0]]), []
+        for j, load in enumerate(loads.sum(axis=1)):
+            step = np.zeros(n) if j == 0 else model.ramp
+            reach = np.stack(
+                [np.maximum(case.p_min, before - step), np.minimum(case.p_max, before + step)], 1
+            )
+            slack = [(0.0, None), (0.0, None)]  # what the slack takes and gives
+            program = linprog(prices, A_eq=[[1.0] * n + [1.0, -1.0]], b_eq=[-load], bounds=[*reach, *slack])
+            before = program.x[:n]
+            found.append(program.fun)
+        costs.append(np.mean(found))
+    least = SMALLEST_COST * max(1.0, n / 2)
+    np.testing.assert_allclose(outset.scale, np.maximum(costs, least), rtol=1e-9)
     np.testing.assert_array_equal(outset.start[:, 0], problems.p_initial)
     assert (np.abs(np.diff(outset.start, axis=1)) <= model.ramp + 1e-12).all()
     assert ((outset.start >= case.p_min) & (outset.start <= case.p_max))[:, 1:].all()

@@ -402,7 +402,7 @@ def _load_mode(maps: Array, outputs: Array, weights: Array, mode: int, m: int, s
 def _loss(
     p: Array, omega: Array32, p_slack: Array32, given: Given, b: int, limits: Limits, modes: Modes
 ) -> float:
-    """Cost as a part of the static dispatch's, and the penalty; see `ScheduleLoss`."""
+    """Cost as a part of `Outset.scale`, and the penalty; see `ScheduleLoss`."""
     cost, penalty, (n, n_gen), n_fine = 0.0, 0.0, p.shape, len(p_slack)
     for j in range(n):
         for g in range(n_gen):

@@ -21,8 +21,8 @@ PRICE = 0.1
 DOUBLING = 0.05
 #: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
 STRAIGHT = 0.2
-#: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per pair
-#: of generators.
+#: Costs are relative to the ramp-limited dispatch, but an instance is not worth more than this mean cost per
+#: pair of generators.
 SMALLEST_COST = 0.05
 
 
@@ -52,7 +52,7 @@ class Limits(NamedTuple):
 class Given(NamedTuple):
     """What is known of a batch before the first iteration."""
 
-    cost: Array  # (slack, generators), as parts of the static dispatch's mean cost, (batch, 1 + n_gen), 1/pu
+    cost: Array  # (slack, generators), as parts of `Outset.scale`, (batch, 1 + n_gen), 1/pu
     offset: Array32  # see `Linear`: (batch, n_fine, n_modes)
     slack: Array32  # (batch, n_fine), pu
     leverage: Array32  # what a mode takes from the slack, (batch, n_fine, n_modes), pu/rad

@@ -29,7 +29,7 @@ class Outset:
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0, (batch, 2, n_modes)
     fixed: Array  # T (L - L_0) at the fine points, (batch, n_fine, n_gen), pu
-    scale: Array  # what costs are relative to: mean cost of the static dispatch, (batch,)
+    scale: Array  # what costs are relative to: mean cost of the ramp-limited dispatch, (batch,)
     start: Array  # first schedule, (batch, n_knots, n_gen), pu
 
 

@@ -1,4 +1,4 @@
-"""Before any decision, compiled: samples of loads, static dispatch, first schedules.
+"""Before any decision, compiled: samples of loads, ramp-limited dispatch, first schedules.
 
 Numba's cache on disk notices that a function's own file changed, not that a function which it calls did.
 """
@@ -21,10 +21,10 @@ def first_schedules(
     mean_cost: Array,
     start: Array,
 ) -> None:
-    """Schedules whose steady angles go to those of the static dispatch, at a limited rate.
+    """Schedules whose steady angles go to those of the ramp-limited dispatch, at a limited rate.
 
-    The static dispatch is that of `problem.dispatch.merit_order`, whose order of costs is here the same at
-    all knots.
+    That dispatch is a merit order at every knot, as in `problem.dispatch`, with powers no farther from those
+    of the knot before than ramps allow: while a cheap generator rises, a dearer one delivers the rest.
 
     Args:
         problem: loads at the fine points (batch, n_fine, n_load), pu; costs of slack and generators
@@ -33,25 +33,31 @@ def first_schedules(
         grid: inverse of the stiffness, and the stiffness, (n_gen, n_gen), rad/pu and pu/rad.
         limits: of powers, from below and above, and of their change between two knots, (n_gen,), pu.
         rate: most that an angle moves between two knots, rad.
-        mean_cost: receives that of the static dispatch over the knots, (batch,).
+        mean_cost: receives that of the dispatch over the knots, (batch,).
         start: receives the schedules, (batch, n_knots, n_gen), pu.
     """
     (load, cost, p_initial), (compliance, stiffness), (low, high, step) = problem, grid, limits
     batch, n, n_gen = start.shape
     fine = (load.shape[1] - 1) // (n - 1)
+    least, room, dispatch = np.empty(n_gen), np.empty(n_gen), np.empty(n_gen)
     for b in range(batch):
         order, angles = np.argsort(cost[b, 1:], kind="mergesort"), np.empty((n, n_gen))
         mean_cost[b] = 0.0
+        dispatch[:] = p_initial[b]
         for j in range(n):
+            reach = 0.0 if j == 0 else 1.0
             demand = -load[b, j * fine].sum()
-            left, price = demand - low.sum(), 0.0
+            for g in range(n_gen):
+                least[g] = max(low[g], dispatch[g] - reach * step[g])
+                room[g] = min(high[g], dispatch[g] + reach * step[g]) - least[g]
+                demand -= least[g]
+            price = 0.0
             for g in order:
-                room = high[g] - low[g] if cost[b, 1 + g] < cost[b, 0] else 0.0
-                raised = min(max(left, 0.0), room)
-                left -= room
-                demand -= low[g] + raised
-                price += cost[b, 1 + g] * (low[g] + raised)
-                angles[j, g] = low[g] + raised - p_initial[b, g] - taken[b, j * fine, g]
+                raised = min(max(demand, 0.0), room[g]) if cost[b, 1 + g] < cost[b, 0] else 0.0
+                demand -= raised
+                dispatch[g] = least[g] + raised
+                price += cost[b, 1 + g] * dispatch[g]
+                angles[j, g] = dispatch[g] - p_initial[b, g] - taken[b, j * fine, g]
             mean_cost[b] += (price + cost[b, 0] * abs(demand)) / n
         angles = np.dot(angles, compliance)
         angles[0] = 0.0

@@ -1,4 +1,4 @@
-"""The loss of the shared policy: cost as a part of the static dispatch's, and a penalty on |ω| out of bounds.
+"""The loss of the shared policy: relative cost, and a penalty on |ω| out of bounds.
 
 Everything but the bound on |ω| holds by construction.
 """
@@ -20,7 +20,7 @@ MARGIN = 0.015
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Cost relative to the static dispatch, penalty, and largest relative excess of |ω|, each (batch,)."""
+    """Cost as a part of `Outset.scale`, penalty, and largest relative excess of |ω|, each (batch,)."""
 
     cost: Tensor
     penalty: Tensor

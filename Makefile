@@ -146,7 +146,7 @@ ablation: models  ## short trainings of DED-DPC, each with one thing changed, ju
 	  $(DED) solve --method ded-dpc --settings study --model $$model $(VALIDATION) || exit 1; done
 
 certify: train-dpc  ## certify DED-DPC on 10,000 fresh instances per regime
-	$(DED) certify --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
+	$(DED) certify --method $(lastword $(filter-out %-paper,$(POLICIES))) --case $(CASE) $(ONLY) --results $(RESULTS) --workers $(WORKERS)
 
 bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),,models)  ## time each method alone on the machine
 	$(DED) bench --case $(CASE) --results $(RESULTS) --instances $(TIMED) $(BENCH)
@@ -154,13 +154,14 @@ bench: solve-baselines $(if $(ANSWERING),solve-dpc) $(if $(filter 9bus,$(CASE)),
 report: bench  ## everything that is missing, then the tables and the report
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
+# AC cannot carry many instances: their rows say so, and commands end with 1.
 ac: solve-baselines  ## the full AC network: methods that know it, then all kept schedules judged on it
 	$(DED) train-ko --truth ac --case $(CASE) --results $(RESULTS)
-	$(call SOLVE,ded-slp, --settings ac)
-	$(call SOLVE,ded-ko-knots, --model trajectory-ac)
+	-$(call SOLVE,ded-slp, --settings ac)
+	-$(call SOLVE,ded-ko-knots, --model trajectory-ac)
 	$(if $(filter two-area,$(CASE)),$(DED) train-ko --truth ac --kind swing --case $(CASE) --results $(RESULTS))
-	$(if $(filter two-area,$(CASE)),$(call SOLVE,ded-ko-knots, --settings swing-ac))
-	$(DED) score --results $(RESULTS) --truth ac
+	$(if $(filter two-area,$(CASE)),-$(call SOLVE,ded-ko-knots, --settings swing-ac))
+	-$(DED) score --case $(CASE) --results $(RESULTS) --truth ac
 	$(DED) report --case $(CASE) --results $(RESULTS)
 
 online: train-ko  ## the closed loop: all methods at their own latency, then sweeps over latency, forecast and period

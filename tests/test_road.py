@@ -82,9 +82,18 @@ def test_a_folder_of_one_s_own(tmp_path: Path) -> None:
 
 
 def test_every_command_is_understood() -> None:
-    for target in ("report", "models", "ablation", "certify", "radau", "starts", "quick"):
+    for target in ("report", "models", "ablation", "certify", "radau", "starts", "quick", "ac"):
         for command in commands(target):
             parser().parse_args(command)
+
+
+def test_certificates_are_of_the_policy_that_the_road_trains() -> None:
+    for case, method in (("9bus", "ded-dpc"), ("39bus", "ded-dpc-shared")):
+        made = commands("certify", f"CASE={case}")
+        (command,) = (c for c in made if c[0] == "certify")
+        assert parser().parse_args(command).method == method
+        trained = [parser().parse_args(c).method for c in made if c[0] == "train-dpc"]
+        assert (method,) in trained
 
 
 def test_fewer_instances_are_timed_on_large_grids() -> None:

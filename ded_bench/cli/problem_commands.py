@@ -16,8 +16,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.instance import check_whole_steps
 from ded_bench.problem.sampling import Manifest, Split, load_manifest, load_split, write_benchmark
-from ded_bench.problem.scenario_sampling import SCENARIOS, scenario_folder, write_scenarios
+from ded_bench.problem.scenario_sampling import DURATION_S, SCENARIOS, scenario_folder, write_scenarios
 
 if TYPE_CHECKING:
     from ded_bench.evaluate.case_check import CaseCheck
@@ -54,7 +55,7 @@ def add_commands(commands: Any) -> None:
 def _instances(a: argparse.Namespace) -> int:
     from ded_bench.truth.servable import servable
 
-    case = Case.load(a.case)
+    case = _drawable(a.case, None)
     home = problem_folder(a.case, case)
     split = load_split(home) if (home / "split.json").is_file() else Split(seed=SEED, train=(), test=())
     there = len(split.train) + len(split.test)
@@ -66,11 +67,28 @@ def _instances(a: argparse.Namespace) -> int:
     def draw(folder: Path) -> Manifest:
         return write_benchmark(case, count, seed, folder, test, servable)
 
-    manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
+    manifest = draw(folder) if a.force else _unless_changed(folder, draw)
     print(f"{counted(count, 'instance')} of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
     if manifest.redraws:
         print(f"{manifest.redraws} loads or instances were drawn again: their sign changed, or no power flow")
     return 0
+
+
+def _drawable(name: str, duration_s: float | None) -> Case:
+    """A case whose horizon, and the duration of scenarios if there are any, is a number of time steps.
+
+    Raises:
+        InputError: there is no such case, or a time is none.
+    """
+    case = Case.load(name)
+    ranges = case.sampling
+    try:
+        check_whole_steps("horizon_s", ranges.horizon_s, ranges.dt_s)
+        if duration_s is not None:
+            check_whole_steps(f"a scenario's duration of {duration_s:g} s", duration_s, ranges.dt_s)
+    except ValueError as error:
+        raise InputError(name, "sampling", str(error)) from None
+    return case
 
 
 def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
@@ -101,7 +119,7 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
 
 
 def _cases(a: argparse.Namespace) -> int:
-    return _list() if a.case is None else _check(Case.load(a.case), a.count)
+    return _list() if a.case is None else _check(_drawable(a.case, None), a.count)
 
 
 def _list() -> int:
@@ -164,13 +182,13 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 def _scenarios(a: argparse.Namespace) -> int:
     from ded_bench.truth.servable import servable
 
-    case = Case.load(a.case)
+    case = _drawable(a.case, DURATION_S)
     folder = a.out or scenario_folder(problem_folder(a.case, case))
 
     def draw(folder: Path) -> Manifest:
         return write_scenarios(case, a.count, a.seed, folder, servable)
 
-    manifest = draw(folder) if a.out or a.force else _unless_changed(folder, draw)
+    manifest = draw(folder) if a.force else _unless_changed(folder, draw)
     print(
         f"{counted(a.count, 'scenario')} of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}"
     )

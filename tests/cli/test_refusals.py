@@ -44,6 +44,28 @@ def test_bad_instances(command, change, named, instance_file, schedule_file, tmp
     assert "bad.json" in line or named == "atlantis"
 
 
+@pytest.mark.parametrize("command", [("cases",), ("instances", "--case"), ("scenarios", "--case")])
+def test_a_case_whose_horizon_is_no_number_of_steps(command: tuple[str, ...], tmp_path: Path, capsys) -> None:
+    document = json.loads(CASE_FILES["threebus"].read_text())
+    document["sampling"]["dt_s"] *= 0.7
+    (tmp_path / "case.json").write_text(json.dumps(document))
+    assert "horizon_s: must be a whole multiple of dt_s" in refused(capsys, *command, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["instances", "scenarios"])
+def test_a_folder_named_by_out_is_not_drawn_over(kind: str, problem: Path, tmp_path: Path, capsys) -> None:
+    """Neither by another number nor by another seed, unless by force."""
+    draw = [kind, "--case", str(problem), "--out", str(tmp_path / "drawn"), "--count"]
+    assert main([*draw, "3"]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
+    capsys.readouterr()
+    for other in (["2"], ["3", "--seed", "7"]):
+        assert "--force" in refused(capsys, *draw, *other)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
+    assert main([*draw, "2", "--force"]) == 0
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} != before
+
+
 def test_an_edited_copy_and_wrong_units(problem: Path, instance_file: Path, tmp_path: Path, capsys) -> None:
     """Refused before anything is solved, also in a benchmark of one's own."""
     out, text = tmp_path / "out", instance_file.read_text()

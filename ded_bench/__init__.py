@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
     from ded_bench.files.errors import InputError
     from ded_bench.methods.solution import Settings, Solution, Solver
+    from ded_bench.plants.score import Score
+    from ded_bench.plants.simulate import SimulationError, Trajectory
     from ded_bench.problem.ac_case import AcCase
     from ded_bench.problem.benchmark import SplitName
     from ded_bench.problem.case import Case
     from ded_bench.problem.instance import Instance
     from ded_bench.problem.schedule import Schedule
     from ded_bench.solvers.status import Status
-    from ded_bench.truth.score import Score
-    from ded_bench.truth.simulate import SimulationError, Trajectory
 
 __all__ = [
     "AcCase",
@@ -50,12 +50,12 @@ _HOMES = {
     "InputError": "ded_bench.files.errors",
     "Instance": "ded_bench.problem.instance",
     "Schedule": "ded_bench.problem.schedule",
-    "Score": "ded_bench.truth.score",
+    "Score": "ded_bench.plants.score",
     "Settings": "ded_bench.methods.solution",
-    "SimulationError": "ded_bench.truth.simulate",
+    "SimulationError": "ded_bench.plants.simulate",
     "Solution": "ded_bench.methods.solution",
     "Status": "ded_bench.solvers.status",
-    "Trajectory": "ded_bench.truth.simulate",
+    "Trajectory": "ded_bench.plants.simulate",
 }
 
 
@@ -84,8 +84,8 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
         InputError: there is no such case or split, the limit is negative, or a file is missing or wrong.
     """
     from ded_bench.files.errors import InputError
+    from ded_bench.plants.lossless.servable import servable
     from ded_bench.problem.benchmark import select_split
-    from ded_bench.truth.servable import servable
 
     if limit is not None and limit < 0:
         raise InputError("limit", "", f"must be at least 0, or None for all, not {limit}")
@@ -120,8 +120,8 @@ def solve(
     Raises:
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
-    from ded_bench.koopman.reference_run import search_folders
     from ded_bench.methods.solution import Settings
+    from ded_bench.results.reference_run import search_folders
 
     own = _case_of(instance, case)
     own.check_regimes([regime])
@@ -156,7 +156,7 @@ def simulate(
         from ded_bench.truth.ac_simulate import simulate_ac
 
         return simulate_ac(own, data, instance, given)
-    from ded_bench.truth import simulate
+    from ded_bench.plants import simulate
 
     return simulate.simulate(own, instance, given)
 
@@ -189,7 +189,7 @@ def score(
         from ded_bench.truth.ac_simulate import score_ac
 
         return score_ac(own, data, instance, given, regime)
-    from ded_bench.truth import score
+    from ded_bench.plants import score
 
     return score.score(own, instance, given, regime)
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench import Case, Settings
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.online import loop
-from ded_bench.online.judgement import Judgement, judge_operation
-from ded_bench.online.planner import Planner
+from ded_bench.results.reference_run import search_folders
+from ded_bench.run.online import loop
+from ded_bench.run.online.judgement import Judgement, judge_operation
+from ded_bench.run.online.planner import Planner
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.scenario import Scenario, ScenarioRamp, load_scenarios

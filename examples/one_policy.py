@@ -17,14 +17,14 @@ import pandas as pd
 import torch
 
 from ded_bench import Case, Settings, score, solve
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.methods.dpc_shared.drawn_problems import draw
-from ded_bench.methods.dpc_shared.grid_response import GridResponse
-from ded_bench.methods.dpc_shared.path_model import PathModel
-from ded_bench.methods.dpc_shared.shared_policy import SharedPolicy, find_policy
-from ded_bench.methods.dpc_shared.unrolled_iterations import UnrolledIterations
-from ded_bench.methods.dpc_shared.unrolled_loss import MARGIN, ScheduleLoss
-from ded_bench.methods.dpc_shared.unrolled_training import (
+from ded_bench.results.reference_run import search_folders
+from ded_bench.methods.admm.drawn_problems import draw
+from ded_bench.methods.admm.grid_response import GridResponse
+from ded_bench.methods.admm.path_model import PathModel
+from ded_bench.methods.admm.admm_policy import SharedPolicy, find_policy
+from ded_bench.methods.admm.admm_iterations import UnrolledIterations
+from ded_bench.methods.admm.admm_loss import MARGIN, ScheduleLoss
+from ded_bench.methods.admm.admm_training import (
     AVERAGE,
     CLIP_NORM,
     HOPELESS,
@@ -36,7 +36,7 @@ from ded_bench.methods.dpc_shared.unrolled_training import (
 )
 from ded_bench.methods.policy_file import Weights
 from ded_bench.problem.benchmark import validation_instances
-from ded_bench.truth.servable import servable
+from ded_bench.plants.lossless.servable import servable
 
 #: Grids of the training, and on how many draws each grid is judged; the last is never trained on.
 TRAINED = ("two-area", "39bus", "68bus")

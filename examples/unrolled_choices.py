@@ -23,13 +23,13 @@ import numpy as np
 import pandas as pd
 
 from ded_bench import Case, Instance, Schedule, Settings, load_instances, score, solve
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.methods.dpc_shared import shared_refined, unrolled_training
-from ded_bench.methods.dpc_shared.shared_policy import SharedPolicy, find_policy
-from ded_bench.methods.dpc_shared.shared_refined import Refiner
+from ded_bench.results.reference_run import search_folders
+from ded_bench.methods.admm import admm_refined as shared_refined, admm_training as unrolled_training
+from ded_bench.methods.admm.admm_policy import SharedPolicy, find_policy
+from ded_bench.methods.admm.admm_refined import Refiner
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.problem.benchmark import validation_instances
-from ded_bench.truth.servable import servable
+from ded_bench.plants.lossless.servable import servable
 
 VALUES = {
     "price": (0.05, 0.1, 0.2),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
-from ded_bench.koopman.model import Koopman
+from ded_bench.surrogates.koopman import Koopman
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.policy_file import find_policy_file

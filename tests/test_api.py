@@ -15,7 +15,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import write_benchmark
 from ded_bench.solvers.status import Status
-from ded_bench.truth import score, simulate
+from ded_bench.plants import score, simulate
 
 HEAVY = ("casadi", "matplotlib", "numba", "pandas", "pyomo", "scipy", "torch")
 
@@ -56,7 +56,7 @@ def test_answers_need_no_torch() -> None:
     code = "from ded_bench.cli import commands\n"
     code += "from ded_bench.methods.registry import METHODS\n"
     code += "[m.settings for m in METHODS.values()]\n"
-    code += "import ded_bench.run.runner, ded_bench.evaluate.certificate, ded_bench.report.report\n"
+    code += "import ded_bench.run.runner, ded_bench.analysis.certificate, ded_bench.report.report\n"
     assert "torch" not in loaded_after(code)
 
 

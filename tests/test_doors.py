@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.evaluate.timing import read_timing, timing_summary
+from ded_bench.results.timing import read_timing, timing_summary
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import load_split, write_benchmark
 from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.paper import paper_lines
-from ded_bench.run.results import Results
+from ded_bench.results.rows import Results
 from tests.evaluate.test_summary import DED, with_gaps
 
 PYPROJECT = """\

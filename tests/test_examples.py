@@ -17,7 +17,7 @@ from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.scenario_sampling import sample_scenario
-from ded_bench.truth.servable import servable
+from ded_bench.plants.lossless.servable import servable
 
 EXAMPLES = REPOSITORY / "examples"
 

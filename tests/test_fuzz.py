@@ -25,11 +25,11 @@ import pytest
 import torch
 
 from ded_bench.cli import commands
-from ded_bench.evaluate.summary import claims, summary, table_times, worst
-from ded_bench.evaluate.timing import TIMING, TimingRow, read_timing
+from ded_bench.analysis.summary import claims, summary, table_times, worst
+from ded_bench.results.timing import TIMING, TimingRow, read_timing
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
@@ -41,9 +41,9 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import Manifest, Split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run import runner
-from ded_bench.run.results import ROWS, Results, Row
+from ded_bench.results.rows import ROWS, Results, Row
 from ded_bench.run.scoring import scored_row
-from ded_bench.truth import score as scorer
+from ded_bench.plants import score as scorer
 from tests.damage import (
     Mutant,
     Payload,

@@ -11,8 +11,8 @@ from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.paper import paper_lines
 from ded_bench.report.render import to_markdown
 from ded_bench.report.sources import read_sources
-from ded_bench.run.results import Results
-from ded_bench.truth.score import Score, score
+from ded_bench.results.rows import Results
+from ded_bench.plants.score import Score, score
 
 FOLDER = REPOSITORY / "results" / "9bus-reference"
 TABLES = {"table_v": TABLE_V, "table_vi": TABLE_VI}

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.surrogates import MODELS
 from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
 from ded_bench.run.environment import version
+from ded_bench.surrogates.find import MODELS
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite

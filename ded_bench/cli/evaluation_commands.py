@@ -23,17 +23,17 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.cli.messages import counted, say
 from ded_bench.files.errors import InputError
-from ded_bench.files.results_folder import ResultsFolder
-from ded_bench.koopman.reference_run import reference_run, search_folders
-from ded_bench.koopman.surrogates import default_results
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.reference_run import reference_run, search_folders
 from ded_bench.run.pool import Workers
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import default_results
 
 if TYPE_CHECKING:
-    from ded_bench.run.results import Results
+    from ded_bench.results.rows import Results
 
 
 def add_commands(commands: Any) -> None:
@@ -95,8 +95,8 @@ def add_commands(commands: Any) -> None:
 
 def _bench(a: argparse.Namespace) -> int:
     from ded_bench.methods.registry import get_method, registered
-    from ded_bench.run.results import Results
-    from ded_bench.truth.servable import servable
+    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.results.rows import Results
 
     chosen = select_split(a.case)
     case = chosen.case
@@ -112,8 +112,8 @@ def _bench(a: argparse.Namespace) -> int:
         )
     timed = ", ".join(sorted(known & set(methods)))
     say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
-    from ded_bench.evaluate.bench import bench, choose_sample, runs_of
-    from ded_bench.evaluate.timing import timing_summary
+    from ded_bench.results.timing import timing_summary
+    from ded_bench.run.bench import bench, choose_sample, runs_of
 
     jobs = runs_of(results.rows, Settings(search=search_folders(case, results.folder)), methods)
     rows = bench(
@@ -145,7 +145,7 @@ def _certify(a: argparse.Namespace) -> int:
     for regime in regimes:
         get_method(a.method).artifacts(case, regime, settings)  # says what is missing
     say(f"{a.method} and ded-ko-knots on {counted(a.count, 'fresh instance')}, {' and '.join(regimes)}")
-    from ded_bench.evaluate.certificate import Criteria, certify, rows_file, save_certificate
+    from ded_bench.analysis.certificate import Criteria, certify, rows_file, save_certificate
 
     for regime in regimes:
         certificate = certify(
@@ -167,7 +167,7 @@ def _certify(a: argparse.Namespace) -> int:
 def _compare(a: argparse.Namespace) -> int:
     if all(ResultsFolder(folder).results.is_file() for folder in (a.a, a.b)):
         say(f"comparing {a.a} with {a.b}")
-    from ded_bench.evaluate.compare import Tolerance, compare
+    from ded_bench.analysis.compare import Tolerance, compare
     from ded_bench.report.comparison import to_json, to_text
 
     limits = Tolerance(a.tolerance, a.tolerance_hz, a.tolerance_pu)
@@ -193,14 +193,14 @@ def _score_waiting(place: str, results: Results, workers: int) -> None:
 
 def _report(a: argparse.Namespace) -> int:
     with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
-        from ded_bench.run.results import Results
+        from ded_bench.results.rows import Results
 
         case = Case.load(a.case)
         folder = a.results or default_results(case)
         if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
             say(f"tables and figures of {counted(rows, 'row')} in {folder}")
         from ded_bench.report.report import write_report
-        from ded_bench.run.objectives import OBJECTIVES, objectives_file, objectives_of
+        from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
 
         _score_waiting(a.case, Results(folder), a.workers)
         written = write_report(case, folder, problem_folder(a.case, case), pool)

@@ -19,18 +19,18 @@ from ded_bench.cli.arguments import (
     positive_number,
 )
 from ded_bench.cli.messages import counted, say
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.koopman.surrogates import default_results
 from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.scenario import load_scenarios
 from ded_bench.problem.scenario_sampling import scenario_files, scenario_folder
+from ded_bench.results.reference_run import search_folders
+from ded_bench.surrogates.find import default_results
 
 if TYPE_CHECKING:
-    from ded_bench.online.online_results import OnlineRow
-    from ded_bench.online.operation import Operation
+    from ded_bench.results.online_results import OnlineRow
+    from ded_bench.run.online.operation import Operation
 
 
 def add_commands(commands: Any) -> None:
@@ -79,8 +79,8 @@ def _qualities(text: str) -> tuple[str, ...]:
 
 
 def _online(a: argparse.Namespace) -> int:
-    from ded_bench.online.online_results import OnlineResults
-    from ded_bench.online.operation import operate
+    from ded_bench.results.online_results import OnlineResults
+    from ded_bench.run.online.operation import operate
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
@@ -92,9 +92,9 @@ def _online(a: argparse.Namespace) -> int:
 
 def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
-    from ded_bench.online.loop import LoopOptions
-    from ded_bench.online.operation import make_operations
-    from ded_bench.online.planner import LIMIT_S
+    from ded_bench.run.online.loop import LoopOptions
+    from ded_bench.run.online.operation import make_operations
+    from ded_bench.run.online.planner import LIMIT_S
 
     search = search_folders(case, folder)
     files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)

@@ -21,7 +21,7 @@ from ded_bench.problem.sampling import Manifest, Split, load_manifest, load_spli
 from ded_bench.problem.scenario_sampling import DURATION_S, SCENARIOS, scenario_folder, write_scenarios
 
 if TYPE_CHECKING:
-    from ded_bench.evaluate.case_check import CaseCheck
+    from ded_bench.analysis.inspect_case import CaseCheck
 
 COUNT, SEED = 500, 2022
 
@@ -53,7 +53,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _instances(a: argparse.Namespace) -> int:
-    from ded_bench.truth.servable import servable
+    from ded_bench.plants.lossless.servable import servable
 
     case = _drawable(a.case, None)
     home = problem_folder(a.case, case)
@@ -138,8 +138,8 @@ def _list() -> int:
 
 
 def _check(case: Case, count: int) -> int:
-    from ded_bench.evaluate.case_check import check_case
-    from ded_bench.truth.network import PowerFlowError
+    from ded_bench.analysis.inspect_case import check_case
+    from ded_bench.plants.lossless.network import PowerFlowError
 
     sizes = f"{len(case.buses)} buses, {len(case.generators)} generators, {len(case.loads)} loads"
     print(f"case {case.id}: {sizes}", flush=True)
@@ -180,7 +180,7 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 
 
 def _scenarios(a: argparse.Namespace) -> int:
-    from ded_bench.truth.servable import servable
+    from ded_bench.plants.lossless.servable import servable
 
     case = _drawable(a.case, DURATION_S)
     folder = a.out or scenario_folder(problem_folder(a.case, case))

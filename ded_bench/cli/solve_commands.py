@@ -24,18 +24,18 @@ from ded_bench.cli.arguments import (
 from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.koopman.surrogates import default_results
 from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
 from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.plausibility import check_own_name, check_plausible
 from ded_bench.problem.schedule import Schedule
+from ded_bench.results.reference_run import search_folders
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import default_results
 
 if TYPE_CHECKING:
-    from ded_bench.run.results import Results, Row
+    from ded_bench.results.rows import Results, Row
 
 
 def add_commands(commands: Any) -> None:
@@ -84,7 +84,7 @@ def _add_score(commands: Any) -> None:
 
 
 def _solve(a: argparse.Namespace) -> int:
-    from ded_bench.run.results import Results
+    from ded_bench.results.rows import Results
     from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
 
     chosen = _chosen(a)
@@ -145,9 +145,9 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
+    from ded_bench.plants.score import score
+    from ded_bench.plants.simulate import SimulationError
     from ded_bench.truth.ac_simulate import score_ac
-    from ded_bench.truth.score import score
-    from ded_bench.truth.simulate import SimulationError
 
     try:
         if a.truth == "ac":
@@ -171,7 +171,7 @@ def _score_one(a: argparse.Namespace) -> int:
 
 def _score_results(a: argparse.Namespace) -> int:
     """The schedules kept in a results folder, against its rows."""
-    from ded_bench.run.results import Results
+    from ded_bench.results.rows import Results
 
     results = Results(a.results)
     if not results.rows:
@@ -249,7 +249,7 @@ def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[s
 
 
 def _score_folder(a: argparse.Namespace) -> int:
-    from ded_bench.run.results import Results
+    from ded_bench.results.rows import Results
     from ded_bench.run.submit import submit
 
     if not a.name:
@@ -272,8 +272,8 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
-    from ded_bench.truth.network import check_servable
-    from ded_bench.truth.servable import servable
+    from ded_bench.plants.lossless.network import check_servable
+    from ded_bench.plants.lossless.servable import servable
 
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)

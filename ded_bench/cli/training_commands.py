@@ -25,12 +25,12 @@ from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
-from ded_bench.koopman.reference_run import search_folders
-from ded_bench.koopman.surrogates import TRAINED, default_results
 from ded_bench.methods.registry import trainable
 from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.benchmark import problem_folder, select_split
 from ded_bench.problem.case import Case
+from ded_bench.results.reference_run import search_folders
+from ded_bench.surrogates.find import TRAINED, default_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,7 +96,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _train_ko(a: argparse.Namespace) -> int:
-    from ded_bench.koopman.surrogates import model_file
+    from ded_bench.surrogates.find import model_file
 
     case, is_ac = Case.load(a.case), a.truth == "ac"
     if a.noise and not is_ac:
@@ -116,15 +116,15 @@ def _train_ko(a: argparse.Namespace) -> int:
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
     if is_ac:
         return _train_ko_ac(a, case, out)
-    from ded_bench.evaluate.rollouts import rollout_table
-    from ded_bench.koopman.identify import held_out, identify
-    from ded_bench.koopman.linear import nominal_model
+    from ded_bench.analysis.rollouts import rollout_table
+    from ded_bench.surrogates.identify import held_out, identify
+    from ded_bench.surrogates.linear import nominal_model
 
     if a.kind == "koopman":
         model = identify(case, a.seed, a.count)
     else:
         with _needing_torch():
-            from ded_bench.koopman.identify_paper import identify_paper
+            from ded_bench.surrogates.koopman_paper import identify_paper
         model = identify_paper(case, a.seed, a.count)
     model.save(out)
     return _told(out, rollout_table(case, [nominal_model(case), model], held_out(case, a.seed)))
@@ -193,12 +193,12 @@ def _train_dpc(a: argparse.Namespace) -> int:
 
 def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
     """Train one policy as the command's options say; returns what to tell."""
-    from ded_bench.koopman.surrogates import find_model
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
     from ded_bench.methods.solution import Settings
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
     from ded_bench.run.code import code_of
+    from ded_bench.surrogates.find import find_model
 
     method, case = get_method(name), Case.load(a.case)
     setting: dict[str, Any] = dict(method.options(Settings(slug)))
@@ -238,17 +238,17 @@ def _needing_torch() -> Iterator[None]:
 
 
 def _rollouts(a: argparse.Namespace) -> int:
-    from ded_bench.koopman.surrogates import MODELS, TRAJECTORY_AC, find_surrogate
-    from ded_bench.run.results import Results
+    from ded_bench.results.rows import Results
+    from ded_bench.surrogates.find import MODELS, TRAJECTORY_AC, find_surrogate
 
     chosen = select_split(a.case, limit=a.limit)
     case = chosen.case
     results = Results(a.results or default_results(case))
     say(f"simulating schedules of {case.id} on the true system and on every model")
+    from ded_bench.analysis.paper_numbers import read_paper
+    from ded_bench.analysis.reference import choose_reference
+    from ded_bench.analysis.rollouts import all_rollouts
     from ded_bench.evaluate.lifted_bound import EXCHANGED, exchange_table
-    from ded_bench.evaluate.paper_numbers import read_paper
-    from ded_bench.evaluate.reference import choose_reference
-    from ded_bench.evaluate.rollouts import all_rollouts
 
     surrogates = []
     for name in MODELS:

@@ -14,13 +14,13 @@ import pyomo.environ as pyo
 from ded_bench.methods.memory import too_large
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
 from ded_bench.solvers.outcome import Compiled
-from ded_bench.truth.network import Network
 
 #: What sets the point that a solver starts from: called with the model and its instance.
 Start = Callable[[pyo.ConcreteModel, Instance], None]

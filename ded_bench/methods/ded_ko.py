@@ -17,14 +17,13 @@ import numpy as np
 import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.model import Koopman
-from ded_bench.koopman.surrogates import Surrogate, find_surrogate
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.memory import too_large
 from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
 from ded_bench.methods.surrogate_program import solve_on_surrogate
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -32,7 +31,8 @@ from ded_bench.solvers.compile import compile_model, fix, reset
 from ded_bench.solvers.ipopt import LINEAR_OPTIONS
 from ded_bench.solvers.outcome import Compiled
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.find import Surrogate, find_surrogate
+from ded_bench.surrogates.koopman import Koopman
 
 #: Solver of the Pyomo model and its options by settings slug.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ded_bench.koopman.surrogates import Surrogate, find_surrogate
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.model_artifact import model_artifact
@@ -22,6 +21,7 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.surrogates.find import Surrogate, find_surrogate
 
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {}}
 

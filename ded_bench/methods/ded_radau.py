@@ -20,9 +20,9 @@ from ded_bench.methods.memory import too_large
 from ded_bench.methods.radau_program import RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.truth.network import Network
 
 #: Mean length of an element: at most `length_s`, and at most a part of the period of the grid's fastest mode.
 #: The default was chosen on validation instances (docs/model.md).

@@ -24,6 +24,7 @@ from ded_bench.methods import ded
 from ded_bench.methods.memory import too_large
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.methods.solver_answer import answer
+from ded_bench.plants.lossless.network import Network, PowerFlowError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -31,7 +32,6 @@ from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.outcome import Outcome
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network, PowerFlowError
 
 #: Mismatch of the nonlinear equations that ends the sequence, pu: IPOPT's tolerance for the same ones.
 TOLERANCE = 1e-8

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ded_bench.koopman.surrogates import find_model_file, find_surrogate
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
+from ded_bench.surrogates.find import find_model_file, find_surrogate
 
 
 def model_artifact(case: Case, settings: Settings) -> Artifact:

@@ -15,10 +15,10 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.methods.solution import DEFAULT_MODEL, Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.results.folder import ResultsFolder
 
 if TYPE_CHECKING:
     from torch import nn

@@ -10,11 +10,11 @@ import numpy as np
 
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Solution, Solver
+from ded_bench.plants.lossless.servable import servable
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.servable import servable
 
 VERSION = f"numba {numba.__version__}, numpy {np.__version__}"
 

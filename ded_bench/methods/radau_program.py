@@ -14,11 +14,11 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ded_bench.methods.collocation import BETWEEN, POINTS, WEIGHTS, differentiation, lagrange
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.sine_program import SineNumbers, SineProgram
-from ded_bench.truth.network import Network
 
 Indices = NDArray[np.intp]
 #: Rows, columns and values of entries of a matrix, arrays that NumPy can broadcast to one shape.

@@ -26,10 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.koopman.instance_model import model_along
-from ded_bench.koopman.planned_trajectory import simulate_plan
-from ded_bench.koopman.surrogates import TRAJECTORY, Surrogate, find_surrogate
-from ded_bench.koopman.trajectory import Indices, TrajectoryModel, linearise_along
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
@@ -38,6 +34,7 @@ from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.receding_knots import receding_points, tightened
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import reference
+from ded_bench.plants.simulate import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -45,7 +42,10 @@ from ded_bench.solvers.highs import solve_form as solve_by_highs
 from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
-from ded_bench.truth.simulate import SimulationError
+from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
+from ded_bench.surrogates.instance_model import model_along
+from ded_bench.surrogates.planned_trajectory import simulate_plan
+from ded_bench.surrogates.trajectory import Indices, TrajectoryModel, linearise_along
 
 #: Part of the frequency bound that plans leave free.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.koopman.surrogates import find_surrogate
-from ded_bench.koopman.trajectory import Indices
 from ded_bench.methods import real_time_knots
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.knot_program import Limit, Prediction
@@ -19,6 +17,8 @@ from ded_bench.methods.reserve import Reserve
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.surrogates.find import find_surrogate
+from ded_bench.surrogates.trajectory import Indices
 
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"reserve": real_time_knots.SETTINGS["real-time"]}
 #: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to

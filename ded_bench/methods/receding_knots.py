@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.koopman.surrogates import Surrogate, find_surrogate
-from ded_bench.koopman.trajectory import Indices
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.model_artifact import model_artifact
@@ -29,6 +27,8 @@ from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.surrogates.find import Surrogate, find_surrogate
+from ded_bench.surrogates.trajectory import Indices
 
 #: Part of the frequency bound that plans leave free.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

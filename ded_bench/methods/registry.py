@@ -1,28 +1,25 @@
 """METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`plugin`).
 
-A method's module offers `prepare(case, regime, settings) -> (instance -> Solution)` and `SETTINGS`, a
-mapping from the slugs of its settings to keyword options. If it depends on a trained model or policy,
-it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy
-to be trained, its line here names the module whose `train` does it (see `training_record`), and
-`ded-bench train-dpc` knows it. What `prepare` returns may also have `solve(instance, last=None)`, which
-the closed loop calls: it may start from the plan in force, and where no schedule meets every limit it
-may answer `Infeasible` with the schedule that exceeds them least.
-
-A setting whose answers depend on much more than the method's others has a module of its own, which offers
-the same and which the method's line names: the code of a row is that of the module that answers. Where a
-setting differs in operation only, `TIMED_AS` of its module names the setting whose times are its own.
+A method's module offers `Options`, its parameters (see `methods.options`); `VERSION`, a whole number that is
+raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If it depends
+on a trained model or policy, it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all
+of them. If it is a policy to be trained, its line here names the module whose `train` does it (see
+`training_record`), and `ded-bench train-dpc` knows it. What `prepare` returns may also have
+`solve(instance, last=None)`, which the closed loop calls: it may start from the plan in force, and where no
+schedule meets every limit it may answer `Infeasible` with the schedule that exceeds them least.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods import plugin
 from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.options import options_text, read_options
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
@@ -36,61 +33,58 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
-    elsewhere: tuple[tuple[str, str], ...] = ()  # settings that another module answers: slug, module
-
-    def module_of(self, settings: str) -> str:
-        """The module that answers, by the settings' name or their slug in the results."""
-        of_slug = (module for slug, module in self.elsewhere if f"{settings}-".startswith(f"{slug}-"))
-        return next(of_slug, self.module)
-
-    def _answering(self, settings: str = "") -> Any:
-        module = self.module_of(settings)
-        return plugin.load(module) if ":" in module else importlib.import_module(module)
 
     @property
-    def settings(self) -> Mapping[str, Mapping[str, Any]]:
-        """The settings this method knows: options by slug."""
-        known: dict[str, Mapping[str, Any]] = dict(self._answering().SETTINGS)
-        for slug, module in self.elsewhere:
-            known[slug] = importlib.import_module(module).SETTINGS[slug]
-        return known
+    def _answering(self) -> Any:
+        return plugin.load(self.module) if ":" in self.module else importlib.import_module(self.module)
 
-    def options(self, settings: Settings) -> Mapping[str, Any]:
-        """The options that the settings' name stands for.
+    @property
+    def is_ours(self) -> bool:
+        """Whether it comes with this package."""
+        return ":" not in self.module
+
+    @property
+    def version(self) -> int:
+        """Raised when answers change; 0 for a method of others, whose code is an artifact."""
+        return int(getattr(self._answering, "VERSION", 0))
+
+    @property
+    def options(self) -> type[Any]:
+        """The dataclass of its options."""
+        kind: type[Any] = self._answering.Options
+        return kind
+
+    def canonical(self, settings: Settings, *, timed: bool = False) -> Settings:
+        """The same settings with the canonical text of their options.
+
+        Args:
+            settings: whose options are read.
+            timed: without the options that matter in operation alone.
 
         Raises:
-            InputError: this method has no such settings (names those it has).
+            InputError: unknown options (names those it has), or a wrong value.
         """
-        known = self.settings
-        if settings.name not in known:
-            problem = f"unknown to method {self.name} (known: {', '.join(known)})"
-            raise InputError("--settings", settings.name, problem)
-        return known[settings.name]
+        options = read_options(self.options, settings.options)
+        return dataclasses.replace(settings, options=options_text(options, timed=timed))
 
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance after another.
 
         Raises:
-            InputError: unknown settings, or a model or policy that does not fit.
+            InputError: unknown options, or a model or policy that does not fit.
         """
-        self.options(settings)  # says what is wrong with them
-        solver: Solver = self._answering(settings.name).prepare(case, regime, settings)
+        solver: Solver = self._answering.prepare(case, regime, self.canonical(settings))
         return solver
 
     def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
         """All models and policies that answers depend on.
 
         Raises:
-            InputError: unknown settings, or a model or policy that is missing or does not fit.
+            InputError: unknown options, or a model or policy that is missing or does not fit.
         """
-        self.options(settings)  # says what is wrong with them
-        find = getattr(self._answering(settings.name), "artifacts", None)
-        return tuple(find(case, regime, settings)) if find else ()
-
-    def timed_as(self, settings: str) -> str:
-        """Name of the settings whose times stand for these: `TIMED_AS` of the module may name others."""
-        names: Mapping[str, str] = getattr(self._answering(settings), "TIMED_AS", {})
-        return names.get(settings, settings)
+        find = getattr(self._answering, "artifacts", None)
+        own = self.canonical(settings)
+        return tuple(find(case, regime, own)) if find else ()
 
     @property
     def train(self) -> Trainer:
@@ -108,38 +102,13 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method(
-            "ded",
-            "ded_bench.methods.ded",
-            "DED",
-            elsewhere=(
-                ("accelerated", "ded_bench.methods.ded_sequential"),
-                ("start-ed", "ded_bench.methods.ded_start"),
-                ("start-ko", "ded_bench.methods.ded_start"),
-                ("start-random", "ded_bench.methods.ded_start"),
-            ),
-        ),
+        Method("ded", "ded_bench.methods.ded", "DED"),
         Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
-        Method(
-            "ded-slp",
-            "ded_bench.methods.ded_slp",
-            "DED (SLP)",
-            elsewhere=(("ac", "ded_bench.methods.ded_slp_ac"),),
-        ),
+        Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
+        Method("ded-rti", "ded_bench.methods.ded_rti", "DED (real-time iteration)"),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
-        Method(
-            "ded-ko-knots",
-            "ded_bench.methods.ded_ko_knots",
-            "DED-KO (knots)",
-            elsewhere=(
-                ("swing-ac", "ded_bench.methods.ded_ko_knots_swing"),
-                ("receding", "ded_bench.methods.receding_knots"),
-                ("receding-wide", "ded_bench.methods.receding_knots"),
-                ("real-time", "ded_bench.methods.real_time_knots"),
-                ("reserve", "ded_bench.methods.real_time_reserve"),
-            ),
-        ),
+        Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (knots)"),
         Method(
             "ded-dpc-paper",
             "ded_bench.methods.dpc_paper.paper_policy",
@@ -149,17 +118,11 @@ METHODS: dict[str, Method] = {
         Method(
             "ded-dpc", "ded_bench.methods.dpc.policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
         ),
-        Method("ded-dpc-refined", "ded_bench.methods.dpc.refined", "DED-DPC (refined)"),
         Method(
-            "ded-dpc-shared",
-            "ded_bench.methods.dpc_shared.shared_policy",
-            "DED-DPC (shared weights)",
-            trainer="ded_bench.methods.dpc_shared.unrolled_training",
-        ),
-        Method(
-            "ded-dpc-shared-refined",
-            "ded_bench.methods.dpc_shared.shared_refined",
-            "DED-DPC (shared weights, refined)",
+            "ded-admm",
+            "ded_bench.methods.admm.admm_policy",
+            "DED-ADMM",
+            trainer="ded_bench.methods.admm.admm_training",
         ),
     )
 }

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.koopman.trajectory import Indices
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.trajectory import Indices
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ded_bench.methods.options import DEFAULT
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-
-DEFAULT_MODEL = "koopman"
 
 
 @dataclass(frozen=True)
@@ -34,18 +33,13 @@ class Solution:
 
 @dataclass(frozen=True)
 class Settings:
-    """How a method is run: a named choice of the method's own, and what it may depend on."""
+    """How a method is run: its options, and what its answers may depend on besides."""
 
-    name: str = "default"
-    model: str = DEFAULT_MODEL
-    policy: Path | None = None
+    options: str = DEFAULT  # as `--set` takes them, see `methods.options`
+    model: str = ""  # a surrogate's name or file; empty: the method's own choice
+    policy: Path | None = None  # a policy's file; None: the trained one
     time_limit_s: float | None = None
     search: tuple[Path, ...] = ()  # folders where trained models and policies may lie
-
-    @property
-    def slug(self) -> str:
-        """The name in the results; another Koopman model than ours makes other rows."""
-        return self.name if self.model == DEFAULT_MODEL else f"{self.name}-{Path(self.model).stem}"
 
 
 #: What `prepare(case, regime, settings)` returns.

@@ -10,19 +10,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ded_bench.koopman.instance_model import model_along
-from ded_bench.koopman.surrogates import Surrogate
-from ded_bench.koopman.trajectory import Indices, TrajectoryModel
 from ded_bench.methods import ed
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, solve_with_rows_added
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.solution import Solution
+from ded_bench.plants.simulate import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.simulate import SimulationError
+from ded_bench.surrogates.find import Surrogate
+from ded_bench.surrogates.instance_model import model_along
+from ded_bench.surrogates.trajectory import Indices, TrajectoryModel
 
 #: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ded_bench.files.strict import write_atomically
-from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.surrogates.koopman import Koopman
 
 #: First columns of every history.
 HISTORY = ("epoch", "seconds", "training", "held out")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 
-from ded_bench.evaluate.summary import HEAD
+from ded_bench.analysis.summary import HEAD
 from ded_bench.report.paper import Line
 
 

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 
-from ded_bench.evaluate.compare import Change, Comparison, name_of
+from ded_bench.analysis.compare import Change, Comparison, name_of
 from ded_bench.report.columns import Column
 from ded_bench.report.render import to_markdown
 

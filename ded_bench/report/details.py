@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from ded_bench.analysis.certificate import Certificate
+from ded_bench.analysis.reference import DEFAULT
+from ded_bench.analysis.rollouts import ROLLOUTS
+from ded_bench.analysis.summary import SMALLEST_GAP, TIME_SHIFT_S, groups, title
 from ded_bench.evaluate.ablation import SAME, STARTED
-from ded_bench.evaluate.certificate import Certificate
 from ded_bench.evaluate.lifted_bound import ANY, EXCHANGED
-from ded_bench.evaluate.reference import DEFAULT
-from ded_bench.evaluate.rollouts import ROLLOUTS
-from ded_bench.evaluate.summary import SMALLEST_GAP, TIME_SHIFT_S, groups, title
 from ded_bench.report.columns import (
     ABLATION,
     CERTIFICATE,

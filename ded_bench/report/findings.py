@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.summary import title
+from ded_bench.analysis.summary import title
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.paper import Line

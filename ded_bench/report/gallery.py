@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ded_bench.evaluate.ablation import main_rows
-from ded_bench.evaluate.summary import (
+from ded_bench.analysis.summary import (
     GROUP,
     STUDY,
     groups,
@@ -23,8 +22,10 @@ from ded_bench.evaluate.summary import (
     title,
     tradeoff,
 )
+from ded_bench.evaluate.ablation import main_rows
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.model import Koopman
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.simulate import SimulationError, Trajectory, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
@@ -38,10 +39,9 @@ from ded_bench.report.figures.style import DPI, FEW, Shown, plain, save_figure
 from ded_bench.report.figures.tradeoff import profile_figure, tradeoff_figure
 from ded_bench.report.page import Block, Picture, Text
 from ded_bench.report.sources import Sources
+from ded_bench.results.rows import Key
 from ded_bench.run.pool import Call, Workers
-from ded_bench.run.results import Key
-from ded_bench.truth.network import Network
-from ded_bench.truth.simulate import SimulationError, Trajectory, simulate
+from ded_bench.surrogates.koopman import Koopman
 
 #: Static dispatch is looked at this often, s.
 MOVEMENT_S = 1.0

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ded_bench.analysis.break_even import payoff
+from ded_bench.analysis.paper_numbers import read_paper
+from ded_bench.analysis.reference import DEFAULT, Reference, choose_reference
+from ded_bench.analysis.summary import benchmark_rows, gaps, groups, judged_rows, summary
 from ded_bench.evaluate.ablation import main_rows, split_slug, training_table
 from ded_bench.evaluate.ac_summary import validated, with_ac
-from ded_bench.evaluate.paper_numbers import read_paper
-from ded_bench.evaluate.payoff import payoff
-from ded_bench.evaluate.reference import DEFAULT, Reference, choose_reference
-from ded_bench.evaluate.summary import benchmark_rows, gaps, groups, judged_rows, summary
-from ded_bench.evaluate.timing import read_timing, timing_summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.results_folder import ResultsFolder
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.sampling import load_split
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.objectives import reference_objectives
+from ded_bench.results.rows import Results
+from ded_bench.results.timing import read_timing, timing_summary
 from ded_bench.run.ac_scoring import AcResults
-from ded_bench.run.objectives import reference_objectives
-from ded_bench.run.results import Results
-from ded_bench.truth.network import Network
 
 #: An exponent is fitted to at least so many grids.
 LEAST_GRIDS = 3

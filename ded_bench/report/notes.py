@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pandas as pd
 
-from ded_bench.evaluate.summary import groups, title
+from ded_bench.analysis.summary import groups, title
+from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 from ded_bench.report.sources import Sources
-from ded_bench.truth.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5

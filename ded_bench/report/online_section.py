@@ -7,9 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.evaluate.summary import title
-from ded_bench.online.online_results import OnlineKey, OnlineResults, read_trajectory
-from ded_bench.online.online_summary import (
+from ded_bench.analysis.online_summary import (
     KINDS,
     RUN,
     STATIC,
@@ -19,6 +17,7 @@ from ded_bench.online.online_summary import (
     own_latency,
     sweeps,
 )
+from ded_bench.analysis.summary import title
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
@@ -34,6 +33,7 @@ from ded_bench.report.figures.online import (
 )
 from ded_bench.report.gallery import Gallery
 from ded_bench.report.page import Block, Heading, Items, Table, folded
+from ded_bench.results.online_results import OnlineKey, OnlineResults, read_trajectory
 from ded_bench.run.pool import Call
 
 #: So many methods are drawn on one scenario: static dispatch of every second, then those of least excess.

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from ded_bench.analysis.reference import DEFAULT
+from ded_bench.analysis.summary import title
 from ded_bench.evaluate.ablation import split_slug
-from ded_bench.evaluate.reference import DEFAULT
-from ded_bench.evaluate.summary import title
 from ded_bench.report.columns import FRONT_V, FRONT_VI, Column, tabulate, without_paper
 from ded_bench.report.details import rows_caption
 from ded_bench.report.findings import findings

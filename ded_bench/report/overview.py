@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.payoff import MANY
+from ded_bench.analysis.break_even import MANY
 from ded_bench.files.strict import write_atomically
 from ded_bench.report.columns import Column
 from ded_bench.report.figures.growth import gap_figure, growth_figure

@@ -9,9 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from ded_bench.evaluate.paper_numbers import Paper, PaperRow
-from ded_bench.evaluate.reference import DEFAULT
-from ded_bench.evaluate.summary import GROUP, groups, statistics, title
+from ded_bench.analysis.paper_numbers import Paper, PaperRow
+from ded_bench.analysis.reference import DEFAULT
+from ded_bench.analysis.summary import GROUP, groups, statistics, title
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator
 
 import pandas as pd
 
-from ded_bench.evaluate.summary import GROUP, HEAD, groups, title
+from ded_bench.analysis.summary import GROUP, HEAD, groups, title
 from ded_bench.methods.registry import METHODS
+from ded_bench.plants import score as scorer
 from ded_bench.run.code import code_of
-from ded_bench.truth import score as scorer
 
 #: Columns of the results table that say what made a row.
 MADE_BY = ("code", "score_code", "model", "policy", "solver_version")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from ded_bench.analysis.summary import claims, coverage, scoring_rows, summary, table_times, worst
 from ded_bench.evaluate.ablation import ablation_table, main_rows, model_table, starts_table, training_table
-from ded_bench.evaluate.summary import claims, coverage, scoring_rows, summary, table_times, worst
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import (

@@ -9,23 +9,23 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.evaluate.certificate import Certificate, read_certificates
-from ded_bench.evaluate.paper_numbers import Paper, read_paper
-from ded_bench.evaluate.reference import Reference, choose_reference
-from ded_bench.evaluate.summary import gaps, judged_rows
-from ded_bench.evaluate.timing import TIMING, WARM_UP, read_timing, timing_summary
+from ded_bench.analysis.certificate import Certificate, read_certificates
+from ded_bench.analysis.paper_numbers import Paper, read_paper
+from ded_bench.analysis.reference import Reference, choose_reference
+from ded_bench.analysis.summary import gaps, judged_rows
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.results_folder import ResultsFolder
 from ded_bench.files.strict import read_text
 from ded_bench.files.table import records
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import load_manifest, load_split
-from ded_bench.run.objectives import reference_objectives
-from ded_bench.run.results import Results
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.objectives import reference_objectives
+from ded_bench.results.rows import Results
+from ded_bench.results.timing import TIMING, WARM_UP, read_timing, timing_summary
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.linear import linear_model
 
 
 @dataclass(frozen=True, eq=False)

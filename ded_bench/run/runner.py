@@ -17,10 +17,10 @@ from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.results.rows import Results, Row
 from ded_bench.run.cluster import open_workers
 from ded_bench.run.code import code_of_method, named
 from ded_bench.run.environment import host, now, version
-from ded_bench.run.results import Results, Row
 from ded_bench.run.scoring import save_scores
 from ded_bench.run.shipping import pack
 from ded_bench.run.tasks import Task, failed, solve_task

@@ -13,15 +13,15 @@ from tqdm import tqdm
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.solution import Settings
+from ded_bench.plants import score as score_module
+from ded_bench.plants.score import Score, score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import SCORING_FAILED, Results, Row
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import SCORING_FAILED, Results, Row
 from ded_bench.run.tasks import Scorer, Task, reason_of, score_tasks
-from ded_bench.truth import score as score_module
-from ded_bench.truth.score import Score, score
 
 #: Schedules scored side by side in one task; more gains little, fewer costs overhead.
 SCORE_BATCH = 50

@@ -19,8 +19,8 @@ from ded_bench.problem.benchmark import Selection
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import Results, Row
 from ded_bench.run.environment import host
-from ded_bench.run.results import Results, Row
 from ded_bench.run.runner import run, unscored_row
 from ded_bench.run.tasks import Task
 from ded_bench.solvers.status import Status

@@ -11,16 +11,16 @@ from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.plugin import accept
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.plants.score import Score, score
+from ded_bench.plants.simulate import SimulationError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import Key
 from ded_bench.run.environment import host
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError
-from ded_bench.run.results import Key
 from ded_bench.run.shipping import Files, unpacked
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import Score, score
-from ded_bench.truth.simulate import SimulationError
 
 
 @dataclass(frozen=True)

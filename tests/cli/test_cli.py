@@ -18,7 +18,7 @@ from ded_bench.cli import main
 from ded_bench.cli.arguments import matching
 from ded_bench.cli.outputs import sweep
 from ded_bench.problem.case import Case
-from ded_bench.run.results import Results, Row
+from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, run_cli
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
@@ -205,7 +205,7 @@ def test_only_policies_that_need_a_koopman_model_ask_for_one(
     problem: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     """`ded-dpc-shared` is trained on the grid itself."""
-    monkeypatch.setattr("ded_bench.methods.dpc_shared.unrolled_training.STEPS", 1)
+    monkeypatch.setattr("ded_bench.methods.admm.admm_training.STEPS", 1)
     regime = next(iter(Case.load(str(problem)).regimes))
     where = ("--case", str(problem), "--regime", regime, "--epochs", "1", "--results", str(tmp_path))
     assert main(["train-dpc", "--method", "ded-dpc", *where]) == 2

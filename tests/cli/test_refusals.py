@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.run.results import Results, Row
+from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
 

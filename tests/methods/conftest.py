@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from ded_bench.koopman.energy_form import injection_lift
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.model import Koopman
+from ded_bench.surrogates.energy_form import injection_lift
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.koopman import Koopman
 from ded_bench.problem.case import Case
 
 

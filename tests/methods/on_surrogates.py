@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ded_bench.koopman.model import Koopman
+from ded_bench.surrogates.koopman import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.ded_ko import SETTINGS
 from ded_bench.methods.solution import Solution
@@ -17,7 +17,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.plants.lossless.network import Network
 
 HORIZON = 3.0
 METHODS = (ded_ko, ded_ko_knots)

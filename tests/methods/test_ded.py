@@ -17,9 +17,9 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
-from ded_bench.truth.score import score
-from ded_bench.truth.simulate import simulate
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 
 HORIZON = 2.0
 

@@ -9,11 +9,11 @@ import pyomo.environ as pyo
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.energy_form import injection_lift
-from ded_bench.koopman.instance_model import model_along
-from ded_bench.koopman.linear import linear_model, nominal_model
-from ded_bench.koopman.model import Koopman
-from ded_bench.koopman.surrogates import find_surrogate
+from ded_bench.surrogates.energy_form import injection_lift
+from ded_bench.surrogates.instance_model import model_along
+from ded_bench.surrogates.linear import linear_model, nominal_model
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.find import find_surrogate
 from ded_bench.methods import ded_ko
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.ded_ko import SETTINGS, build_ded_ko, set_instance
@@ -23,7 +23,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 from tests.methods.on_surrogates import METHODS, SLUGS, check_limits, replay, short
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.koopman.condensed import CondensedRollout
-from ded_bench.koopman.energy_form import injection_lift
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.model import Koopman
+from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.energy_form import injection_lift
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.koopman import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots, knot_program
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Settings
@@ -19,7 +19,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.plants.lossless.network import Network
 from tests.methods.on_surrogates import HORIZON, check_limits, replay, short
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ded_bench.koopman.trajectory import linearise_along
+from ded_bench.surrogates.trajectory import linearise_along
 from ded_bench.methods import ded_slp, ed, knot_program
 from ded_bench.methods.ded_slp import MARGIN, prepare
 from ded_bench.methods.ded_slp_model import build_ded_slp
@@ -20,8 +20,8 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import score
-from ded_bench.truth.simulate import SimulationError, simulate
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import SimulationError, simulate
 
 HORIZON = 4.0
 POINTS = np.array([0, 60, 121, 130, 205, 300, 400])

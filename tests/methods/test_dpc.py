@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.condensed import CondensedRollout, free_response
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.condensed import CondensedRollout, free_response
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.export import export
@@ -31,9 +31,9 @@ from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
-from ded_bench.truth.score import score
-from ded_bench.truth.simulate import simulate
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 
 HORIZON = 4.0
 

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.surrogates import search_folders
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.find import search_folders
 from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.kernels import predict
@@ -18,8 +18,8 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.network import Network
-from ded_bench.truth.score import score
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
 
 #: Bounds so wide, or so tight, that no schedule exceeds them, or every one does.
 WIDE, TIGHT = 1e6, 1e-3

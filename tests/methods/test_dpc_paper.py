@@ -13,8 +13,8 @@ import torch
 from ded_bench.cli import main
 from ded_bench.evaluate.ablation import training_table
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.condensed import free_response
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.condensed import free_response
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
 from ded_bench.methods.dpc_paper.paper_inference import FILTERS, WINDOWS, weight_shapes
 from ded_bench.methods.dpc_paper.paper_loss import (
@@ -38,7 +38,7 @@ from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.plants.lossless.network import Network
 
 HORIZON = 4.0
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.koopman.condensed import CondensedRollout
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Inputs
@@ -24,7 +24,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.plants.lossless.network import Network
 
 
 def some_instances(case: Case, count: int) -> list[Instance]:

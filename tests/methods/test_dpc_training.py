@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.export import network_of
 from ded_bench.methods.dpc.inputs import Inputs, sequence_groups

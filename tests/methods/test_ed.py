@@ -13,7 +13,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 
 RAMP = 0.05  # pu/s, both cases
 

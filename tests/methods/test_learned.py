@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.surrogates import model_file
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.find import model_file
 from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS, trainable
 from ded_bench.methods.solution import Settings

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods import ded, ded_ko, ded_radau, ded_sequential, memory
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case

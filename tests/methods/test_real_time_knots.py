@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ded_bench.evaluate.bench import timed
-from ded_bench.koopman.energy_form import injection_lift
-from ded_bench.koopman.linear import linear_model
+from ded_bench.run.bench import timed
+from ded_bench.surrogates.energy_form import injection_lift
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods import ded_ko_knots
 from ded_bench.methods.real_time_knots import GAP, OPEN, RealTimeSolver
 from ded_bench.methods.registry import get_method
@@ -18,7 +18,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 from ded_bench.solvers.status import Status
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 from tests.methods.on_surrogates import replay, short
 from tests.methods.test_ded_ko_knots import least_excess
 

@@ -16,7 +16,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.truth.network import Network
+from ded_bench.plants.lossless.network import Network
 
 
 def answered(case: Case, instance: Instance, settings: str, regime: str, model: str) -> Schedule:

@@ -22,8 +22,8 @@ from ded_bench.problem.scenario_sampling import (
     scenario_files,
     write_scenarios,
 )
-from ded_bench.truth.network import Network
-from ded_bench.truth.servable import servable
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.lossless.servable import servable
 
 SHIPPED = ("9bus", "two-area", "39bus")
 #: A load of the three-bus chain: a ramp in the past of t = 5, one announced wrongly, one that is not.

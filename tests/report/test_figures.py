@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -22,7 +22,7 @@ from ded_bench.report.figures.style import (
     thin,
 )
 from ded_bench.report.gallery import rollout
-from ded_bench.truth.simulate import Trajectory, simulate
+from ded_bench.plants.simulate import Trajectory, simulate
 from tests.report.drawing import check_layout, has_level, shows
 
 HORIZON = 2.0

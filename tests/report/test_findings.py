@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from ded_bench.evaluate.paper_numbers import Paper
+from ded_bench.analysis.paper_numbers import Paper
 from ded_bench.problem.case import Case
 from ded_bench.report.findings import findings
 from ded_bench.report.paper import Line, paper_lines

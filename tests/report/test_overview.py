@@ -11,16 +11,16 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.evaluate.timing import TIMING, TimingRow
+from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.results_folder import ResultsFolder
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.problem.case import REPOSITORY
 from ded_bench.report.figures.growth import gap_figure, growth_figure
 from ded_bench.report.grids import across, payoffs, read_grid, slopes
 from ded_bench.report.overview import write_overview
 from ded_bench.run.ac_scoring import AcResults, AcRow
-from ded_bench.run.results import Results, Row
+from ded_bench.results.rows import Results, Row
 from tests.reading import Page
 from tests.report.drawing import check_layout
 

@@ -12,7 +12,7 @@ from ded_bench.run.code import code_of, code_of_method
 from tests.evaluate.test_summary import frame_of
 from tests.evaluate.test_summary import row as plain_row
 
-SCORER = code_of("ded_bench.truth.score")
+SCORER = code_of("ded_bench.plants.score")
 COLUMNS = ["regime", "method", "settings", "code", "model", "policy"]
 
 

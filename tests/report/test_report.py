@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.evaluate.summary import title
-from ded_bench.evaluate.timing import TIMING, TimingRow
+from ded_bench.analysis.summary import title
+from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
@@ -27,9 +27,9 @@ from ded_bench.report.columns import GAPS, TABLE_V, TABLE_VI
 from ded_bench.report.figures.plan import plan
 from ded_bench.report.report import write_report
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import Key, Results, Row
+from ded_bench.results.rows import Key, Results, Row
 from ded_bench.run.scoring import scored_row
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 from tests.evaluate.test_summary import DED, with_gaps
 from tests.reading import Page
 from tests.report.conftest import TEST, TRAIN

@@ -8,11 +8,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ded_bench.evaluate.certificate import Certificate, save_certificate
+from ded_bench.analysis.certificate import Certificate, save_certificate
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.report.report import write_report
-from ded_bench.run.results import Results, Row
+from ded_bench.results.rows import Results, Row
 
 
 @pytest.mark.usefixtures("sketched")

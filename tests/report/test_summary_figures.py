@@ -10,9 +10,9 @@ import pytest
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from ded_bench.evaluate.summary import GROUP, in_own_table, title
+from ded_bench.analysis.summary import GROUP, in_own_table, title
 from ded_bench.files.strict import parse_record
-from ded_bench.koopman.linear import linear_model
+from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order

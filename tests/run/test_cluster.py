@@ -19,8 +19,8 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.surrogates import find_model, model_file
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.find import find_model, model_file
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.registry import METHODS
@@ -30,11 +30,11 @@ from ded_bench.run import cluster as module
 from ded_bench.run import runner
 from ded_bench.run.cluster import Cluster
 from ded_bench.run.pool import WorkersLostError
-from ded_bench.run.results import Results
+from ded_bench.results.rows import Results
 from ded_bench.run.runner import make_tasks, run
 from ded_bench.run.shipping import pack, unpacked
 from ded_bench.run.tasks import solve_task
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import wait_until
 from tests.strange_methods import STRANGE, solve_strange

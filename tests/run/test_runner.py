@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.koopman.linear import linear_model
-from ded_bench.koopman.surrogates import model_file
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.find import model_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.run import runner
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import ATTEMPTS
-from ded_bench.run.results import ROWS, Results
+from ded_bench.results.rows import ROWS, Results
 from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
 from ded_bench.run.tasks import Task
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 from tests.strange_methods import STRANGE, solve_strange
 
 
@@ -95,7 +95,7 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
     assert limited.policy == ""
     assert limited.code == code_of("ded_bench.methods.ded_ko_knots")
-    assert limited.score_code == code_of("ded_bench.truth.score")
+    assert limited.score_code == code_of("ded_bench.plants.score")
     path = model_file(elsewhere, "koopman")
     assert fallbacks(tasks(settings), folder) == [
         f"ded-ko-knots {regime}: model {limited.model} from {path}" for regime in ("NO", "TO")

@@ -15,9 +15,9 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
-from ded_bench.run.results import Results, Row
+from ded_bench.results.rows import Results, Row
 from ded_bench.run.scoring import rescore, score_unscored, scored_row
-from ded_bench.truth.score import score
+from ded_bench.plants.score import score
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Res
     check = rescore(threebus, instances, results, update=True)
     assert [line.split(":")[0] for line in check.differences] == ["ded default TO b"]
     assert Results(results.folder).rows == right
-    assert row_of(results, "b").score_code == code_of("ded_bench.truth.score")
+    assert row_of(results, "b").score_code == code_of("ded_bench.plants.score")
     assert len(results.path.read_text().splitlines()) == 5
 
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.koopman.condensed import CondensedRollout
-from ded_bench.koopman.linear import linear_model
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.kernels import OmegaModel, predict
 from ded_bench.methods.ramp_follower import follow
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.linear import linear_model
 
 #: Points at which ω is looked at, for each interval between knots.
 PARTS = 10

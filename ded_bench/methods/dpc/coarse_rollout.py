@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.koopman.condensed import free_response
-from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.response import Array32
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.condensed import free_response
+from ded_bench.surrogates.koopman import Koopman
 
 #: Spacing of the points at which P_s and ω are evaluated, s. Frequencies are below 0.25 Hz.
 SPACING_S = 0.1

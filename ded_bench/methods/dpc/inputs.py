@@ -23,10 +23,10 @@ from ded_bench.methods.dpc.kernels import (
 )
 from ded_bench.methods.dpc.response import Array32, Response
 from ded_bench.methods.ramp_follower import track
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
-from ded_bench.truth.network import Network
 
 #: A segment that no path reaches: it starts later than any horizon ends, s.
 NEVER = (1e30, 0.0, 0.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ded_bench.koopman.condensed import CondensedRollout
+from ded_bench.surrogates.condensed import CondensedRollout
 
 
 @dataclass(frozen=True, eq=False)

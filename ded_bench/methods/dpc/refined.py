@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from ded_bench.koopman.surrogates import find_model
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.inputs import Inputs
@@ -19,6 +18,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import find_model
 
 METHOD = "ded-dpc-refined"
 #: Number of steps, by slug.

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.koopman.condensed import CondensedRollout
-from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.ramp_follower import follow
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.koopman import Koopman
 
 Array32 = NDArray[np.float32]
 STEPS = 200

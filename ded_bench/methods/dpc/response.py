@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.koopman.condensed import hat_functions
-from ded_bench.koopman.linear import linear_model
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.condensed import hat_functions
+from ded_bench.surrogates.linear import linear_model
 
 Array32 = NDArray[np.float32]
 

@@ -15,8 +15,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ded_bench.koopman.condensed import CondensedRollout
-from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
 from ded_bench.methods.dpc.inputs import Channels, Inputs
 from ded_bench.methods.dpc.loss import Objective
@@ -26,11 +24,13 @@ from ded_bench.methods.dpc.response import Response
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.lossless.servable import servable
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
-from ded_bench.truth.network import Network
-from ded_bench.truth.servable import servable
+from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.koopman import Koopman
 
 #: Fresh instances, epochs over them, batch size.
 FRESH, EPOCHS, BATCH = 64_000, 32, 128

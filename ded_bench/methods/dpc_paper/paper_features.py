@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.truth.network import Network
 
 
 def n_channels(case: Case) -> int:

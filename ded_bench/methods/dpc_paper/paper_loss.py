@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ded_bench.koopman.condensed import CondensedRollout, hat_functions
-from ded_bench.koopman.model import Koopman
 from ded_bench.problem.case import Array, Case
+from ded_bench.surrogates.condensed import CondensedRollout, hat_functions
+from ded_bench.surrogates.koopman import Koopman
 
 #: Weights of the penalty terms (paper, section on the implementation).
 Q_OMEGA, Q_RAMP, Q_INITIAL = 1e3, 1e2, 1e4

@@ -24,10 +24,10 @@ from ded_bench.methods.policy_file import (
 )
 from ded_bench.methods.policy_solver import method
 from ded_bench.methods.solution import Settings, Solver
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.truth.network import Network
 
 METHOD = "ded-dpc-paper"
 #: How the policy is trained, by slug: fields of `paper_training.Recipe`. The default is the paper's recipe

@@ -27,8 +27,6 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
-from ded_bench.koopman.condensed import free_response
-from ded_bench.koopman.model import Koopman
 from ded_bench.methods.dpc_paper.paper_features import channels, n_channels
 from ded_bench.methods.dpc_paper.paper_loss import Condensed, loss_terms
 from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
@@ -36,9 +34,11 @@ from ded_bench.methods.dpc_paper.paper_policy import METHOD, Policy
 from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.condensed import free_response
+from ded_bench.surrogates.koopman import Koopman
 
 LEARNING_RATE = 5e-4
 BATCH, EPOCHS = 8, 900

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from ded_bench.plants.simulate import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.report.figures.style import (
     BLACK,
@@ -23,7 +24,6 @@ from ded_bench.report.figures.style import (
     thin,
     time_axis,
 )
-from ded_bench.truth.simulate import Trajectory
 
 #: Generators whose frequencies have a panel of their own, if there are more.
 SHOWN = 4

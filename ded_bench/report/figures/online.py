@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.evaluate.summary import title
-from ded_bench.online.online_summary import KINDS
+from ded_bench.analysis.online_summary import KINDS
+from ded_bench.analysis.summary import title
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.scenario import Scenario

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.evaluate.summary import groups, worst
+from ded_bench.analysis.summary import groups, worst
 from ded_bench.methods.registry import METHODS
-from ded_bench.run.results import Key
+from ded_bench.results.rows import Key
 
 #: How many of the worst instances of each method are drawn.
 WORST = 3

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.evaluate.summary import title
+from ded_bench.analysis.summary import title
+from ded_bench.plants.simulate import Trajectory
 from ded_bench.problem.case import Case
 from ded_bench.report.figures.style import (
     BLACK,
@@ -29,7 +30,6 @@ from ded_bench.report.figures.style import (
     thin,
     time_axis,
 )
-from ded_bench.truth.simulate import Trajectory
 
 
 def schedule_figure(case: Case, heading: str, shown: Sequence[Shown]) -> Figure:

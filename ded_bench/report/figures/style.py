@@ -20,12 +20,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.evaluate.reference import ACCURATE
-from ded_bench.evaluate.summary import title
+from ded_bench.analysis.reference import ACCURATE
+from ded_bench.analysis.summary import title
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
+from ded_bench.plants.simulate import Trajectory
 from ded_bench.problem.case import Array
-from ded_bench.truth.simulate import Trajectory
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"

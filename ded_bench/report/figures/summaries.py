@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ded_bench.koopman.model import Koopman
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
@@ -28,7 +28,7 @@ from ded_bench.report.figures.style import (
     plain,
     thin,
 )
-from ded_bench.truth.network import Network
+from ded_bench.surrogates.koopman import Koopman
 
 
 def parameters_figure(case: Case, instances: Sequence[Instance]) -> Figure:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from ded_bench.evaluate.summary import GROUP, natural, title
+from ded_bench.analysis.summary import GROUP, natural, title
 from ded_bench.problem.case import Array
 from ded_bench.report.figures.labels import Label, place_labels
 from ded_bench.report.figures.style import GREY, colour, dashes, legend_below, marker, new_figure, plain

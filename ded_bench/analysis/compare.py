@@ -1,0 +1,201 @@
+"""What changed between two results folders: a benchmark's regression test.
+
+Rows are compared by their key. Status, feasibility, objective and violations decide; gaps and times
+are printed for information.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from ded_bench.analysis.paper_numbers import read_paper
+from ded_bench.analysis.reference import choose_reference
+from ded_bench.analysis.summary import GROUP, gaps, groups, table, title
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import SHIPPED_CASES
+from ded_bench.results.rows import Key, Results, Row
+from ded_bench.results.timing import read_timing, timing_summary
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Largest change that is none: of the objective relative, of violations absolute."""
+
+    objective: float = 1e-6
+    hz: float = 1e-6
+    pu: float = 1e-8
+
+
+@dataclass(frozen=True)
+class Change:
+    """One value of one row, before (in A) and after (in B); None is an empty cell."""
+
+    key: Key
+    column: str
+    before: str | float | bool | None
+    after: str | float | bool | None
+    size: float  # relative or absolute; infinite where there is no distance
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What differs between two results folders."""
+
+    a: Path
+    b: Path
+    heads: tuple[str, str]
+    common: int
+    incomparable: str  # why nothing was compared; else empty
+    only_a: tuple[Key, ...]
+    only_b: tuple[Key, ...]
+    changes: tuple[Change, ...]
+    summary: pd.DataFrame  # SUMMARY_COLUMNS, for information
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing changed beyond the tolerances."""
+        return not (self.incomparable or self.only_a or self.only_b or self.changes)
+
+
+def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: bool = False) -> Comparison:
+    """Compare two results folders.
+
+    Args:
+        a: the folder that sets the standard.
+        b: the folder that is compared with it.
+        tolerance: changes up to this are none; None: the default ones.
+        common_only: rows that only one folder has count as no difference.
+
+    Raises:
+        InputError: a folder has no results table, or one that is wrong.
+    """
+    before, after = _read(a), _read(b)
+    shared = [key for key in before if key in after]
+    facts = (a, b, (_head(before), _head(after)), len(shared))
+    if reason := _incomparable(before, after, shared):
+        return Comparison(*facts, reason, (), (), (), table([], SUMMARY_COLUMNS))
+    only_a = () if common_only else tuple(key for key in before if key not in after)
+    only_b = () if common_only else tuple(key for key in after if key not in before)
+    limits = tolerance or Tolerance()
+    changes = [change for key in shared for change in _changes(before[key], after[key], limits)]
+    changes.sort(key=lambda change: (list(_limits(limits)).index(change.column), -change.size, change.key))
+    return Comparison(*facts, "", only_a, only_b, tuple(changes), _summary(a, b))
+
+
+def _read(folder: Path) -> dict[Key, Row]:
+    results = Results(folder)
+    if not results.path.is_file():
+        raise InputError(results.path, "", "is missing: this is no results folder")
+    return results.rows
+
+
+def _head(rows: Mapping[Key, Row]) -> str:
+    versions = ", ".join(sorted({row.version for row in rows.values()})) or "–"
+    problems = ", ".join(sorted({row.problems_version or "(none)" for row in rows.values()})) or "–"
+    return f"{len(rows)} rows, ded-bench {versions}, problems {problems}"
+
+
+def _incomparable(before: Mapping[Key, Row], after: Mapping[Key, Row], shared: Sequence[Key]) -> str:
+    """Why the two tables are not about the same problems; empty if they are."""
+    pairs = [(before[key], after[key]) for key in shared]
+    other = [(x, y) for x, y in pairs if (x.case, x.problems_version) != (y.case, y.problems_version)]
+    if other:
+        x, y = other[0]
+        return (
+            f"{len(other)} common rows are of different problems, "
+            f"such as {name_of(x.key)}: {_problems(x)} in A, {_problems(y)} in B"
+        )
+    if not shared and before and after:
+        return "no row is in both"
+    return ""
+
+
+def _problems(row: Row) -> str:
+    return f"{row.case} {row.problems_version or '(no version)'}"
+
+
+def _limits(tolerance: Tolerance) -> dict[str, float]:
+    """Columns that decide, in the order in which they are printed, with the size of a change."""
+    return {
+        "status": 0.0,
+        "feasible": 0.0,
+        "objective": tolerance.objective,
+        "freq_violation_hz": tolerance.hz,
+        "ramp_violation": tolerance.pu,
+        "bound_violation": tolerance.pu,
+        "initial_violation": tolerance.pu,
+    }
+
+
+def _changes(before: Row, after: Row, tolerance: Tolerance) -> Iterator[Change]:
+    for column, limit in _limits(tolerance).items():
+        x, y = getattr(before, column), getattr(after, column)
+        size = _distance(x, y, relative=column == "objective")
+        if size > limit:
+            yield Change(before.key, column, x, y, size)
+
+
+def _distance(x: object, y: object, relative: bool) -> float:
+    if x == y:
+        return 0.0
+    if not (isinstance(x, float) and isinstance(y, float)):
+        return math.inf
+    return abs(y - x) / max(abs(x), abs(y)) if relative else abs(y - x)
+
+
+def _summary(a: Path, b: Path) -> pd.DataFrame:
+    """Mean gap and time per method over the common rows that have one in both folders."""
+    names = list(Key._fields)
+    frames = [_with_gaps(Results(folder).frame()).set_index(names, drop=False) for folder in (a, b)]
+    common = frames[0].index.intersection(frames[1].index, sort=False)
+    x, y = (frame.loc[common] for frame in frames)
+    timings = []
+    for folder in (a, b):
+        timing = timing_summary(read_timing(folder / "timing.csv"))
+        timings.append(timing.set_index(GROUP)["solve_s"])
+    rows = []
+    for regime, method, settings, part in groups(x.reset_index(drop=True)):
+        chosen = pd.MultiIndex.from_frame(part[names])
+        mine, theirs = x.loc[chosen], y.loc[chosen]
+        both = (mine["gap_percent"].notna() & theirs["gap_percent"].notna()).to_numpy()
+        ratios = (theirs["solve_s"] / mine["solve_s"].where(mine["solve_s"] > 0)).dropna()
+        alone = [timing.get((regime, method, settings), math.nan) for timing in timings]
+        rows.append(
+            {
+                "regime": regime,
+                "title": title(method, settings),
+                "method": method,
+                "settings": settings,
+                "common": len(part),
+                "gap_percent_a": float(mine["gap_percent"][both].mean()),
+                "gap_percent_b": float(theirs["gap_percent"][both].mean()),
+                "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
+                "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
+            }
+        )
+    return table(rows, SUMMARY_COLUMNS)
+
+
+def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
+    """Rows with their gaps, each case's to its own reference."""
+    parts = [
+        gaps(rows, choose_reference(rows, read_paper(SHIPPED_CASES / str(case))).objectives)
+        for case, rows in frame.groupby("case", sort=False)
+    ]
+    return pd.concat(parts) if parts else gaps(frame, pd.Series(dtype=float))
+
+
+def name_of(key: Key) -> str:
+    """A row's key as a reader sees it; default settings go without saying."""
+    return " ".join(key[:3]) + ("" if key.settings == "default" else f" [{key.settings}]")
+
+
+SUMMARY_COLUMNS = [
+    *("regime", "title", "method", "settings", "common"),
+    *("gap_percent_a", "gap_percent_b", "time_ratio", "time_ratio_alone"),
+]

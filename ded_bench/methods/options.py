@@ -1,0 +1,131 @@
+"""Options: the parameters of a method as one frozen dataclass, read from text and written as text.
+
+A method's module declares `Options`; each field is an `option` with its default and one line of help. Rows
+carry the canonical text: the options that differ from their defaults, in the order of the fields, or
+`default`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from ded_bench.files.errors import InputError
+
+#: The text of options that are all as declared.
+DEFAULT = "default"
+_TRUE, _FALSE, _NONE = "on", "off", "none"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """The options of a method that has none."""
+
+
+def option(
+    default: Any,
+    text: str,
+    *,
+    choices: Sequence[str] = (),
+    lowest: float = -math.inf,
+    highest: float = math.inf,
+    in_operation: bool = False,
+) -> Any:
+    """Declare a field of an `Options` dataclass, of type bool, int, float, str, or one of these or None.
+
+    Args:
+        default: its value unless `--set` says otherwise.
+        text: one line of help, with the unit.
+        choices: the texts that a str may be.
+        lowest, highest: of a number.
+        in_operation: it changes answers in the closed loop alone, so that times are those without it.
+    """
+    limits = {"choices": tuple(choices), "lowest": lowest, "highest": highest, "in_operation": in_operation}
+    return dataclasses.field(default=default, metadata={"text": text, **limits})
+
+
+def read_options(kind: type[T], text: str) -> T:
+    """Read `name=value` pairs separated by commas, or `default`.
+
+    Raises:
+        InputError: an unknown name (lists the known ones), or a value that is none of its kind.
+    """
+    hints = typing.get_type_hints(kind)
+    known = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for part in [] if text in ("", DEFAULT) else text.split(","):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if name not in known:
+            listed = f"known: {', '.join(known)}" if known else "this method has none"
+            raise InputError("--set", name or repr(part), f"no such option ({listed})")
+        if not equals:
+            raise InputError("--set", name, "needs a value: NAME=VALUE")
+        if name in values:
+            raise InputError("--set", name, "is set twice")
+        values[name] = _value(known[name], hints[name], value)
+    return kind(**values)
+
+
+def options_text(options: Any, *, timed: bool = False) -> str:
+    """The canonical text of a method's options.
+
+    Args:
+        options: an instance of its `Options`.
+        timed: leave out what matters in operation alone.
+    """
+    parts = []
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if value != field.default and not (timed and field.metadata["in_operation"]):
+            parts.append(f"{field.name}={_text(value)}")
+    return ",".join(parts) or DEFAULT
+
+
+def described(kind: type[Any]) -> list[tuple[str, str, str]]:
+    """Name, default and help of every option, as texts."""
+    return [(f.name, _text(f.default), f.metadata["text"]) for f in dataclasses.fields(kind)]
+
+
+def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
+    kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if types.NoneType in kinds and text == _NONE:
+        return None
+    (kind,) = (k for k in kinds if k is not types.NoneType)
+    limits = field.metadata
+    try:
+        if kind is bool:
+            return {_TRUE: True, _FALSE: False}[text]
+        value = kind(text)
+        if kind is str and limits["choices"] and value not in limits["choices"]:
+            raise ValueError(text)
+        if kind is not str and not (math.isfinite(value) and limits["lowest"] <= value <= limits["highest"]):
+            raise ValueError(text)
+    except (KeyError, ValueError):
+        raise InputError("--set", field.name, f"{text[:40]!r} is not {_wanted(kind, limits)}") from None
+    return value
+
+
+def _wanted(kind: type, limits: Any) -> str:
+    if kind is bool:
+        return f"{_TRUE} or {_FALSE}"
+    if kind is str:
+        return f"one of {', '.join(limits['choices'])}"
+    name = "a whole number" if kind is int else "a number"
+    bounds = [f"at least {limits['lowest']:g}"] if math.isfinite(limits["lowest"]) else []
+    bounds += [f"at most {limits['highest']:g}"] if math.isfinite(limits["highest"]) else []
+    return " ".join([name, " and ".join(bounds)]).strip()
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return _NONE
+    if isinstance(value, bool):
+        return _TRUE if value else _FALSE
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)

@@ -1,0 +1,1 @@
+"""What is simulated: plants behind one protocol, their simulation, and the scorer; knows no method."""

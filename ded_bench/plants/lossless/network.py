@@ -1,0 +1,229 @@
+"""Structure-preserving swing equations of one case: power flow, index-1 DAE, linearisation.
+
+Angles are relative to the slack bus, which is held at θ_s = 0, ω_s = 0. Differential states are
+(θ, ω) of the generators; the angles of all other buses follow from the algebraic equations
+L_i = f_i(θ). Everything is batched over leading dimensions.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.state import State
+
+if TYPE_CHECKING:
+    from ded_bench.plants.lossless.integrator import Grid, Indices
+
+#: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
+MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
+
+
+class PowerFlowError(ArithmeticError):
+    """The network cannot carry the powers asked of it: the power flow has no stable solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The swing DAE linearised at an equilibrium, with load angles eliminated.
+
+    M dω/dt = -D ω + δP_gen - δf, with δf = stiffness @ δθ + share @ δP_load; the slack delivers
+    δP_s = -Σ δf - Σ δP_load.
+    """
+
+    stiffness: Array  # (n_gen, n_gen), pu/rad
+    share: Array  # (n_gen, n_load): instantaneous change of f at the generators, pu/pu
+    slack_share: Array  # (n_load,): instantaneous change of P_s, pu/pu
+    m: Array
+    d: Array
+
+    def modes(self) -> NDArray[np.complex128]:
+        """Eigenvalues in rad/s of the linearised dynamics in (θ, ω), shape (2 n_gen,), complex."""
+        n = len(self.m)
+        top = np.hstack([np.zeros((n, n)), np.eye(n)])
+        bottom = np.hstack([-self.stiffness / self.m[:, None], -np.diag(self.d / self.m)])
+        return np.linalg.eigvals(np.vstack([top, bottom])).astype(np.complex128)
+
+
+class Network:
+    """The lossless network of a case: injections f(θ) and the equations that fix load angles.
+
+    Couplings are b_ij = |V_i||V_j| / |r_ij + j x_ij|, so that f_i = Σ_j b_ij sin(θ_i - θ_j)
+    (paper, eq. for f_i). Angles are arrays over all buses in the case's order.
+    """
+
+    def __init__(self, case: Case) -> None:
+        index = {bus.id: i for i, bus in enumerate(case.buses)}
+        voltage = np.array([bus.v for bus in case.buses])
+        self.ends = ends = np.array([[index[line.from_bus], index[line.to_bus]] for line in case.lines])
+        impedance = np.array([abs(complex(line.r, line.x)) for line in case.lines])
+        self.case = case
+        self.n_bus = len(case.buses)
+        self.slack = index[case.slack]
+        self.generators = np.array([index[bus] for bus in case.generators])
+        self.loads = np.array([index[bus] for bus in case.loads])
+        fixed = {self.slack, *self.generators.tolist()}
+        self.algebraic = np.array([i for i in range(self.n_bus) if i not in fixed])
+        self.unknown = np.array([i for i in range(self.n_bus) if i != self.slack])
+        self.coupling = voltage[ends].prod(axis=1) / impedance
+        self.incidence = np.zeros((len(case.lines), self.n_bus))
+        self.incidence[np.arange(len(ends)), ends[:, 0]] = 1.0
+        self.incidence[np.arange(len(ends)), ends[:, 1]] = -1.0
+        self.m = np.array([case.machines[g].m for g in case.generators])
+        self.d = np.array([case.machines[g].d for g in case.generators])
+        self.mismatch = max(MISMATCH, RESOLUTION * float(self.coupling.max()))
+        self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
+        self._first_step = np.zeros_like(self._flat)
+        self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
+            self._flat[np.ix_(self.unknown, self.unknown)]
+        )
+
+    @functools.cached_property
+    def grid(self) -> Grid:
+        """What compiled functions see of this network."""
+        from ded_bench.plants.lossless.integrator import Grid  # and with it Numba: help does without
+
+        places = self.generators, self.algebraic, self.slack
+        return Grid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
+
+    def injections(self, theta: Array) -> Array:
+        """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
+        flow = np.sin(theta @ self.incidence.T) * self.coupling
+        return np.asarray(flow @ self.incidence)
+
+    def load_injections(self, p_load: Array) -> Array:
+        """Injections at the algebraic buses, shape (..., n_algebraic): loads, and zero at junctions."""
+        full = np.zeros((*p_load.shape[:-1], self.n_bus))
+        full[..., self.loads] = p_load
+        return full[..., self.algebraic]
+
+    def solve_loads(self, theta: Array, injection: Array) -> tuple[Array, Array]:
+        """Angles and injections of all buses, given angles of generators and slack: L_i = f_i(θ), index 1.
+
+        Args:
+            theta: angles, shape (..., n_bus); load entries are Newton's first guess.
+            injection: wanted injections at the algebraic buses (see `load_injections`).
+
+        Returns:
+            θ, rad, and f(θ), pu; each of shape (..., n_bus).
+
+        Raises:
+            PowerFlowError: no solution from this guess.
+        """
+        return self._newton(theta, injection, self.algebraic)
+
+    def power_flow(self, p_gen: Array, p_load: Array) -> Array:
+        """Equilibrium angles for given generator and load injections, shape (..., n_bus), rad.
+
+        Raises:
+            PowerFlowError: there is no solution, or it is not a stable one (an angle across a line
+                beyond 90 degrees).
+        """
+        shape = np.broadcast_shapes(p_gen.shape[:-1], p_load.shape[:-1])
+        wanted = np.zeros((*shape, self.n_bus))
+        wanted[..., self.generators] = p_gen
+        wanted[..., self.loads] = p_load
+        theta = wanted @ self._first_step  # Newton's first step from θ = 0
+        theta, _ = self._newton(theta, wanted[..., self.unknown], self.unknown)
+        if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
+            raise PowerFlowError("an angle across a line exceeds 90 degrees")
+        return theta
+
+    def acceleration(self, omega: Array, p_gen: Array, f_gen: Array) -> Array:
+        """dω/dt = (P - f - D ω) / M, shape (..., n_gen), rad/s² (paper, swing equation)."""
+        return np.asarray((p_gen - f_gen - self.d * omega) / self.m)
+
+    def initial_angles(self, instance: Instance) -> Array:
+        """Angles at t = 0, shape (n_bus,), rad.
+
+        The power flow of P_0 and the initial loads, unless the instance gives the generators' angles: then
+        the loads fix the others.
+
+        Raises:
+            PowerFlowError: there are no such angles.
+        """
+        p_load = instance.p_load(self.case, np.zeros(1))[0]
+        theta = instance.theta_initial(self.case)
+        if theta is None:
+            return self.power_flow(instance.p_initial(self.case), p_load)
+        state = State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
+        return self.angles(state, p_load)
+
+    def initial_state(self, instance: Instance) -> State:
+        """The generators at t = 0; raises PowerFlowError where `initial_angles` does."""
+        theta = self.initial_angles(instance)[self.generators]
+        return State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
+
+    def angles(self, state: State, p_load: Array) -> Array:
+        """Angles of all buses, shape (n_bus,), rad: loads, shape (n_load,), pu, fix those not in the state.
+
+        Raises:
+            PowerFlowError: the loads cannot be served at these angles of the generators.
+        """
+        theta = np.zeros(self.n_bus)
+        theta[self.generators] = state.theta
+        # Newton's guess: angles that the lines, linearised at zero, would give the other buses.
+        alg, gen = self.algebraic, self.generators
+        wanted = self.load_injections(p_load) - self._flat[np.ix_(alg, gen)] @ state.theta
+        theta[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], wanted)
+        return self.solve_loads(theta, self.load_injections(p_load))[0]
+
+    def linearise(self, theta: Array) -> Linearisation:
+        """Linearise at the angles of an equilibrium, shape (n_bus,)."""
+        weights = self.coupling * np.cos(theta @ self.incidence.T)
+        full = self.incidence.T @ (weights[:, None] * self.incidence)
+        gen, alg = self.generators, self.algebraic
+        to_load = np.zeros((len(alg), len(self.loads)))
+        to_load[np.searchsorted(alg, self.loads), np.arange(len(self.loads))] = 1.0
+        inverse = np.linalg.inv(full[np.ix_(alg, alg)])
+        share = full[np.ix_(gen, alg)] @ inverse @ to_load
+        stiffness = full[np.ix_(gen, gen)] - full[np.ix_(gen, alg)] @ inverse @ full[np.ix_(alg, gen)]
+        slack_share = (full[[self.slack]][:, alg] @ inverse @ to_load)[0]
+        return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
+
+    def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
+        from ded_bench.plants.lossless.integrator import solve_angles  # here only, as in `grid`
+
+        theta = np.array(theta)
+        f = np.empty(theta.shape)
+        rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
+        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(free))).reshape(-1, len(free))
+        try:
+            solved = solve_angles(self.grid, free, np.ascontiguousarray(wanted), *rows)
+        except np.linalg.LinAlgError:
+            solved = False
+        if not solved:
+            raise PowerFlowError("the power flow has no solution")
+        return theta, f
+
+
+def check_servable(case: Case, instance: Instance, source: str) -> None:
+    """Check that the power flow can serve an instance's loads at t = 0 and at every kink after it.
+
+    Raises:
+        InputError: it cannot; names the source and the field.
+    """
+    network = Network(case)
+    try:
+        network.initial_angles(instance)
+    except PowerFlowError as error:
+        given = "power" if instance.initial.theta is None else "theta"
+        problem = f"initial loads and {given} cannot be served: {error}"
+        raise InputError(source, f"load, initial.{given}", problem) from None
+    kinks = {0.0, instance.horizon_s, *(t for load in instance.load.values() for t in load.kinks)}
+    times = np.array(sorted(t for t in kinks if t <= instance.horizon_s))
+    p_load = instance.p_load(case, times)
+    p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+    for t, gen, load in zip(times, p_gen, p_load, strict=True):
+        try:
+            network.power_flow(gen, load)
+        except PowerFlowError as error:
+            raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None

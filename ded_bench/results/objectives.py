@@ -1,0 +1,56 @@
+"""Objectives of a reference run: what a package without its rows measures gaps against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ded_bench.files.table import Table, cell
+from ded_bench.problem.case import Case
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.reference_run import reference_run
+from ded_bench.results.rows import Row
+
+#: Rows of drawn validation instances serve choices, not comparisons.
+_LEFT_OUT = "validation"
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The re-simulated objective of one method in its default settings; comparable within one version."""
+
+    case: str = cell()
+    instance: str = cell()
+    regime: str = cell()
+    method: str = cell()
+    objective: float = cell()
+    problems_version: str = ""
+
+
+OBJECTIVES = Table(Objective)
+
+
+def objectives_file(folder: Path) -> Path:
+    """Where a results folder keeps the table."""
+    return ResultsFolder(folder).tables / "objectives.csv"
+
+
+def objectives_of(rows: Iterable[Row]) -> list[Objective]:
+    """The scored rows with default settings, by regime, method and instance."""
+    found = [
+        Objective(row.case, row.instance, row.regime, row.method, row.objective, row.problems_version)
+        for row in rows
+        if row.objective is not None and row.settings == "default" and row.split != _LEFT_OUT
+    ]
+    return sorted(found, key=lambda o: (o.regime, o.method, o.instance))
+
+
+def reference_objectives(case: Case) -> list[Objective]:
+    """The objectives of a case's reference run; empty where it has none.
+
+    Raises:
+        InputError: the table is wrong.
+    """
+    path = objectives_file(reference_run(case))
+    return OBJECTIVES.read(path) if path.is_file() else []

@@ -1,0 +1,202 @@
+"""What a results folder keeps of the closed loop: rows, hindsight, and trajectories for figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.keyed_table import KeyedTable
+from ded_bench.files.table import Table, cell, plain_name
+from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.ac_case import TRUTHS
+from ded_bench.problem.forecast import QUALITIES
+
+#: Trajectories are kept at points this far apart, s.
+KEPT_S = 0.1
+
+
+class OnlineKey(NamedTuple):
+    """What makes a row of `online.csv` unique."""
+
+    scenario: str
+    regime: str
+    method: str
+    settings: str
+    period_s: float
+    latency_s: float
+    forecast: str
+    predicted: bool
+    warm: bool
+    truth: str = TRUTHS[0]
+
+
+class HindsightKey(NamedTuple):
+    """What makes a row of `hindsight.csv` unique."""
+
+    scenario: str
+    regime: str
+    truth: str = TRUTHS[0]
+
+
+def _quality(text: str) -> str:
+    if text not in QUALITIES:
+        raise ValueError(text)
+    return text
+
+
+def _truth(text: str) -> str:
+    if text not in TRUTHS:
+        raise ValueError(text)
+    return text
+
+
+@dataclass(frozen=True)
+class OnlineRow:
+    """One scenario operated with one method's plans, judged on the true DAE (see `Judgement`).
+
+    `truth` names the network that was operated: the lossless one, or the full AC network. `unforeseen_hz`
+    is how far loads that no plan knew of move frequencies (see `unforeseen`); it depends on no method.
+
+    `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
+    the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
+    that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
+    method's own word, exceeds limits as little as it can. `method_s` and `loop_s` are wall-clock seconds of
+    the method, and of all else.
+    """
+
+    scenario: str = cell(check=plain_name)
+    regime: str = cell(check=plain_name)
+    method: str = cell(check=plain_name)
+    settings: str = cell(check=plain_name)
+    period_s: float = cell(lowest=0)
+    latency_s: float = cell(lowest=0)
+    forecast: str = cell(check=_quality)
+    predicted: bool = cell()
+    warm: bool = cell()
+    truth: str = cell(default=TRUTHS[0], check=_truth)
+    objective: float | None = None
+    increase_percent: float | None = None
+    max_excess_hz: float | None = cell(default=None, lowest=0)
+    mean_excess_hz: float | None = cell(default=None, lowest=0)
+    share_outside: float | None = cell(default=None, lowest=0, highest=1)
+    ramp_violation: float | None = cell(default=None, lowest=0)
+    bound_violation: float | None = cell(default=None, lowest=0)
+    slack_travel_pu: float | None = cell(default=None, lowest=0)
+    unforeseen_hz: float | None = cell(default=None, lowest=0)
+    plans: int = cell(default=0, lowest=0)
+    late: int = cell(default=0, lowest=0)
+    failed: int = cell(default=0, lowest=0)
+    infeasible: int = cell(default=0, lowest=0)
+    warm_used: bool = False
+    error: str = ""
+    limit_s: float | None = None
+    method_s: float | None = None
+    loop_s: float | None = None
+    latency_source: str = ""  # timing, zero or given
+    case: str = ""
+    model: str = ""
+    policy: str = ""
+    fingerprint: str = ""
+    code: str = ""
+    online_code: str = ""
+    version: str = ""
+    host: str = ""
+    date: str = ""
+
+    @property
+    def key(self) -> OnlineKey:
+        """The row's place in the table."""
+        return OnlineKey(*(getattr(self, name) for name in OnlineKey._fields))
+
+
+@dataclass(frozen=True)
+class HindsightRow:
+    """The optimum of one scenario and regime with full knowledge, judged as the rows of `online.csv`."""
+
+    scenario: str = cell(check=plain_name)
+    regime: str = cell(check=plain_name)
+    truth: str = cell(default=TRUTHS[0], check=_truth)
+    method: str = ""
+    objective: float | None = None
+    max_excess_hz: float | None = None
+    slack_travel_pu: float | None = None
+    error: str = ""
+    case: str = ""
+    fingerprint: str = ""
+    online_code: str = ""
+    version: str = ""
+    host: str = ""
+    date: str = ""
+
+    @property
+    def key(self) -> HindsightKey:
+        """The row's place in the table."""
+        return HindsightKey(self.scenario, self.regime, self.truth)
+
+
+ONLINE, HINDSIGHT = Table(OnlineRow), Table(HindsightRow)
+
+
+@dataclass(frozen=True)
+class OnlineFiles:
+    """Where a results folder keeps what of the closed loop; it need not exist."""
+
+    folder: Path
+
+    @property
+    def table(self) -> Path:
+        """Rows of scenario × regime × method × settings × loop."""
+        return self.folder / "online.csv"
+
+    @property
+    def hindsight(self) -> Path:
+        """Rows of scenario × regime, with full knowledge."""
+        return self.folder / "hindsight.csv"
+
+    def trajectory(self, key: OnlineKey) -> Path:
+        """The trajectory of a row."""
+        loop = f"{key.period_s:g}s-{key.latency_s:g}s-{key.forecast}"
+        loop += "" if key.predicted else "-present"
+        loop += "" if key.warm else "-cold"
+        loop += _suffix(key.truth)
+        place = self.folder / "online" / key.method / key.settings / key.regime
+        return place / loop / f"{key.scenario}.safetensors"
+
+    def hindsight_trajectory(self, scenario: str, regime: str, truth: str = TRUTHS[0]) -> Path:
+        """The trajectory of a scenario's hindsight."""
+        place = self.folder / "online" / f"hindsight{_suffix(truth)}"
+        return place / regime / f"{scenario}.safetensors"
+
+
+def _suffix(truth: str) -> str:
+    return "" if truth == TRUTHS[0] else f"-{truth}"
+
+
+class OnlineResults:
+    """The tables of the closed loop in a results folder, and where the files beside them lie.
+
+    Raises:
+        InputError: there is a table, but it is wrong.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.files = OnlineFiles(folder)
+        self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
+        self.hindsight = KeyedTable[HindsightKey, HindsightRow](self.files.hindsight, HINDSIGHT)
+
+
+def keep_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write times (s), powers of generators and slack, loads (pu) and frequency deviations (rad/s)."""
+    stride = max(round(KEPT_S / (trajectory.t[1] - trajectory.t[0])), 1)
+    names = ("t", "p_gen", "p_slack", "p_load", "omega")
+    arrays = {name: getattr(trajectory, name)[::stride] for name in names}
+    write_arrays(path, arrays, {"kept_s": KEPT_S})
+
+
+def read_trajectory(path: Path) -> dict[str, np.ndarray]:
+    """Read what `keep_trajectory` wrote; InputError if it is missing or damaged."""
+    return read_arrays(path)[0]

@@ -1,0 +1,100 @@
+"""The surrogates by name, and where trained ones lie."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.case import REPOSITORY, Case
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.linear import nominal_model
+
+#: Models that `ded-bench train-ko` identifies.
+TRAINED = ("koopman", "koopman-paper")
+#: The linearisation along a simulated trajectory.
+TRAJECTORY = "trajectory"
+#: All models by name; those not trained follow from the case, or from each instance.
+MODELS = (*TRAINED, "linear", TRAJECTORY)
+
+
+@dataclass(frozen=True)
+class AlongTrajectory:
+    """The surrogate that is made anew for each instance: nothing of it is trained (see `instance_model`)."""
+
+    case: Case
+    kind: str = TRAJECTORY
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change with the case."""
+        return hashlib.sha256(f"{self.kind}|{self.case.fingerprint}".encode()).hexdigest()[:12]
+
+
+#: A lifted model has one K for all instances and times; the other kind is made for each instance.
+Surrogate = Koopman | AlongTrajectory
+
+
+def default_results(case: Case) -> Path:
+    """Where results of a case lie unless told otherwise, below the working directory."""
+    return Path("results") / case.id
+
+
+def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
+    """Where trained models and policies are looked for: `first`, default results, reference run."""
+    return (*first, default_results(case), REPOSITORY / "results" / f"{case.id}-reference")
+
+
+def model_file(results: Path, kind: str) -> Path:
+    """Where a results folder keeps a model."""
+    return ResultsFolder(results).model(kind)
+
+
+def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
+    """Return a surrogate by its kind, from the first folder that has it, or by its file's path.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it), or its file is wrong.
+    """
+    if name == TRAJECTORY:
+        return AlongTrajectory(case)
+    return find_model(case, name, search)
+
+
+def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
+    """Return a lifted model by its kind, from the first folder that has it, or by its file's path.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it), its file is wrong, or the
+            surrogate of this name is made for each instance.
+    """
+    if name == TRAJECTORY:
+        raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
+    path = find_model_file(case, name, search)
+    if path is None:
+        return nominal_model(case)
+    return Koopman.load(path, case)
+
+
+def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | None:
+    """The file that a model is read or derived from; None if it follows from the case.
+
+    Raises:
+        InputError: there is no such model yet (names the command that makes it).
+    """
+    if name in ("linear", TRAJECTORY):
+        return None
+    if name in TRAINED:
+        for folder in search:
+            if model_file(folder, name).is_file():
+                return model_file(folder, name)
+        problem = (
+            f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
+        )
+        raise InputError("--model", name, problem)
+    if Path(name).is_file():
+        return Path(name)
+    raise InputError("--model", name, f"no such file and no such model (known: {', '.join(MODELS)})")

@@ -1,0 +1,80 @@
+"""The one form in which linear programs see every surrogate: a linear model of one instance, by knots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ded_bench.koopman.ac_trajectory import linearise_along_ac
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.surrogates.find import Surrogate
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.trajectory import Hold, Indices, TrajectoryModel, linearise_along, repeated
+from ded_bench.truth.ac_network import AcNetwork
+from ded_bench.truth.ac_simulate import simulate_ac
+
+
+def model_along(
+    case: Case, surrogate: Surrogate, instance: Instance, p_gen: Array, points: Indices
+) -> TrajectoryModel:
+    """The linear model of one instance by which a surrogate answers to schedules linear between knots.
+
+    Args:
+        case: the grid.
+        surrogate: any kind. A lifted model's answers do not depend on `p_gen` but for round-off; the others
+            are linearised along the simulation of it.
+        instance: x_0 and the loads.
+        p_gen: powers at the knots, shape (n_knots, n_gen), pu; `ded-ko` and its like take the static
+            dispatch of every second.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+
+    Raises:
+        SimulationError: the system cannot follow these powers.
+        InputError: a lifted model was identified at another time step than the instance's.
+    """
+    if isinstance(surrogate, Koopman):
+        surrogate.check_step(instance)
+        return _lifted_along(case, surrogate, instance, p_gen, points)
+    schedule = Schedule(t=instance.grid[points], p=p_gen)
+    if surrogate.data is not None:
+        trajectory = simulate_ac(case, surrogate.data, instance, schedule)
+        return linearise_along_ac(AcNetwork(case, surrogate.data), trajectory, points)
+    return linearise_along(case, simulate(case, instance, schedule), points)
+
+
+def _lifted_along(
+    case: Case, model: Koopman, instance: Instance, p_gen: Array, points: Indices
+) -> TrajectoryModel:
+    """A lifted model around its own rollout.
+
+    Args:
+        case: the grid.
+        model: K, B and G are those of all intervals.
+        instance: x_0 and the loads.
+        p_gen: powers at the knots, linear between them, shape (n_knots, n_gen), pu.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+    """
+    n_gen, lengths = len(case.generators), np.diff(points)
+    psi = model.initial(Network(case), [instance])[0]
+    steps = np.arange(points[-1] + 1)
+    powers = np.stack([np.interp(steps, points, p) for p in p_gen.T], axis=1)
+    outputs = model.rollout(psi, np.hstack([powers, instance.p_load(case)]))
+    b, h = model.b[:, :n_gen], model.g[:, :n_gen]
+    one = Hold(model.k[None], (b - model.k @ b)[None], h[None])
+    kinds, kind = np.unique(lengths, return_inverse=True)
+    over = [repeated(one, int(length)) for length in kinds]
+    slack = np.zeros((1, len(psi)))
+    slack[0, n_gen] = 1.0
+    return TrajectoryModel(
+        points=points,
+        step=Hold(*(np.broadcast_to(part, (len(lengths), *part.shape[1:])) for part in one)),
+        across=Hold(*(np.concatenate(parts)[kind] for parts in zip(*over, strict=True))),
+        speed=slice(0, n_gen),
+        slack=np.broadcast_to(slack, (len(lengths), len(psi))),
+        omega=outputs[:, :n_gen],
+        p_slack=outputs[:, n_gen],
+        p_gen=p_gen,
+    )

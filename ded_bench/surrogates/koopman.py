@@ -1,0 +1,205 @@
+"""The Koopman surrogate: observables, K, B and G; sequential rollout (condensed: see `condensed`).
+
+    ψ(x) = (ω, P_s, N(x))
+    ψ_{k+1} = K (ψ_k - B P_k) + B P_k + G (P_{k+1} - P_k)
+
+G = 0 is the paper's eq. (KO_dyn); G = (I - K) B is the same form with the newer input sample; any
+other G is a first-order hold. Inputs are P = (generators, loads). B's ω rows are zero and its P_s
+row is -1, so equilibria are exact: ψ = B P gives ω = 0 and P_s = -Σ P.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.errors import InputError
+from ded_bench.plants.lossless.network import Network
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+
+SCHEMA = "ded-bench/koopman/1"
+#: Numbers in a block of steps of the rollout; larger blocks cost more products than they save turns.
+BLOCK = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Koopman:
+    """A linear model of (ω, P_s) under generator and load inputs, for one case and time step.
+
+    `lift` maps the features (f at all buses, θ at all buses, ω, P_load, 1) to ψ; an MLP of the
+    paper's x = (θ_gen, P_s, ω), with tanh layers, may add to the last rows of ψ.
+    """
+
+    kind: str
+    case_id: str
+    case_fingerprint: str
+    dt_s: float
+    k: Array  # (n_psi, n_psi)
+    b: Array  # (n_psi, n_gen + n_load)
+    g: Array  # (n_psi, n_gen + n_load)
+    lift: Array  # (n_psi, 2 n_bus + n_gen + n_load + 1)
+    mlp: tuple[tuple[Array, Array], ...] = ()  # (weight, bias) of each layer
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def observables(self, network: Network, theta: Array, omega: Array, p_load: Array) -> Array:
+        """ψ(x), shape (..., n_psi), from angles (..., n_bus), ω (..., n_gen), loads (..., n_load)."""
+        injections = network.injections(theta)
+        one = np.ones((*theta.shape[:-1], 1))
+        psi = np.concatenate([injections, theta, omega, p_load, one], axis=-1) @ self.lift.T
+        if self.mlp:
+            slack = injections[..., [network.slack]]
+            x = np.concatenate([theta[..., network.generators], slack, omega], axis=-1)
+            for weight, bias in self.mlp[:-1]:
+                x = np.tanh(x @ weight.T + bias)
+            weight, bias = self.mlp[-1]
+            psi[..., -len(bias) :] += x @ weight.T + bias
+        return psi
+
+    def initial(self, network: Network, instances: Sequence[Instance]) -> Array:
+        """ψ(x_0) of instances, shape (batch, n_psi)."""
+        case = network.case
+        theta = np.stack([network.initial_angles(i) for i in instances])
+        omega = np.stack([i.omega_initial(case) for i in instances])
+        p_load = np.stack([i.p_load(case, np.zeros(1))[0] for i in instances])
+        return self.observables(network, theta, omega, p_load)
+
+    def rollout(self, psi: Array, inputs: Array) -> Array:
+        """Run the model from ψ_0.
+
+        Args:
+            psi: ψ_0, shape (..., n_psi).
+            inputs: P_k, shape (n_points, ..., n_gen + n_load), pu.
+
+        Returns:
+            ψ_k, shape (n_points, ..., n_psi).
+        """
+        steady = inputs @ self.b.T
+        increments = np.diff(inputs, axis=0) @ (self.g - self.b).T
+        start = np.broadcast_to(psi - steady[0], np.broadcast_shapes(psi.shape, steady.shape[1:]))
+        increments = np.broadcast_to(increments, (len(increments), *start.shape))
+        return linear_recurrence(self.k, start, increments) + steady
+
+    def check_step(self, instance: Instance) -> None:
+        """Raise InputError unless the model's time step is the instance's."""
+        if abs(self.dt_s - instance.dt_s) > 1e-9 * instance.dt_s:
+            problem = f"is {instance.dt_s:g}, but the Koopman model was identified at {self.dt_s:g}"
+            raise InputError(f"instance {instance.id}", "dt_s", problem)
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change when the model's arrays do."""
+        arrays = [self.k, self.b, self.g, self.lift, *(a for layer in self.mlp for a in layer)]
+        return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
+
+    def save(self, path: Path) -> None:
+        """Write arrays and header (see `files.arrays`)."""
+        arrays = {"k": self.k, "b": self.b, "g": self.g, "lift": self.lift}
+        for i, (weight, bias) in enumerate(self.mlp):
+            arrays |= {f"mlp.{i}.weight": weight, f"mlp.{i}.bias": bias}
+        header = {
+            "schema": SCHEMA,
+            "kind": self.kind,
+            "case": self.case_id,
+            "case_fingerprint": self.case_fingerprint,
+            "dt_s": self.dt_s,
+            "training": self.training,
+        }
+        write_arrays(path, arrays, header)
+
+    @staticmethod
+    def load(path: str | Path, case: Case) -> Koopman:
+        """Read a model of `case`.
+
+        Raises:
+            InputError: the file is wrong or belongs to another case.
+        """
+        arrays, header = read_arrays(path)
+        if header.get("schema") != SCHEMA:
+            raise InputError(path, "schema", f"expected {SCHEMA!r}")
+        if header.get("case_fingerprint") != case.fingerprint:
+            raise InputError(path, "case", f"was identified on another case than {case.id!r} as it is now")
+        try:
+            layers = sum(name.endswith(".bias") for name in arrays)
+            mlp = tuple((arrays[f"mlp.{i}.weight"], arrays[f"mlp.{i}.bias"]) for i in range(layers))
+            model = Koopman(
+                kind=str(header["kind"]),
+                case_id=case.id,
+                case_fingerprint=case.fingerprint,
+                dt_s=float(header["dt_s"]),
+                training=dict(header["training"]),
+                mlp=mlp,
+                **{name: arrays[name] for name in ("k", "b", "g", "lift")},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(path, str(error).strip("'")[:60], "is missing or mistyped") from None
+        if not 0 < model.dt_s < float("inf"):
+            raise InputError(path, "dt_s", "is no positive number of seconds")
+        model._check_shapes(path, case)
+        return model
+
+    def _check_shapes(self, path: str | Path, case: Case) -> None:
+        n = self.k.shape[0] if self.k.ndim else 0
+        n_gen, n_in = len(case.generators), len(case.generators) + len(case.loads)
+        expected = {
+            "k": (n, n),
+            "b": (n, n_in),
+            "g": (n, n_in),
+            "lift": (n, 2 * len(case.buses) + n_in + 1),
+        }
+        width = 2 * n_gen + 1
+        for i, (weight, bias) in enumerate(self.mlp):
+            if bias.ndim != 1 or weight.shape != (len(bias), width):
+                raise InputError(path, f"mlp.{i}", "has the wrong shape")
+            width = len(bias)
+        for name in ("k", "b", "g", "lift"):
+            if getattr(self, name).shape != expected[name]:
+                raise InputError(
+                    path, name, f"has shape {getattr(self, name).shape}, expected {expected[name]}"
+                )
+        if n < n_gen + 1 or (width > n - n_gen - 1 and self.mlp):
+            raise InputError(path, "k", "has too few observables")
+
+
+def linear_recurrence(k: Array, start: Array, increments: Array) -> Array:
+    """All x_i of x_{i+1} = K x_i + u_i, computed a block of steps at a time.
+
+    Args:
+        k: K, shape (n, n).
+        start: x_0, shape (..., n).
+        increments: u_i, shape (n_steps, ..., n).
+
+    Returns:
+        Shape (n_steps + 1, ..., n).
+
+    Within a block, x is one matrix product of its u's (a block Toeplitz matrix of the powers of K),
+    so that the loop in Python has hundreds of turns fewer than there are steps.
+    """
+    n, n_steps = len(k), len(increments)
+    length = max(1, min(BLOCK // n, n_steps))
+    powers = [np.eye(n)]
+    for _ in range(length):
+        powers.append(powers[-1] @ k.T)
+    inside = np.zeros((length, n, length, n))
+    for i in range(length):
+        for j in range(i, length):
+            inside[i, :, j] = powers[j - i]
+    blocks = -(-n_steps // length)
+    before = start.reshape(-1, n)
+    batch = len(before)
+    u = np.zeros((blocks * length, batch, n))
+    u[:n_steps] = increments.reshape(n_steps, batch, n)
+    u = np.moveaxis(u.reshape(blocks, length, batch, n), 1, 2).reshape(blocks, batch, length * n)
+    x = (u @ inside.reshape(length * n, length * n)).reshape(blocks, batch, length, n)
+    carry = np.concatenate(powers[1:], axis=1)
+    for block in x:
+        block += (before @ carry).reshape(batch, length, n)
+        before = block[:, -1]
+    x = np.moveaxis(x, 2, 1).reshape(blocks * length, *start.shape)
+    return np.concatenate([start[None], x[:n_steps]])

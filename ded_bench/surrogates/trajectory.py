@@ -1,0 +1,343 @@
+"""Linear models along a trajectory, by the knots of the schedules that they answer to.
+
+Two kinds. The swing DAE linearised along a simulated trajectory is linear and time-varying, with nothing to
+train: between two knots the reduced stiffness S is that of the middle of the interval (generator angles
+and loads determine the angles of all other buses, see `Network.linearise`), and deviations from the
+trajectory under an input increment δP, linear between grid points, obey
+
+    dδθ/dt = δω,    M dδω/dt = -D δω - S δθ + δP,    δP_s = -1ᵀ S δθ,
+
+advanced from grid point to grid point by the exact map of that equation (first-order hold). A lifted model
+(`Koopman`) has the same form, the same for all intervals, around its own rollout under any powers.
+The loads are those of the trajectory, so that they enter through it alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.case import Array, Case
+
+Indices = NDArray[np.intp]
+
+#: Terms of the exponential series below this are left out; doubles resolve no more.
+SERIES_END = 1e-18
+
+
+class Hold(NamedTuple):
+    """x⁺ = f x + g u + h Δu over some grid steps: u is the input at their start, Δu its change per step.
+
+    Arrays have one map for each of several intervals.
+    """
+
+    f: Array  # (n_maps, n_state, n_state)
+    g: Array  # (n_maps, n_state, n_gen)
+    h: Array  # (n_maps, n_state, n_gen)
+
+    def then(self, other: Hold, steps: int) -> Hold:
+        """This map over `steps` steps, followed by another one."""
+        g = other.f @ self.g + other.g
+        return Hold(other.f @ self.f, g, other.f @ self.h + steps * other.g + other.h)
+
+    def take(self, chosen: Indices) -> Hold:
+        """The maps of some intervals."""
+        return Hold(self.f[chosen], self.g[chosen], self.h[chosen])
+
+
+class LocalRows(NamedTuple):
+    """Rows in the variables of one interval each: x and u at its start, u at its end."""
+
+    interval: Indices  # (n_rows,)
+    x: Array  # (n_rows, n_state)
+    start: Array  # (n_rows, n_gen)
+    end: Array  # (n_rows, n_gen)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryModel:
+    """(ω, P_s) at all grid points as affine functions of generator power at the knots.
+
+    The state x is (δθ, δω) of the generators at a knot, or δψ of a lifted model; the input is u = δP at the
+    knots; both are deviations from the trajectory. Interval j lies between knots j and j + 1.
+    """
+
+    points: Indices  # (n_knots,): grid point of each knot
+    step: Hold  # over one grid step, of each interval
+    across: Hold  # over the whole of each interval
+    speed: slice  # the entries δω of the state
+    slack: Array  # (n_intervals, n_state): δP_s / δx
+    omega: Array  # (n_points, n_gen): of the trajectory, rad/s
+    p_slack: Array  # (n_points,): of the trajectory, pu
+    p_gen: Array  # (n_knots, n_gen): of the trajectory, pu
+
+    @property
+    def lengths(self) -> Indices:
+        """Grid steps of each interval, shape (n_intervals,)."""
+        return np.diff(self.points)
+
+    def states(self, u: Array) -> Array:
+        """Deviations x at the knots under input increments.
+
+        Args:
+            u: δP at the knots, shape (n_knots, n_gen), pu.
+
+        Returns:
+            Shape (n_knots, n_state), zero at the first knot.
+        """
+        slope = np.diff(u, axis=0) / self.lengths[:, None]
+        driven = (self.across.g @ u[:-1, :, None] + self.across.h @ slope[:, :, None])[..., 0]
+        x = np.zeros((len(self.points), self.across.f.shape[1]))
+        for j, (f, force) in enumerate(zip(self.across.f, driven, strict=True)):
+            x[j + 1] = f @ x[j] + force
+        return x
+
+    def outputs(self, u: Array, x: Array | None = None) -> tuple[Array, Array]:
+        """ω, shape (n_points, n_gen) in rad/s, and P_s, shape (n_points,) in pu, at all grid points.
+
+        Args:
+            u: δP at the knots, shape (n_knots, n_gen), pu.
+            x: deviations at the knots if they are known (see `states`).
+        """
+        x = self.states(u) if x is None else x
+        length = self.lengths
+        slope = np.diff(u, axis=0) / length[:, None]
+        state, force = x[:-1], (self.step.g @ u[:-1, :, None] + self.step.h @ slope[:, :, None])[..., 0]
+        growth = (self.step.g @ slope[:, :, None])[..., 0]
+        deviation = np.zeros((len(self.omega), x.shape[1]))
+        deviation[self.points] = x
+        interval = np.arange(len(length))
+        for r in range(1, int(length.max())):
+            if not (length[interval] > r).all():
+                some = length[interval] > r
+                interval, state, force, growth = interval[some], state[some], force[some], growth[some]
+            f = self.step.f if len(interval) == len(length) else self.step.f[interval]
+            state = (f @ state[:, :, None])[..., 0] + force
+            force = force + growth
+            deviation[self.points[interval] + r] = state
+        return self._outputs(deviation)
+
+    def rollout(self, p_gen: Array) -> tuple[Array, Array]:
+        """ω and P_s as `outputs` gives them, under powers given at all grid points, (n_points, n_gen), pu."""
+        knots = np.arange(len(self.omega))
+        reference = [np.interp(knots, self.points, p) for p in self.p_gen.T]
+        u = p_gen - np.stack(reference, axis=1)
+        change, deviation = np.diff(u, axis=0), np.zeros((len(u), self.step.f.shape[1]))
+        for k, j in enumerate(self._intervals[:-1]):
+            inputs = self.step.g[j] @ u[k] + self.step.h[j] @ change[k]
+            deviation[k + 1] = self.step.f[j] @ deviation[k] + inputs
+        return self._outputs(deviation)
+
+    @property
+    def _intervals(self) -> Indices:
+        """In which interval each grid point lies; the point at a knot belongs to the one after it."""
+        owner = np.repeat(np.arange(len(self.lengths)), self.lengths)
+        return np.append(owner, owner[-1])
+
+    def _outputs(self, deviation: Array) -> tuple[Array, Array]:
+        p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
+        return self.omega + deviation[:, self.speed], self.p_slack + p_slack
+
+    def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
+        """δω at single grid points, as rows in the variables of the intervals that they lie in.
+
+        Args:
+            generators: of which generator each row is, shape (n_rows,).
+            points: at which grid point, none of them the first, shape (n_rows,).
+        """
+        interval = np.searchsorted(self.points, points) - 1
+        steps, slot = points - self.points[interval], _places(interval)
+
+        def add(r: int, costate: Array) -> None:
+            here = np.flatnonzero(steps == r)
+            costate[interval[here], slot[here], self.speed.start + generators[here]] += 1.0
+
+        count = int(slot.max(initial=-1)) + 1
+        rows = self._costates(count, add)
+        return LocalRows(
+            interval, rows.x[interval, slot], rows.start[interval, slot], rows.end[interval, slot]
+        )
+
+    def slack_rows(self, first: Indices) -> LocalRows:
+        """Sums of δP_s over stretches of grid points, as rows in the variables of their intervals.
+
+        Args:
+            first: first grid point of each stretch, strictly increasing, shape (n_rows,); a stretch ends
+                where the next one starts. All knots but the last start one: the last is the last stretch's.
+        """
+        interval = np.searchsorted(self.points[:-1], first, side="right") - 1
+        ends, slot = np.append(first[1:], len(self.omega)), _places(interval)
+        begin, end = first - self.points[interval], ends - self.points[interval]
+
+        def add(r: int, costate: Array) -> None:
+            here = np.flatnonzero((begin <= r) & (r < end))
+            costate[interval[here], slot[here]] += self.slack[interval[here]]
+
+        rows = self._costates(int(slot.max()) + 1, add)
+        return LocalRows(
+            interval, rows.x[interval, slot], rows.start[interval, slot], rows.end[interval, slot]
+        )
+
+    def adjoint(self, on_omega: Array, on_slack: Array) -> Array:
+        """Gradient with respect to u of Σ on_omega · ω + on_slack · P_s over all grid points.
+
+        Args:
+            on_omega: weights, shape (n_points, n_gen).
+            on_slack: weights, shape (n_points,).
+
+        Returns:
+            Shape (n_knots, n_gen).
+        """
+        n_gen, length = self.p_gen.shape[1], self.lengths
+
+        def add(r: int, costate: Array) -> None:
+            # The point at a knot belongs to the interval after it.
+            here = np.flatnonzero((r < length) | ((r == length) & (self.points[1:] == self.points[-1])))
+            at = self.points[here] + r
+            costate[here, 0, self.speed] += on_omega[at]
+            costate[here, 0] += on_slack[at, None] * self.slack[here]
+
+        rows = self._costates(1, add)
+        gradient = np.zeros((len(self.points), n_gen))
+        gradient[:-1] += rows.start[:, 0]
+        gradient[1:] += rows.end[:, 0]
+        costate = np.zeros(self.slack.shape[1])
+        for j in range(len(length) - 1, -1, -1):
+            through, slope = costate @ self.across.g[j], costate @ self.across.h[j] / length[j]
+            gradient[j] += through - slope
+            gradient[j + 1] += slope
+            costate = rows.x[j, 0] + costate @ self.across.f[j]
+        return gradient
+
+    def _costates(self, n_rows: int, add: Callable[[int, Array], None]) -> LocalRows:
+        """The adjoint recursion through all intervals at once, `n_rows` weighted sums in each.
+
+        Args:
+            n_rows: sums per interval.
+            add: called with a number of steps r from the intervals' starts, and the costates there, shape
+                (n_intervals, n_rows, n_state), to which it adds the weights of δx at that point.
+        """
+        (n, n_state), n_gen = self.slack.shape, self.p_gen.shape[1]
+        f, g, h = self.step
+        costate = np.zeros((n, n_rows, n_state))
+        on_start, on_slope = np.zeros((2, n, n_rows, n_gen))
+        for r in range(int(self.lengths.max()), -1, -1):
+            add(r, costate)
+            if r:
+                through = costate @ g
+                on_start += through
+                on_slope += (r - 1) * through + costate @ h
+                costate = costate @ f
+        end = on_slope / self.lengths[:, None, None]
+        return LocalRows(np.arange(n), costate, on_start - end, end)
+
+
+def _places(interval: Indices) -> Indices:
+    """How many earlier entries are equal, shape (n,)."""
+    order = np.argsort(interval, kind="stable")
+    ordered = interval[order]
+    places = np.empty_like(interval)
+    places[order] = np.arange(len(interval)) - np.searchsorted(ordered, ordered)
+    return places
+
+
+def linearise_along(case: Case, trajectory: Trajectory, points: Indices) -> TrajectoryModel:
+    """Linearise along a simulated trajectory.
+
+    Args:
+        case: the grid.
+        trajectory: what `truth.simulate` says about one schedule.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+    """
+    network = Network(case)
+    middle = trajectory.theta[(points[:-1] + points[1:]) // 2]
+    stiffness = np.stack([network.linearise(theta).stiffness for theta in middle])
+    return time_varying(trajectory, points, stiffness, -stiffness.sum(axis=1), network.m, network.d)
+
+
+def time_varying(
+    trajectory: Trajectory, points: Indices, stiffness: Array, slack: Array, m: Array, d: Array
+) -> TrajectoryModel:
+    """The linear model around a trajectory with one stiffness for each interval between knots.
+
+    Args:
+        trajectory: the reference.
+        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        stiffness: change of the generators' electrical powers by their angles, shape
+            (n_intervals, n_gen, n_gen), pu/rad.
+        slack: of the slack's power likewise, shape (n_intervals, n_gen), pu/rad.
+        m: inertia, shape (n_gen,), s² pu/rad.
+        d: damping, shape (n_gen,), s pu/rad.
+    """
+    dt_s = float(trajectory.t[1] - trajectory.t[0])
+    step, n_gen = _one_step(stiffness / m[:, None], d / m, 1.0 / m, dt_s), len(m)
+    lengths = np.diff(points)
+    across = Hold(*(np.empty_like(part) for part in step))
+    for length in np.unique(lengths):
+        chosen = np.flatnonzero(lengths == length)
+        for whole, part in zip(across, repeated(step.take(chosen), int(length)), strict=True):
+            whole[chosen] = part
+    return TrajectoryModel(
+        points=points,
+        step=step,
+        across=across,
+        speed=slice(n_gen, 2 * n_gen),
+        slack=np.concatenate([slack, np.zeros((len(lengths), n_gen))], axis=1),
+        omega=trajectory.omega,
+        p_slack=trajectory.p_slack,
+        p_gen=trajectory.p_gen[points],
+    )
+
+
+def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hold:
+    """The exact map over one grid step, by the series of the matrix exponential.
+
+    With A the system's matrix and φ_2 = Σ (A dt)^i / (i + 2)!, it is f = I + A dt φ_1, g = dt φ_1 B and
+    h = dt φ_2 B, where φ_1 = I + A dt φ_2.
+
+    Args:
+        stiffness: M⁻¹ S, shape (n_maps, n_gen, n_gen), 1/s².
+        damping: M⁻¹ D, shape (n_gen,), 1/s.
+        gain: M⁻¹, shape (n_gen,).
+        dt_s: grid step, s.
+    """
+    n_maps, n, _ = stiffness.shape
+    eye = np.broadcast_to(np.eye(2 * n), (n_maps, 2 * n, 2 * n))
+
+    def derivative(value: Array) -> Array:
+        angle, speed = value[:, :n], value[:, n:]
+        rate = -(stiffness @ angle) - damping[:, None] * speed
+        return np.concatenate([speed, rate], axis=1) * dt_s
+
+    # |A dt| of (θ, ω / ω_fastest), in which the matrix is balanced.
+    size = dt_s * (np.sqrt(np.abs(stiffness).sum(axis=2).max()) + damping.max())
+    term, total, degree = eye / 2.0, eye / 2.0, 0
+    remainder = 1.0
+    while remainder > SERIES_END:
+        degree += 1
+        term = derivative(term) / (degree + 2)
+        total = total + term
+        remainder *= size / degree
+    first = eye + derivative(total)
+    one = eye + derivative(first)
+    return Hold(one, dt_s * first[:, :, n:] * gain, dt_s * total[:, :, n:] * gain)
+
+
+def repeated(step: Hold, times: int) -> Hold:
+    """A map over several steps, from maps over 1, 2, 4, ... steps."""
+    total: Hold | None = None
+    done, length = 0, 1
+    while True:
+        if times & length:
+            total = step if total is None else total.then(step, done)
+            done += length
+        if done == times:
+            assert total is not None
+            return total
+        step, length = step.then(step, length), 2 * length

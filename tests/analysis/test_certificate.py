@@ -1,0 +1,170 @@
+"""The certificate: its bounds, what counts as a success, resuming."""
+
+from __future__ import annotations
+
+import collections
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binom
+
+from ded_bench.analysis import certificate
+from ded_bench.analysis.certificate import (
+    ROWS,
+    Criteria,
+    certify,
+    clopper_pearson,
+    gaps,
+    hoeffding,
+    judge,
+    meets_limits,
+    read_rows,
+)
+from ded_bench.files.errors import InputError
+from ded_bench.methods.registry import METHODS, Method
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instance
+from ded_bench.plants.score import score
+
+SETTINGS = Settings()
+
+
+@pytest.mark.parametrize(("successes", "count"), [(1, 1), (7, 10), (995, 1000), (9950, 10_000)])
+def test_clopper_pearson_is_the_exact_bound(successes: int, count: int) -> None:
+    """At the bound, so many successes or more have exactly the probability δ."""
+    for delta in (0.01, 0.2):
+        p = clopper_pearson(successes, count, delta)
+        assert binom.sf(successes - 1, count, p) == pytest.approx(delta, rel=1e-6)
+        assert hoeffding(successes, count, delta) < p < successes / count
+
+
+def test_bounds_in_closed_form() -> None:
+    assert clopper_pearson(100, 100, 0.01) == pytest.approx(0.01 ** (1 / 100))
+    assert clopper_pearson(0, 100, 0.01) == 0.0
+    assert hoeffding(90, 100, 0.01) == pytest.approx(0.9 - np.sqrt(np.log(100) / 200))
+    assert hoeffding(1, 100, 0.01) == 0.0
+    for wrong in ((5, 4, 0.01), (-1, 4, 0.01), (0, 0, 0.01), (1, 4, 0.0), (1, 4, 1.0)):
+        with pytest.raises(ValueError, match="successes"):
+            clopper_pearson(*wrong)
+        with pytest.raises(ValueError, match="successes"):
+            hoeffding(*wrong)
+
+
+def test_clopper_pearson_covers_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    p, count, delta = 0.9, 200, 0.1
+    wrong = np.mean([clopper_pearson(s, count, delta) > p for s in rng.binomial(count, p, 2000)])
+    assert 0.04 < wrong <= 0.1 + 3 * np.sqrt(0.09 / 2000)
+
+
+def test_what_counts() -> None:
+    rows = pd.DataFrame(
+        {
+            "objective": [101.0, 103.0, np.nan, 100.0],
+            "reference": [100.0, 100.0, 100.0, np.nan],
+            "freq_violation_hz": [0.0, 2e-6, np.nan, 0.0],
+            "ramp_violation": [0.0, 0.0, np.nan, 0.0],
+            "bound_violation": [0.0, 0.0, np.nan, 1e-7],
+            "initial_violation": [0.0, 0.0, np.nan, 0.0],
+        }
+    )
+    assert (gaps(rows) <= 2.0).tolist() == [True, False, False, False]
+    assert meets_limits(rows, 1e-6, 1e-8).tolist() == [True, False, False, False]
+    assert meets_limits(rows, 1e-5, 1e-6).tolist() == [True, True, False, True]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Two methods that hold P_0 and note each instance they are asked about."""
+    log = tmp_path / "log"
+    log.touch()
+    monkeypatch.setenv("STRANGE_LOG", str(log))
+    for name in ("ded-dpc-paper", "ded"):
+        monkeypatch.setitem(METHODS, name, Method(name, "tests.strange_methods", name))
+    monkeypatch.setattr(certificate, "CHUNK", 2)
+    certificate._prepared.cache_clear()
+    yield lambda: collections.Counter(log.read_text().split())
+    certificate._prepared.cache_clear()
+
+
+def run(case: Case, file: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:
+    chosen = Criteria("ded", **criteria)
+    return certify(case, "ded-dpc-paper", regime, SETTINGS, file, chosen, count=4, seed=seed)
+
+
+def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case, tmp_path: Path) -> None:
+    loose = max(threebus.regimes, key=threebus.omega_bound)
+    result = run(threebus, tmp_path / "rows.csv", loose)
+    rows = ROWS.frame(read_rows(tmp_path / "rows.csv"))
+    assert rows["index"].tolist() == [0, 1, 2, 3]
+    assert (rows["objective"] == rows["reference"]).all()  # the same schedules
+    verdicts = []
+    for i, objective in enumerate(rows["objective"]):
+        instance = sample_instance(threebus, CERTIFICATE_SEED, i)
+        power = instance.p_initial(threebus)
+        schedule = certificate.Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power]))
+        verdicts.append(score(threebus, instance, schedule, loose))
+        assert verdicts[-1].objective == pytest.approx(objective, rel=1e-9)
+    assert result.meets_limits == result.successes == sum(v.feasible_strict for v in verdicts)
+    assert result.near_reference == 4
+    assert result.seed == CERTIFICATE_SEED
+    assert result.clopper_pearson == clopper_pearson(result.successes, 4, 0.01)
+    assert f"{result.successes} of 4" in result.sentence
+    assert set(calls().values()) == {2}
+
+
+def test_an_interrupted_certificate_goes_on(
+    calls, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, regime = tmp_path / "rows.csv", next(iter(threebus.regimes))
+    with monkeypatch.context() as patch:
+
+        def stop(*call):
+            if 2 in call[-1]:
+                raise KeyboardInterrupt
+            return judge(*call)
+
+        patch.setattr(certificate, "judge", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(threebus, file, regime)
+    assert len(read_rows(file)) == 2
+    first = run(threebus, file, regime)
+    assert set(calls().values()) == {2}  # once by each method: nothing was done twice
+    again = run(threebus, file, regime)
+    assert again.model_copy(update={"date": first.date}) == first
+    assert set(calls().values()) == {2}
+    run(threebus, file, regime, seed=1)  # other instances: rows of these do not count
+    assert sum(calls().values()) == 16
+    with monkeypatch.context() as patch:
+        patch.setattr(certificate, "code_of", lambda module: "another scorer")
+        again = run(threebus, file, regime, seed=1)
+    assert again.score_code == "another scorer"
+    assert sum(calls().values()) == 24  # rows of other code do not count either
+
+
+def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkeypatch) -> None:
+    regime = max(threebus.regimes, key=threebus.omega_bound)
+    plain = certificate.sample_instances
+
+    def renamed(case, master, count, first, servable):
+        for instance in plain(case, master, count, first, servable):
+            name = {0: "raise", 1: "apart"}.get(first, "calm")
+            yield instance.model_copy(update={"id": f"{name}-{first}"})
+
+    monkeypatch.setattr(certificate, "sample_instances", renamed)
+    result = run(threebus, tmp_path / "rows.csv", regime, tolerance_hz=1.0)
+    lost = [row.objective is None for row in read_rows(tmp_path / "rows.csv")]
+    assert lost == [True, True, False, False]
+    assert result.successes == result.meets_limits == result.near_reference == 2
+
+
+def test_wrong_files_and_regimes_are_named(calls, threebus: Case, tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    file.write_text("index,gap\n0,1.0\n")
+    with pytest.raises(InputError, match=r"rows\.csv"):
+        run(threebus, file, next(iter(threebus.regimes)))
+    with pytest.raises(InputError, match="regime"):
+        run(threebus, tmp_path / "other.csv", "no such")

@@ -1,0 +1,126 @@
+"""The check of a case: closed forms on the chain, the scorer's own frequencies, and the command around it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ded_bench.cli import main
+from ded_bench.analysis.inspect_case import check_case, suggested_knots
+from ded_bench.files.strict import write_record
+from ded_bench.methods import ed
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.sampling import VALIDATION_SEED, load_split, sample_instances
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
+
+
+def test_the_chain_has_the_mode_of_a_spring_and_a_mass(threebus: Case) -> None:
+    """Lines in series have stiffness b₁b₂/(b₁ + b₂) with b cos δ; ω² = k/m, damping ratio d/(2mω)."""
+    found = check_case(threebus, 1)
+    v = {bus.id: bus.v for bus in threebus.buses}
+    b_slack = v["s"] * v["town"] / abs(complex(0.01, 0.12))
+    b_plant = v["plant"] * v["town"] / 0.1
+    across = np.arcsin([0.4 / b_slack, 0.6 / b_plant])
+    k_slack, k_plant = np.array([b_slack, b_plant]) * np.cos(across)
+    omega = np.sqrt(k_slack * k_plant / (k_slack + k_plant) / 2.0)
+    assert found.frequency_hz == pytest.approx([omega / (2 * np.pi)], rel=1e-9)
+    assert found.damping == pytest.approx([1.2 / (2 * 2.0 * omega)], rel=1e-9)
+    assert found.angle_deg == pytest.approx(np.degrees(across.max()), rel=1e-9)
+    assert found.p_slack == pytest.approx(0.4)
+
+
+def test_static_dispatch_violates_where_the_scorer_says_so(case: Case) -> None:
+    found = check_case(case, 6)
+    assert (found.drawn, found.served, found.redrawn_loads) == (6, 6, 0)
+    assert len(found.peak_hz) == 6
+    regime = min(case.regimes, key=case.omega_bound)
+    bound = case.regimes[regime].omega_hz
+    scores = [
+        score(case, instance, ed.dispatch(case, instance, 60.0), regime)
+        for instance in sample_instances(case, VALIDATION_SEED, 6)
+    ]
+    beyond = np.sort([s.freq_violation_hz for s in scores])
+    np.testing.assert_allclose(np.maximum(found.peak_hz - bound, 0.0), beyond, atol=1e-12)
+    assert found.violating(bound) == np.mean(beyond > 0)
+    assert found.violating(found.peak_hz[2]) == 0.5
+    assert found.violating(np.inf) == 0.0
+
+
+def test_draws_that_cannot_be_served_or_collapse_are_counted(threebus: Case, alter) -> None:
+    lines = json.loads(threebus.model_dump_json(by_alias=True))["lines"]
+    weak = alter(threebus, lines=[line | {"r": 0.0, "x": 1.45} for line in lines])
+    found = check_case(weak, 40)
+    assert 0 < found.served < 40
+    assert len(found.peak_hz) == found.served
+    ranges = json.loads(threebus.model_dump_json(by_alias=True))["sampling"]
+    wild = alter(threebus, sampling=ranges | {"omega_rad_per_s": [20.0, 30.0]})
+    assert np.isinf(check_case(wild, 2).peak_hz).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("name", sorted(p.parent.name for p in SHIPPED_CASES.glob("*/case.json")))
+def test_shipped_cases_have_the_suggested_knots(name: str) -> None:
+    """But for two, whose reasons docs/grids.md gives: the paper's 50 on 9 buses, and fewer on 140."""
+    case = Case.load(name)
+    network = Network(case)
+    modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
+    fastest = float(np.abs(modes).max() / (2 * np.pi))
+    knots = suggested_knots(case, fastest)
+    assert knots == {"9bus": 25, "140bus": 241}.get(name, case.n_knots)
+    spacing = np.diff(case.knot_times(60.0)) / case.sampling.dt_s
+    if case.knots:
+        np.testing.assert_allclose(spacing, np.round(spacing), atol=1e-9)
+        assert name == "140bus" or spacing.max() * case.sampling.dt_s <= 2 / 3 / fastest
+
+
+@pytest.mark.parametrize(("fastest", "knots"), [(1e-9, 2), (1.0, 11), (2.0, 21), (1e9, 601)])
+def test_knots_lie_on_the_grid_however_fast_the_mode(threebus: Case, fastest: float, knots: int) -> None:
+    """Spacings of 6, 0.6, 0.3 and 0.01 s are the longest that divide 6 s and are short enough."""
+    assert suggested_knots(threebus, fastest) == knots
+
+
+def test_the_command_lists_the_shipped_cases(capsys) -> None:
+    assert main(["cases"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == ["case", "buses", "generators", "loads", "instances", "version"]
+    assert lines[1][:5] == ["9bus", "9", "2", "3", "400+100"]
+    assert lines[1][5] == json.loads((SHIPPED_CASES / "9bus" / "MANIFEST.json").read_text())["version"]
+    assert {line[0] for line in lines[1:6]} == {p.parent.name for p in SHIPPED_CASES.glob("*/case.json")}
+
+
+def test_the_command_checks_a_case(threebus: Case, alter, tmp_path: Path, capsys) -> None:
+    """Exit code 0; 1 where the grid cannot work; 2 where the file is wrong."""
+    write_record(threebus, tmp_path / "good" / "case.json")
+    assert main(["cases", str(tmp_path / "good"), "--count", "3"]) == 0
+    printed = capsys.readouterr().out
+    found = check_case(threebus, 3)
+    assert f"{found.frequency_hz[0]:.3f}" in printed
+    assert f"{found.peak_hz[-1]:.4g}" in printed
+    assert "3 of 3 servable" in printed
+    lines = json.loads(threebus.model_dump_json(by_alias=True))["lines"]
+    for name, x, problem in (("dead", 100.0, "nominal powers"), ("weak", 1.65, "no instance can be served")):
+        write_record(alter(threebus, lines=[e | {"x": x} for e in lines]), tmp_path / name / "case.json")
+        assert main(["cases", str(tmp_path / name), "--count", "3"]) == 1
+        assert problem in capsys.readouterr().err
+    assert main(["cases", str(tmp_path / "nowhere")]) == 2
+    assert "no such case" in capsys.readouterr().err
+
+
+def test_instances_are_drawn_as_many_as_before(threebus: Case, tmp_path: Path) -> None:
+    """Without options, a split that is there says how many, how many for testing, and from which seed."""
+    write_record(threebus, tmp_path / "case.json")
+    command = ["instances", "--case", str(tmp_path)]
+    assert main([*command, "--count", "7", "--test", "3", "--seed", "11"]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
+    assert len(load_split(tmp_path).test) == 3
+    assert main(command) == 0
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
+    assert main([*command, "--count", "10"]) == 2  # it would replace what is there
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
+    assert main([*command, "--count", "10", "--force"]) == 0
+    split = load_split(tmp_path)
+    assert (len(split.train), len(split.test), split.seed) == (8, 2, 11)
+    assert main([*command, "--count", "2", "--test", "3"]) == 2

@@ -1,0 +1,316 @@
+"""Gaps, rates and profiles, on small tables with answers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ded_bench.analysis.summary import (
+    TIME_SHIFT_S,
+    benchmark_rows,
+    claims,
+    coverage,
+    gaps,
+    groups,
+    judged_rows,
+    performance_profile,
+    scoring_rows,
+    shifted_geometric_mean,
+    summary,
+    table_times,
+    timed_rows,
+    title,
+    tradeoff,
+    validation_rows,
+    worst,
+)
+from ded_bench.methods.registry import METHODS
+from ded_bench.results.rows import Results, Row
+
+DED = ("ded", "default")
+NO_TIMES = pd.DataFrame([], columns=["regime", "method", "settings", "solve_s", "failures"])
+
+
+def row(instance: str, method: str, objective: float | None = None, **fields: object) -> Row:
+    """A scored, feasible row unless the fields say otherwise; no objective: a failure."""
+    scored = objective is not None
+    facts: dict[str, object] = {
+        "split": "test",
+        "regime": "TO",
+        "settings": "default",
+        "status": "Optimal" if scored else "Failed",
+        "solve_s": 1.0,
+        "objective": objective,
+        "freq_violation_hz": 0.0 if scored else None,
+        "ramp_violation": 0.0 if scored else None,
+        "bound_violation": 0.0 if scored else None,
+        "initial_violation": 0.0 if scored else None,
+        "feasible": True if scored else None,
+        "feasible_strict": True if scored else None,
+    }
+    return Row(instance=instance, method=method, **(facts | fields))  # type: ignore[arg-type]
+
+
+def frame_of(*rows: Row) -> pd.DataFrame:
+    """A results frame, as `Results.frame` gives it."""
+    results = Results(Path("nowhere"))
+    results.rows = {r.key: r for r in rows}
+    return results.frame()
+
+
+def with_gaps(frame: pd.DataFrame, reference: tuple[str, str] = DED) -> pd.DataFrame:
+    """Rows with their gaps to a method's rows in the same table."""
+    own = frame[(frame["method"] == reference[0]) & (frame["settings"] == reference[1])]
+    return gaps(frame, own.set_index(["instance", "regime"])["objective"])
+
+
+@pytest.fixture
+def table() -> pd.DataFrame:
+    """Four instances; ded-ko has gaps 1, -1 and 4 %, one failure, and one row without DED."""
+    return frame_of(
+        row("a", "ded", 100.0),
+        row("b", "ded", 200.0),
+        row("c", "ded", 1000.0),
+        row("d", "ded"),
+        row("e", "ded", 50.0),
+        row("a", "ded-ko", 101.0, freq_violation_hz=2e-4, feasible=False, feasible_strict=False),
+        row("b", "ded-ko", 198.0, freq_violation_hz=1e-5, feasible_strict=False),
+        row("c", "ded-ko", 1040.0),
+        row("d", "ded-ko", 10.0),
+        row("e", "ded-ko", status="TimeLimit"),
+    )
+
+
+def test_gaps_are_signed_percent_of_ded(table: pd.DataFrame) -> None:
+    ours = with_gaps(table).set_index(["method", "instance"])["gap_percent"]
+    assert ours["ded-ko"][["a", "b", "c"]].to_list() == pytest.approx([1.0, -1.0, 4.0])
+    assert math.isnan(ours["ded-ko", "d"])  # DED has no score there
+    assert math.isnan(ours["ded-ko", "e"])  # ded-ko has none
+    assert (ours["ded"].dropna() == 0).all()
+
+
+def test_gaps_compare_within_a_regime_and_with_default_settings_only() -> None:
+    frame = frame_of(
+        row("a", "ded", 100.0, regime="NO"),
+        row("a", "ded", 200.0, regime="TO"),
+        row("a", "ded", 50.0, regime="NO", settings="accelerated"),
+        row("a", "ed", 110.0, regime="NO"),
+        row("a", "ed", 110.0, regime="TO"),
+    )
+    ours = with_gaps(frame).set_index(["method", "settings", "regime"])["gap_percent"]
+    assert ours["ed", "default", "NO"] == pytest.approx(10.0)
+    assert ours["ed", "default", "TO"] == pytest.approx(-45.0)
+    assert ours["ded", "accelerated", "NO"] == pytest.approx(-50.0)
+
+
+def test_no_gap_where_ded_costs_nothing() -> None:
+    frame = frame_of(row("a", "ded", 0.0), row("a", "ed", 1.0))
+    assert with_gaps(frame)["gap_percent"].isna().all()
+    assert summary(with_gaps(frame))["unpaired"].to_list() == [1, 1]
+
+
+def test_gaps_do_not_depend_on_the_order_of_rows(table: pd.DataFrame) -> None:
+    shuffled = table.sample(frac=1.0, random_state=0).reset_index(drop=True)
+    pd.testing.assert_frame_equal(summary(with_gaps(table)), summary(with_gaps(shuffled)))
+
+
+def test_summary_counts_and_spreads(table: pd.DataFrame) -> None:
+    ko = summary(with_gaps(table)).set_index("method").loc["ded-ko"]
+    assert (ko["rows"], ko["n"], ko["failures"], ko["unpaired"]) == (5, 3, 1, 1)
+    assert ko["gap_percent_mean"] == pytest.approx(4 / 3)
+    assert ko["gap_percent_median"] == pytest.approx(1.0)
+    assert ko["gap_percent_max"] == pytest.approx(4.0)
+    assert ko["gap_percent_p95"] == pytest.approx(np.quantile([1, -1, 4], 0.95))
+    assert ko["freq_violation_hz_mean"] == pytest.approx((2e-4 + 1e-5) / 4)
+    assert ko["freq_violation_hz_max"] == pytest.approx(2e-4)
+
+
+def test_ratio_of_summed_costs_weighs_instances_by_cost(table: pd.DataFrame) -> None:
+    """The mean of ratios is 1.0133; of the sums it is 1339 / 1300."""
+    ko = summary(with_gaps(table)).set_index("method").loc["ded-ko"]
+    assert ko["cost_ratio"] == pytest.approx((101 + 198 + 1040) / (100 + 200 + 1000))
+
+
+def test_claims_and_verdicts_are_separate_rates(table: pd.DataFrame) -> None:
+    ko = summary(with_gaps(table)).set_index("method").loc["ded-ko"]
+    assert ko["success_rate"] == pytest.approx(4 / 5)
+    assert ko["correct_rate"] == pytest.approx(3 / 5)
+    assert ko["strict_rate"] == pytest.approx(2 / 5)
+    counts = claims(table).set_index(["method", "status"])
+    assert counts.loc[
+        ("ded-ko", "Optimal"), ["rows", "feasible", "feasible_strict", "infeasible"]
+    ].to_list() == [
+        4,
+        3,
+        2,
+        1,
+    ]
+    assert counts.loc[("ded-ko", "TimeLimit"), "not_scored"] == 1
+    assert counts["rows"].sum() == len(table)
+
+
+@pytest.mark.parametrize(
+    ("status", "rate"),
+    [("Optimal", 1), ("Feasible", 1), ("Policy", 1), ("TimeLimit", 0), ("Failed", 0), ("Infeasible", 0)],
+)
+def test_a_time_limit_is_no_success(status: str, rate: int) -> None:
+    assert summary(with_gaps(frame_of(row("a", "ded", 1.0, status=status))))["success_rate"].to_list() == [
+        rate
+    ]
+
+
+def test_groups_follow_the_registry_with_strangers_last() -> None:
+    names = ["zebra", "aardvark", *reversed(METHODS)]
+    rows = [row("a", name, 1.0) for name in names] + [row("a", "ded", 1.0, settings="accelerated")]
+    order = [(method, settings) for _, method, settings, _ in groups(frame_of(*rows))]
+    registered = [(name, "default") for name in METHODS]
+    assert order == [
+        registered[0],
+        ("ded", "accelerated"),
+        *registered[1:],
+        ("aardvark", "default"),
+        ("zebra", "default"),
+    ]
+
+
+def test_titles_name_settings_other_than_the_default() -> None:
+    assert title("ded") == METHODS["ded"].title
+    assert title("ded", "accelerated") == f"{METHODS['ded'].title} [accelerated]"
+    assert title("mine") == "mine"
+
+
+def test_only_test_rows_count_if_there_are_any() -> None:
+    mixed = frame_of(
+        row("a", "ded", 1.0), row("b", "ded", 2.0, split="train"), row("c", "ed", 3.0, split="none")
+    )
+    assert judged_rows(mixed)["instance"].to_list() == ["a"]
+    others = mixed[mixed["split"] != "test"]
+    assert len(judged_rows(others)) == 2
+
+
+def test_validation_rows_are_never_judged() -> None:
+    rows = [row("v", "ded", 1.0, split="validation"), row("b", "ded", 2.0, split="train")]
+    assert judged_rows(frame_of(*rows))["instance"].to_list() == ["b"]
+    assert judged_rows(frame_of(rows[0])).empty
+    assert validation_rows(frame_of(*rows))["instance"].to_list() == ["v"]
+    assert scoring_rows(frame_of(*rows))["instance"].to_list() == ["b"]
+
+
+def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
+    everything = frame_of(
+        row("a", "ded", 1.0),
+        row("b", "ded", 2.0, split="train", freq_violation_hz=3e-4, feasible=False),
+        row("c", "ded", split="train"),
+        row("a", "ed", 3.0),
+        row("b", "ded", 2.0, split="train", settings="start-ed"),
+    )
+    judged = judged_rows(everything)
+    covered = coverage(summary(with_gaps(everything)), summary(with_gaps(judged)))
+    assert covered[["method", "settings", "rows", "failures"]].to_numpy().tolist() == [
+        ["ded", "default", 3, 1]
+    ]
+    assert covered["correct_rate"].item() == pytest.approx(1 / 3)
+    assert covered["freq_violation_hz_max"].item() == 3e-4
+    assert not len(coverage(summary(with_gaps(judged)), summary(with_gaps(judged))))
+    assert not len(coverage(summary(with_gaps(everything[:0])), summary(with_gaps(everything[:0]))))
+
+
+def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:
+    found = worst(with_gaps(table), count=2)
+    ko = found[found["method"] == "ded-ko"]
+    assert ko[ko["worst_by"] == "gap"]["instance"].to_list() == ["c", "a"]
+    violations = ko[ko["worst_by"] == "violation"]
+    assert violations["instance"].to_list() == ["a"]  # b is within tolerance
+    assert violations["excess"].to_list() == pytest.approx([2.0])  # in units of 1e-4 Hz
+    assert violations["broken"].to_list() == ["frequency"]
+    assert not len(found[found["method"] == "ded"])  # DED has no gap to itself, and breaks no limit here
+
+
+def test_excess_takes_the_limit_broken_most() -> None:
+    frame = frame_of(row("a", "ded", 1.0, freq_violation_hz=1e-5, ramp_violation=3e-6, bound_violation=1e-7))
+    assert worst(with_gaps(frame))[["excess", "broken"]].to_numpy().tolist() == [[pytest.approx(3.0), "ramp"]]
+    assert not len(worst(with_gaps(frame_of(row("a", "ded", 100.0), row("a", "ed", 100.0005)))))  # rounding
+
+
+def test_performance_profile_by_hand() -> None:
+    frame = frame_of(
+        row("a", "ded", 1.0, solve_s=10.0),
+        row("b", "ded", 1.0, solve_s=8.0),
+        row("a", "ded-ko", 1.0, solve_s=5.0),
+        row("b", "ded-ko", 1.0, solve_s=16.0),
+        row("a", "ed", 1.0, solve_s=0.001, feasible=False),
+        row("b", "ed", solve_s=0.001),
+        row("b", "ded-radau", 1.0, solve_s=32.0),
+    )
+    profile = performance_profile(frame, "solve_s")
+    steps = {m: p[["ratio", "fraction"]].to_numpy().tolist() for m, p in profile.groupby("method")}
+    assert steps == {
+        "ded": [[1.0, 0.5], [2.0, 1.0]],
+        "ded-ko": [[1.0, 0.5], [2.0, 1.0]],
+        "ded-radau": [[4.0, 1.0]],  # asked one instance only
+    }  # ed: never feasible
+
+
+def test_rows_take_the_median_of_their_times_alone() -> None:
+    frame = frame_of(row("a", "ded", 1.0, solve_s=99.0), row("b", "ded", 1.0), row("a", "ed", 2.0))
+    cells = [("a", "ded", 1.0), ("a", "ded", 3.0), ("a", "ded", 2.0), ("b", "ded", np.nan), ("x", "ed", 1.0)]
+    calls = pd.DataFrame(cells, columns=["instance", "method", "solve_s"]).assign(
+        regime="TO", settings="default"
+    )
+    timed = timed_rows(frame, calls)
+    assert timed[["instance", "method", "solve_s"]].to_numpy().tolist() == [["a", "ded", 2.0]]
+    assert timed_rows(frame, calls[:0]).empty
+
+
+def test_performance_profile_counts_failures_as_never_solved(table: pd.DataFrame) -> None:
+    profile = performance_profile(table, "objective")
+    assert (profile["ratio"] >= 1).all()
+    top = profile.groupby("method")["fraction"].max()
+    assert top["ded"] == pytest.approx(4 / 5)
+    assert top["ded-ko"] == pytest.approx(3 / 5)
+
+
+def test_shifted_geometric_mean() -> None:
+    assert shifted_geometric_mean(np.array([3.0, 3.0, 3.0])) == pytest.approx(3.0)
+    assert shifted_geometric_mean(np.array([1.0, 100.0]), shift=0.0) == pytest.approx(10.0)
+    by_hand = math.sqrt((1 + TIME_SHIFT_S) * (100 + TIME_SHIFT_S)) - TIME_SHIFT_S
+    assert shifted_geometric_mean(np.array([1.0, 100.0])) == pytest.approx(by_hand)
+    assert math.isnan(shifted_geometric_mean(np.array([])))
+
+
+def test_table_times_are_quartiles_and_say_how_many_workers() -> None:
+    rows = [row(name, "ded", 1.0, solve_s=float(i), workers=2) for i, name in enumerate("abcde")]
+    times = table_times(frame_of(*rows)).iloc[0]
+    assert (times["solve_s_q1"], times["solve_s"], times["solve_s_q3"]) == (1.0, 2.0, 3.0)
+    assert (times["n"], times["workers"]) == (5, "2")
+    assert math.isnan(times["build_s"])
+
+
+def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
+    points = tradeoff(
+        with_gaps(table), pd.DataFrame([["TO", "ded-ko", "default", 0.25, 0]], columns=NO_TIMES.columns)
+    ).set_index("method")
+    assert points.loc["ded-ko", "seconds"] == 0.25
+    assert points.loc["ded-ko", "alone"]
+    assert points.loc["ded", "seconds"] == 1.0
+    assert not points.loc["ded", "alone"]
+
+
+def test_an_empty_table_has_its_columns() -> None:
+    empty = with_gaps(frame_of())
+    for made in (summary(empty), claims(empty), table_times(empty), worst(empty), tradeoff(empty, NO_TIMES)):
+        assert len(made) == 0
+        assert {"regime", "method", "settings", "title"} <= set(made.columns)
+    assert len(performance_profile(empty, "solve_s")) == 0
+
+
+def test_plans_for_the_ac_network_stand_in_its_table_only() -> None:
+    """They solve another problem: here their violations are no failure of theirs."""
+    settings = ["default", "default-trajectory", "ac", "swing-ac", "default-trajectory-ac"]
+    frame = pd.DataFrame({"settings": settings, "split": "test"})
+    assert judged_rows(frame)["settings"].tolist() == settings[:2]
+    assert benchmark_rows(frame)["settings"].tolist() == settings

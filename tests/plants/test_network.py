@@ -1,0 +1,324 @@
+"""Power flow, load angles and linearisation: known numbers, closed forms, finite differences, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.sampling import sample_instances
+from ded_bench.plants.lossless.network import MISMATCH, Network, PowerFlowError, check_servable
+
+
+@pytest.fixture(scope="module")
+def network(case) -> Network:
+    """The network of each case."""
+    return Network(case)
+
+
+@pytest.fixture(scope="module")
+def chain(threebus):
+    """Couplings a (slack - load) and b (load - generator) of the chain, by hand."""
+    assert [bus.id for bus in threebus.buses] == ["town", "s", "plant"]
+    return 1.02 / abs(0.01 + 0.12j), 1.03 / 0.1
+
+
+def random_powers(case, n: int, seed: int = 0):
+    """Generator powers within their limits and loads within half of nominal to either side."""
+    rng = np.random.default_rng(seed)
+    p_gen = rng.uniform(case.p_min, case.p_max, (n, len(case.generators)))
+    p_load = case.load_nominal * rng.uniform(0.5, 1.5, (n, len(case.loads)))
+    return p_gen, p_load
+
+
+# Known numbers of the 9-bus case at nominal power, given to 4 digits.
+
+
+def test_ninebus_angles_and_slack_power(ninebus):
+    """Angles at buses s, 2..9 in rad and P_s in pu, as documented."""
+    network = Network(ninebus)
+    theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
+    known = [0, 0.1705, 0.0889, -0.0371, -0.0637, 0.0403, 0.0161, 0.0709, -0.0695]
+    np.testing.assert_allclose(theta, known, rtol=0, atol=0.5e-4)
+    assert network.injections(theta)[network.slack] == pytest.approx(0.67, abs=1e-12)
+
+
+def test_ninebus_modes(ninebus):
+    """Two damped pairs in rad/s, as documented."""
+    network = Network(ninebus)
+    theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
+    modes = sorted(network.linearise(theta).modes(), key=lambda mode: (mode.imag, mode.real))
+    known = [-0.1722 - 1.4285j, -0.1892 - 0.6636j, -0.1892 + 0.6636j, -0.1722 + 1.4285j]
+    np.testing.assert_allclose(np.real(modes), np.real(known), rtol=0, atol=0.5e-4)
+    np.testing.assert_allclose(np.imag(modes), np.imag(known), rtol=0, atol=0.5e-4)
+
+
+def test_ninebus_slack_answers_a_load_step_at_once(ninebus):
+    """Shares .53, .14 and .53 of a step at loads 5, 7 and 9: δP_s = -share · δL, L being an injection."""
+    network = Network(ninebus)
+    theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
+    np.testing.assert_allclose(-network.linearise(theta).slack_share, [0.53, 0.14, 0.53], rtol=0, atol=5e-3)
+
+
+# Closed forms of the three-bus chain.
+
+
+def test_chain_power_flow(threebus, chain):
+    """θ_load = asin((P + L)/a), θ_gen - θ_load = asin(P/b), P_s = -(P + L)."""
+    a, b = chain
+    network = Network(threebus)
+    p_gen, p_load = random_powers(threebus, 200)
+    theta = network.power_flow(p_gen, p_load)
+    town = np.arcsin((p_gen[:, 0] + p_load[:, 0]) / a)
+    plant = town + np.arcsin(p_gen[:, 0] / b)
+    np.testing.assert_allclose(theta, np.stack([town, 0 * town, plant], axis=1), rtol=0, atol=1e-12)
+    p_slack = network.injections(theta)[:, network.slack]
+    np.testing.assert_allclose(p_slack, -(p_gen + p_load)[:, 0], rtol=0, atol=1e-11)
+
+
+def test_chain_load_angle(threebus, chain):
+    """a sin x + b sin(x - θ_g) = L is A sin(x - φ) = L with A cos φ = a + b cos θ_g, A sin φ = b sin θ_g."""
+    a, b = chain
+    network = Network(threebus)
+    rng = np.random.default_rng(1)
+    theta_gen, load = rng.uniform(-1.5, 1.5, 300), rng.uniform(-3, 3, 300)
+    guess = np.stack([np.zeros(300), np.zeros(300), theta_gen], axis=1)
+    theta, f = network.solve_loads(guess, network.load_injections(load[:, None]))
+    np.testing.assert_array_equal(f, network.injections(theta))
+    amplitude = np.hypot(a + b * np.cos(theta_gen), b * np.sin(theta_gen))
+    phi = np.arctan2(b * np.sin(theta_gen), a + b * np.cos(theta_gen))
+    np.testing.assert_allclose(theta[:, 0], phi + np.arcsin(load / amplitude), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(theta[:, 1:], guess[:, 1:])
+
+
+def test_chain_linearisation(threebus, chain):
+    """Two springs in series: stiffness c_a c_b / (c_a + c_b), shares -c_b and -c_a over c_a + c_b."""
+    a, b = chain
+    network = Network(threebus)
+    for p_gen, p_load in zip(*random_powers(threebus, 20), strict=True):
+        theta = network.power_flow(p_gen, p_load)
+        linear = network.linearise(theta)
+        c_a, c_b = a * np.cos(theta[0]), b * np.cos(theta[2] - theta[0])
+        stiffness = c_a * c_b / (c_a + c_b)
+        assert linear.stiffness == pytest.approx(stiffness, rel=1e-12)
+        assert linear.share == pytest.approx(-c_b / (c_a + c_b), rel=1e-12)
+        assert linear.slack_share == pytest.approx(-c_a / (c_a + c_b), rel=1e-12)
+        roots = np.roots([2.0, 1.2, stiffness])  # m λ² + d λ + k = 0
+        np.testing.assert_allclose(np.sort(linear.modes()), np.sort(roots), rtol=1e-12)
+
+
+# Properties that hold on every case.
+
+
+def test_injections_sum_to_zero(network):
+    """Lines are lossless: whatever the angles, what goes in comes out."""
+    theta = np.random.default_rng(2).uniform(-np.pi, np.pi, (50, 4, network.n_bus))
+    f = network.injections(theta)
+    assert f.shape == theta.shape
+    assert np.abs(f.sum(axis=-1)).max() < 1e-13 * network.coupling.sum()
+
+
+def test_injections_are_the_papers_double_sum(case, network):
+    """f_i = Σ_j b_ij sin(θ_i - θ_j), term by term from the case's lines."""
+    theta = np.random.default_rng(3).uniform(-1, 1, network.n_bus)
+    voltage = {bus.id: bus.v for bus in case.buses}
+    angle = dict(zip(voltage, theta.tolist(), strict=True))
+    for i, bus in enumerate(case.buses):
+        total = 0.0
+        for line in case.lines:
+            if bus.id in (line.from_bus, line.to_bus):
+                other = line.to_bus if bus.id == line.from_bus else line.from_bus
+                coupling = voltage[bus.id] * voltage[other] / np.sqrt(line.r**2 + line.x**2)
+                total += coupling * np.sin(angle[bus.id] - angle[other])
+        assert network.injections(theta)[i] == pytest.approx(total, rel=1e-12, abs=1e-12)
+
+
+def test_power_flow_satisfies_its_equations(case, network):
+    """Every bus injects what it should, the slack what is left; angles relative to the slack."""
+    p_gen, p_load = random_powers(case, 200)
+    theta = network.power_flow(p_gen, p_load)
+    f = network.injections(theta)
+    np.testing.assert_allclose(f[:, network.generators], p_gen, rtol=0, atol=MISMATCH)
+    np.testing.assert_allclose(f[:, network.loads], p_load, rtol=0, atol=MISMATCH)
+    junctions = sorted(set(network.algebraic) - set(network.loads))
+    assert len(junctions) == [bus.kind for bus in case.buses].count("junction")
+    assert np.abs(f[:, junctions]).max(initial=0.0) < MISMATCH
+    balance = -p_gen.sum(axis=-1) - p_load.sum(axis=-1)
+    np.testing.assert_allclose(f[:, network.slack], balance, rtol=0, atol=network.n_bus * MISMATCH)
+    np.testing.assert_array_equal(theta[:, network.slack], 0.0)
+
+
+def test_load_angles_satisfy_their_equations(case, network):
+    """With generator angles given, loads draw their power and junctions pass theirs on."""
+    p_gen, p_load = random_powers(case, 100)
+    guess = network.power_flow(p_gen, p_load)
+    guess[:, network.generators] += np.random.default_rng(4).uniform(-0.3, 0.3, p_gen.shape)
+    wanted = network.load_injections(0.8 * p_load)
+    theta, _ = network.solve_loads(guess, wanted)
+    np.testing.assert_allclose(network.injections(theta)[:, network.algebraic], wanted, rtol=0, atol=MISMATCH)
+    fixed = [network.slack, *network.generators]
+    np.testing.assert_array_equal(theta[:, fixed], guess[:, fixed])
+
+
+def test_batches_equal_one_by_one(case, network):
+    """Leading dimensions broadcast and do not mix."""
+    p_gen, p_load = random_powers(case, 6)
+    batch = network.power_flow(p_gen.reshape(2, 3, -1), p_load.reshape(2, 3, -1)).reshape(6, -1)
+    one_by_one = [network.power_flow(g, load) for g, load in zip(p_gen, p_load, strict=True)]
+    np.testing.assert_allclose(batch, one_by_one, rtol=0, atol=1e-12)
+    mixed = network.power_flow(p_gen[0], p_load)
+    np.testing.assert_allclose(mixed[4], network.power_flow(p_gen[0], p_load[4]), rtol=0, atol=1e-12)
+
+
+def test_initial_angles_serve_initial_power_and_loads(case, network):
+    """The state at t_0 is an equilibrium of P_0 and the loads before any ramp."""
+    for instance in sample_instances(case, 21, 20):
+        f = network.injections(network.initial_angles(instance))
+        np.testing.assert_allclose(f[network.generators], instance.p_initial(case), rtol=0, atol=1e-11)
+        initial = [instance.load[bus].initial for bus in case.loads]
+        np.testing.assert_allclose(f[network.loads], initial, rtol=0, atol=1e-11)
+
+
+def test_linearisation_matches_finite_differences(case, network):
+    """Central differences of the nonlinear functions with load angles eliminated by Newton.
+
+    Step h = 1e-4 rad or pu: truncation of order h² ~ 1e-8 times third derivatives, rounding about
+    1e-12/h ~ 1e-8; hence 1e-6.
+    """
+    h = 1e-4
+    for p_gen, p_load in zip(*random_powers(case, 5), strict=True):
+        theta = network.power_flow(p_gen, p_load)
+        linear = network.linearise(theta)
+
+        def f_at(
+            gen: np.ndarray, load: np.ndarray, theta: np.ndarray = theta, p_load: np.ndarray = p_load
+        ) -> np.ndarray:
+            moved = theta.copy()
+            moved[network.generators] += gen
+            return network.solve_loads(moved, network.load_injections(p_load + load))[1]
+
+        still, steady = np.zeros(len(case.generators)), np.zeros(len(case.loads))
+        for j, step in enumerate(h * np.eye(len(still))):
+            slope = (f_at(step, steady) - f_at(-step, steady)) / (2 * h)
+            np.testing.assert_allclose(linear.stiffness[:, j], slope[network.generators], rtol=0, atol=1e-6)
+            assert slope[network.slack] == pytest.approx(-linear.stiffness[:, j].sum(), abs=1e-6)
+        for j, step in enumerate(h * np.eye(len(steady))):
+            slope = (f_at(still, step) - f_at(still, -step)) / (2 * h)
+            np.testing.assert_allclose(linear.share[:, j], slope[network.generators], rtol=0, atol=1e-6)
+            assert linear.slack_share[j] == pytest.approx(slope[network.slack], abs=1e-6)
+
+
+def test_linearisation_is_consistent(case, network):
+    """Stiffness is symmetric positive definite, shares are losses of δL elsewhere, modes decay."""
+    for p_gen, p_load in zip(*random_powers(case, 20), strict=True):
+        linear = network.linearise(network.power_flow(p_gen, p_load))
+        np.testing.assert_array_equal(linear.stiffness, linear.stiffness.T)
+        assert np.linalg.eigvalsh(linear.stiffness).min() > 0
+        np.testing.assert_allclose(linear.share.sum(axis=0) + linear.slack_share, -1.0, rtol=0, atol=1e-12)
+        assert (linear.share < 0).all()
+        assert (linear.slack_share < 0).all()
+        modes = linear.modes()
+        assert len(modes) == 2 * len(case.generators)
+        assert modes.real.max() < 0
+        # The trace of the state matrix is the sum of its eigenvalues.
+        assert modes.sum().real == pytest.approx(-(linear.d / linear.m).sum(), rel=1e-12)
+
+
+# Refusals.
+
+
+@pytest.mark.parametrize("factor", [20.0, 1e3, 1e300])
+def test_power_flow_refuses_overload(case, network, factor):
+    """Beyond what the lines can carry there is no answer, and none is made up."""
+    with pytest.raises(PowerFlowError):
+        network.power_flow(case.p_nominal, factor * case.load_nominal)
+    with pytest.raises(PowerFlowError):
+        network.power_flow(factor * case.p_nominal, factor * case.load_nominal)
+
+
+def test_power_flow_answers_exactly_where_there_is_a_stable_answer(threebus, chain):
+    """On the chain that is |P + L| < a and |P| < b; elsewhere, and for other roots, it refuses."""
+    a, b = chain
+    network = Network(threebus)
+    loadings = np.array([-1.5, -1.02, -0.99, -0.9, -0.5, 0.0, 0.3, 0.7, 0.95, 0.99, 1.01, 1.2, 2.0])
+    for slack_line in loadings:
+        for generator_line in loadings:
+            p_gen = np.array([generator_line * b])
+            p_load = np.array([slack_line * a]) - p_gen
+            if max(abs(slack_line), abs(generator_line)) < 1:
+                theta = network.power_flow(p_gen, p_load)
+                town = np.arcsin(slack_line)
+                known = [town, 0, town + np.arcsin(generator_line)]
+                np.testing.assert_allclose(theta, known, rtol=0, atol=1e-10)
+            else:
+                with pytest.raises(PowerFlowError):
+                    network.power_flow(p_gen, p_load)
+
+
+def test_every_answer_is_a_stable_equilibrium(ninebus):
+    """In a mesh, Newton also finds roots where a line is beyond 90 degrees; they are refused.
+
+    Where every angle across a line is within 90 degrees, ∂f/∂θ is positive definite: checked here
+    by eigenvalues of a finite-difference Jacobian, for powers up to ten times nominal.
+    """
+    network = Network(ninebus)
+    rng = np.random.default_rng(6)
+    answered = 0
+    for p in rng.uniform(-15, 15, (1000, 5)):
+        try:
+            theta = network.power_flow(p[:2], p[2:])
+        except PowerFlowError:
+            continue
+        answered += 1
+        angle = dict(zip([bus.id for bus in ninebus.buses], theta.tolist(), strict=True))
+        assert all(abs(angle[line.from_bus] - angle[line.to_bus]) < np.pi / 2 for line in ninebus.lines)
+        steps = 1e-6 * np.eye(network.n_bus)[network.unknown]
+        jacobian = (network.injections(theta + steps) - network.injections(theta - steps)) / 2e-6
+        assert np.linalg.eigvalsh(jacobian[:, network.unknown]).min() > 0
+    assert 100 < answered < 900
+
+
+def test_one_bad_instance_in_a_batch_is_an_error(case, network):
+    """No silent NaN for the others to be averaged with."""
+    p_load = np.stack([case.load_nominal, 1e3 * case.load_nominal])
+    with pytest.raises(PowerFlowError):
+        network.power_flow(case.p_nominal, p_load)
+
+
+def test_every_sampled_instance_is_servable(case):
+    """The benchmark asks nothing impossible."""
+    for instance in sample_instances(case, 2022, 40):
+        check_servable(case, instance, "sampled")
+
+
+def _ramp(case, **changes):
+    """Nominal loads, the first of which ramps."""
+    loads = {
+        bus: {"initial": value, "start": 1.0, "duration": 2.0, "rate": 0.0}
+        for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+    }
+    loads[case.loads[0]] |= changes
+    return loads
+
+
+def test_check_servable_names_source_and_field(case, quiet_instance):
+    """Too much load at the start, at the end of a ramp, or at the horizon; what lies beyond is no matter."""
+    too_much = quiet_instance(case, load=_ramp(case, initial=-40.0))
+    with pytest.raises(InputError, match=r"my\.json: load, initial\.power: initial loads and power cannot"):
+        check_servable(case, too_much, "my.json")
+    ramps_up = quiet_instance(case, load=_ramp(case, rate=-20.0))
+    with pytest.raises(InputError, match=r"my\.json: load: loads at t = 3 s cannot be served"):
+        check_servable(case, ramps_up, "my.json")
+    horizon = case.sampling.horizon_s
+    cut_off = quiet_instance(case, load=_ramp(case, duration=2 * horizon, rate=-40 / horizon))
+    with pytest.raises(InputError, match=rf"my\.json: load: loads at t = {horizon:g} s cannot be served"):
+        check_servable(case, cut_off, "my.json")
+    check_servable(case, quiet_instance(case, load=_ramp(case, start=horizon + 1, rate=-40.0)), "my.json")
+
+
+def test_check_servable_refuses_initial_power_that_no_line_carries(case, quiet_instance):
+    """Generators of an instance may lie outside their limits, but not outside physics."""
+    power = dict.fromkeys(case.generators, 50.0)
+    instance = quiet_instance(case, initial={"power": power, "omega": dict.fromkeys(case.generators, 0.0)})
+    with pytest.raises(InputError, match="initial loads and power cannot be served"):
+        check_servable(case, instance, "my.json")

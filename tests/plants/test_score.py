@@ -1,0 +1,272 @@
+"""The scorer: known costs, known violations of each limit, thresholds, and the limit of slow loads."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.schedule import Schedule
+from ded_bench.plants.score import Score, judge, score
+from ded_bench.plants.simulate import SimulationError, Trajectory, simulate
+
+N = 101
+
+
+@pytest.fixture
+def instance(case, quiet_instance):
+    """One second at rest at nominal power, with costs that tell the terms apart."""
+    cost = {case.slack: 0.7} | {bus: 0.1 * (j + 2) for j, bus in enumerate(case.generators)}
+    return quiet_instance(case, horizon_s=1.0, cost=cost)
+
+
+@pytest.fixture
+def still(case, instance) -> Trajectory:
+    """A made-up trajectory that breaks nothing: constant nominal power, P_s = 0.4 pu, ω = 0."""
+    n_gen = len(case.generators)
+    return Trajectory(
+        t=instance.grid,
+        theta=np.zeros((N, len(case.buses))),
+        omega=np.zeros((N, n_gen)),
+        p_gen=np.tile(case.p_nominal, (N, 1)),
+        p_load=np.tile(case.load_nominal, (N, 1)),
+        p_slack=np.full(N, 0.4),
+        case=case,
+    )
+
+
+def changed(trajectory: Trajectory, name: str, edit) -> Trajectory:
+    """A copy with one array edited in place."""
+    array = getattr(trajectory, name).copy()
+    edit(array)
+    return dataclasses.replace(trajectory, **{name: array})
+
+
+VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
+
+
+def violations(verdict: Score) -> dict[str, float]:
+    return {name: getattr(verdict, name) for name in VIOLATIONS if getattr(verdict, name) != 0}
+
+
+# Hand-made trajectories: exactly one limit is broken, by a known amount.
+
+
+def test_nothing_broken(case, instance, still):
+    """Objective over all points, unscaled, and not a single violation."""
+    verdict = judge(case, instance, still, "TO")
+    per_point = sum(instance.cost[g] * p for g, p in zip(case.generators, case.p_nominal, strict=True))
+    assert verdict.objective == pytest.approx(N * (per_point + 0.7 * 0.4), rel=1e-13)
+    assert violations(verdict) == {}
+    assert verdict.feasible
+    assert verdict.feasible_strict
+
+
+def test_negative_slack_power_costs_as_much(case, instance, still):
+    """c_s |P_s|: exporting through the slack bus is penalised equally."""
+    exporting = changed(still, "p_slack", lambda p: np.negative(p, out=p))
+    same = judge(case, instance, still, "NO").objective
+    assert judge(case, instance, exporting, "NO").objective == same
+    half = changed(still, "p_slack", lambda p: p[: N // 2].__imul__(-1))
+    assert judge(case, instance, half, "NO").objective == pytest.approx(same, rel=1e-13)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("k", [0, 50, N - 1])
+def test_frequency_violation_is_in_hz_beyond_the_bound(case, instance, still, sign, k):
+    """One generator at one point, either sign, first and last points included."""
+    last = len(case.generators) - 1
+    for regime, bound in (("NO", 0.05), ("TO", 0.0016)):
+
+        def push(omega: np.ndarray, bound: float = bound) -> None:
+            omega[k, last] = sign * 2 * math.pi * (bound + 0.003)
+
+        verdict = judge(case, instance, changed(still, "omega", push), regime)
+        assert violations(verdict) == {"freq_violation_hz": pytest.approx(0.003, rel=1e-9)}
+        assert not verdict.feasible
+
+        def touch(omega: np.ndarray, bound: float = bound) -> None:
+            omega[k, last] = sign * 2 * math.pi * bound * (1 - 1e-12)
+
+        assert violations(judge(case, instance, changed(still, "omega", touch), regime)) == {}
+
+
+def test_the_largest_frequency_counts(case, instance, still):
+    """Not the sum, not the last: the maximum over k and i."""
+
+    def push(omega: np.ndarray) -> None:
+        omega[3] = 2 * math.pi * 0.06
+        omega[60, 0] = -2 * math.pi * 0.08
+        omega[90] = 2 * math.pi * 0.07
+
+    verdict = judge(case, instance, changed(still, "omega", push), "NO")
+    assert verdict.freq_violation_hz == pytest.approx(0.03, rel=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_ramp_violation_is_per_step_beyond_epsilon(case, instance, still, sign):
+    """A jump of ε + 2e-3 pu between two points; ε = ramp · dt. Up and down alike."""
+    epsilon = case.ramp[0] * instance.dt_s
+
+    def jump(p: np.ndarray) -> None:
+        p[50:, 0] += sign * (epsilon + 2e-3)
+
+    verdict = judge(case, instance, changed(still, "p_gen", jump), "NO")
+    assert violations(verdict) == {"ramp_violation": pytest.approx(2e-3, rel=1e-9)}
+
+    def full_ramp(p: np.ndarray) -> None:
+        p[:, 0] += sign * epsilon * np.arange(N)
+
+    at_the_limit = judge(case, instance, changed(still, "p_gen", full_ramp), "NO")
+    assert at_the_limit.ramp_violation < 1e-15
+    assert at_the_limit.feasible_strict
+
+
+@pytest.mark.parametrize("upper", [True, False])
+def test_bound_violation_is_the_largest_excess(case, quiet_instance, still, upper):
+    """A constant schedule 0.02 pu beyond one limit of the last generator, where it also starts."""
+    last = case.generators[-1]
+    power = dict(zip(case.generators, case.p_nominal.tolist(), strict=True))
+    machine = case.machines[last]
+    power[last] = machine.p_max + 0.02 if upper else machine.p_min - 0.02
+    omega = dict.fromkeys(case.generators, 0.0)
+    outside = quiet_instance(case, horizon_s=1.0, initial={"power": power, "omega": omega})
+
+    def shift(p: np.ndarray) -> None:
+        p[:, -1] = power[last]
+
+    verdict = judge(case, outside, changed(still, "p_gen", shift), "NO")
+    assert violations(verdict) == {"bound_violation": pytest.approx(0.02, rel=1e-9)}
+
+
+def test_initial_violation_is_the_distance_from_p_0(case, instance, still):
+    """A constant schedule 0.01 pu below P_0 of one generator: no ramp, no bound, only the start."""
+
+    def shift(p: np.ndarray) -> None:
+        p[:, 0] -= 0.01
+
+    verdict = judge(case, instance, changed(still, "p_gen", shift), "NO")
+    assert violations(verdict) == {"initial_violation": pytest.approx(0.01, rel=1e-9)}
+
+
+# Schedules through the simulator.
+
+
+@pytest.mark.parametrize(
+    ("regime", "bound_hz"),
+    [("NO", 0.05), ("TO", 0.0016)],
+)
+def test_violations_of_a_schedule(case, instance, regime, bound_hz):
+    """A jump of 0.3 pu at t = 0.505 s: ramps, and a frequency excess as the trajectory shows it."""
+    step = np.zeros(len(case.generators))
+    step[0] = -0.3
+    p = np.stack([case.p_nominal, case.p_nominal, case.p_nominal + step, case.p_nominal + step])
+    schedule = Schedule(t=np.array([0.0, 0.5, 0.51, 1.0]), p=p)
+    verdict = score(case, instance, schedule, regime)
+    assert verdict.ramp_violation == pytest.approx(0.3 - case.ramp[0] * instance.dt_s, rel=1e-9)
+    assert verdict.initial_violation == 0
+    assert verdict.bound_violation == pytest.approx(max(0.0, float((case.p_min - p[-1]).max())), abs=1e-12)
+    fastest = np.abs(simulate(case, instance, schedule).omega).max() / (2 * math.pi)
+    # Half a second after a step ΔP a generator of inertia M is near ω = ΔP t / M, less what lines return.
+    assert 0.2 < fastest * 2 * math.pi / (0.3 * 0.49 / case.machines[case.generators[0]].m) < 1
+    assert verdict.freq_violation_hz == pytest.approx(max(0.0, fastest - bound_hz), abs=1e-15)
+    assert not verdict.feasible
+
+
+def test_a_step_between_grid_points_counts_as_sampled(case, instance):
+    """Schedules are taken at t_k: what a file says between two grid points cannot be seen."""
+    p = np.tile(case.p_nominal, (4, 1))
+    p[1, 0] += 5.0
+    spike = Schedule(t=np.array([0.0, 0.505, 0.509, 1.0]), p=p[[0, 1, 2, 3]])
+    seen = spike.at(instance.grid)[:, 0]
+    assert seen.max() > case.p_nominal[0] + 4  # the way up is seen, the peak itself is not
+    needle = Schedule(t=np.array([0.0, 0.502, 0.505, 0.508, 1.0]), p=p[[0, 0, 1, 2, 3]])
+    assert violations(score(case, instance, needle, "TO")) == {}
+
+
+def test_objective_of_an_equilibrium_in_closed_form(case, instance, constant):
+    """(n + 1) times the static cost: 101 points for 100 steps."""
+    verdict = score(case, instance, constant(instance, case.p_nominal), "TO")
+    p_slack = -case.p_nominal.sum() - case.load_nominal.sum()
+    static = case.p_nominal @ instance.cost_gen(case) + 0.7 * abs(p_slack)
+    assert verdict.objective == pytest.approx((instance.steps + 1) * static, rel=1e-11)
+    assert verdict.feasible_strict
+
+
+def test_slow_loads_approach_static_dispatch(case, quiet_instance):
+    """With P = P_opt of the loads at each t_k, the objective exceeds the static one by O(rate).
+
+    The slack bus covers what acceleration and damping take, Σ (M ω' + D ω), and ω is proportional to
+    the ramps' rate; the static part of the cost does not depend on the simulation.
+    """
+    cost = {case.slack: 0.9} | dict.fromkeys(case.generators, 0.2)
+    excess = []
+    for rate in (4e-3, 2e-3, 1e-3):
+        loads = {
+            bus: {"initial": value, "start": 1.0, "duration": 1e3, "rate": -rate}
+            for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+        }
+        p_load = case.load_nominal
+        p_opt = merit_order(case, np.full(len(case.generators), 0.2), 0.9, p_load)
+        initial = {
+            "power": dict(zip(case.generators, p_opt.tolist(), strict=True)),
+            "omega": dict.fromkeys(case.generators, 0.0),
+        }
+        instance = quiet_instance(case, horizon_s=10.0, dt_s=0.05, cost=cost, load=loads, initial=initial)
+        p = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), instance.p_load(case))
+        verdict = score(case, instance, Schedule(t=instance.grid, p=p), "NO")
+        balance = -p.sum(axis=1) - instance.p_load(case).sum(axis=1)
+        static = (p @ instance.cost_gen(case) + 0.9 * np.abs(balance)).sum()
+        excess.append(abs(verdict.objective / static - 1))
+        assert verdict.feasible
+        assert verdict.initial_violation < 1e-12
+    assert excess[-1] < 1e-3
+    np.testing.assert_allclose([excess[0] / excess[1], excess[1] / excess[2]], 2.0, rtol=0.05)
+
+
+# Thresholds.
+
+
+@pytest.mark.parametrize("name", VIOLATIONS)
+def test_feasible_and_feasible_strict_have_their_thresholds(name):
+    """1e-4 Hz and 1e-6 pu; strictly 1e-6 Hz and 1e-8 pu. Each limit alone decides; at the edge: met."""
+    loose, strict = (1e-4, 1e-6) if name == "freq_violation_hz" else (1e-6, 1e-8)
+    clean = Score(1.0, 0.0, 0.0, 0.0, 0.0)
+    for value, feasible, feasible_strict in [
+        (0.0, True, True),
+        (strict, True, True),
+        (np.nextafter(strict, 1), True, False),
+        (loose, True, False),
+        (np.nextafter(loose, 1), False, False),
+        (math.inf, False, False),
+        (math.nan, False, False),
+    ]:
+        verdict = dataclasses.replace(clean, **{name: float(value)})
+        assert (verdict.feasible, verdict.feasible_strict) == (feasible, feasible_strict), value
+
+
+# Refusals.
+
+
+def test_losing_synchronism_has_no_score(case, quiet_instance, constant):
+    """A schedule under which the system falls apart raises; it never gets a finite cost."""
+    loads = {
+        bus: {"initial": 2 * value, "start": 0.0, "duration": 0.0, "rate": 0.0}
+        for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+    }
+    instance = quiet_instance(case, load=loads)
+    with pytest.raises(SimulationError):
+        score(case, instance, constant(instance, 20 + 0 * case.p_nominal), "NO")
+
+
+def test_wrong_regimes_and_schedules_are_refused(case, instance, constant):
+    """Before any simulation, naming what is wrong."""
+    good = constant(instance, case.p_nominal)
+    with pytest.raises(InputError, match="unknown regime 'XX'"):
+        score(case, instance, good, "XX")
+    with pytest.raises(InputError, match=r"must end at the horizon 1\.0, not 0\.5"):
+        score(case, instance, Schedule(t=0.5 * good.t, p=good.p), "NO")

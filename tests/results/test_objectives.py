@@ -1,0 +1,72 @@
+"""Objectives that a reference run leaves for those who do not have its rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.results import reference_run
+from ded_bench.problem.case import REPOSITORY, Case
+from ded_bench.results.objectives import (
+    OBJECTIVES,
+    Objective,
+    objectives_file,
+    objectives_of,
+    reference_objectives,
+)
+from ded_bench.results.rows import Results, Row
+
+RUNS = sorted(path.parent for path in (REPOSITORY / "results").glob("*-reference/results.csv"))
+ROW = Row(
+    *("a-0001", "test", "NO", "ded", "default", "Optimal"), objective=2.5, case="a", problems_version="1"
+)
+
+
+def test_default_settings_only_and_no_instances_that_served_choices() -> None:
+    other = dataclasses.replace(ROW, method="ed", objective=3.0)
+    left_out = [
+        dataclasses.replace(ROW, settings="accelerated"),
+        dataclasses.replace(ROW, split="validation"),
+        dataclasses.replace(ROW, instance="a-0002", objective=None, error="failed"),
+    ]
+    found = objectives_of([other, *left_out, ROW])
+    assert found == [
+        Objective("a", "a-0001", "NO", "ded", 2.5, "1"),
+        Objective("a", "a-0001", "NO", "ed", 3.0, "1"),
+    ]
+
+
+def test_a_case_has_those_of_its_reference_run(threebus: Case, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(reference_run, "REFERENCE_RUNS", tmp_path)
+    assert reference_objectives(threebus) == []
+    path = objectives_file(tmp_path / "threebus-reference")
+    OBJECTIVES.write(path, objectives_of([ROW]))
+    assert reference_objectives(threebus) == objectives_of([ROW])
+    path.write_text(path.read_text().replace("2.5", "cheap"))
+    with pytest.raises(InputError, match="line 2, objective: 'cheap'"):
+        reference_objectives(threebus)
+
+
+@pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
+def test_committed_tables_follow_from_the_rows(folder: Path) -> None:
+    assert OBJECTIVES.read(objectives_file(folder)) == objectives_of(Results(folder).rows.values())
+
+
+@pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
+def test_committed_rows_of_success_have_a_score(folder: Path) -> None:
+    """Or say why they have none."""
+    rows = [row for row in Results(folder).rows.values() if row.status in ("Optimal", "Feasible", "Policy")]
+    assert rows
+    assert not [row.key for row in rows if row.objective is None and not row.error]
+
+
+def test_models_are_looked_for_in_the_given_folder_first(threebus: Case, tmp_path: Path, monkeypatch) -> None:
+    """Then in the default results folder, then in the reference run; each once."""
+    monkeypatch.setattr(reference_run, "REFERENCE_RUNS", REPOSITORY / "results")
+    own, default = tmp_path / "own", Path("results/threebus")
+    last = REPOSITORY / "results" / "threebus-reference"
+    assert reference_run.search_folders(threebus, own) == (own, default, last)
+    assert reference_run.search_folders(threebus, default) == (default, last)

@@ -1,0 +1,94 @@
+"""The results table on disk: nothing lost, nothing twice, bad files named."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.results.rows import ROWS, SCORING_FAILED, Key, Results, Row
+
+ROW = Row(
+    instance="a-1",
+    split="test",
+    regime="NO",
+    method="ded",
+    settings="default",
+    status="Optimal",
+    iterations=3,
+    solve_s=0.1 + 0.2,
+    feasible=True,
+    error='comma, "quote"',
+    fingerprint="f",
+)
+
+
+def test_rows_survive_the_file_to_the_last_digit(tmp_path: Path) -> None:
+    Results(tmp_path).add([ROW])
+    assert ROWS.read(tmp_path / "results.csv") == [ROW]
+    assert Results(tmp_path).rows == {ROW.key: ROW}
+    frame = Results(tmp_path).frame()
+    assert frame["solve_s"].iloc[0] == 0.1 + 0.2
+    assert list(frame.columns) == list(ROWS.names)
+
+
+def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(tmp_path: Path) -> None:
+    """Its schedule need not be kept, unless it is still to be scored, or scoring it has failed."""
+    results = Results(tmp_path)
+    plain = dataclasses.replace(ROW, error="")
+    scored, told = dataclasses.replace(plain, objective=1.0), dataclasses.replace(plain, error="why")
+    failed = dataclasses.replace(plain, error=f"{SCORING_FAILED}why")
+    cases = (scored, True, True), (plain, False, False), (told, False, False), (failed, False, True)
+    for row, alone, with_schedule in cases:
+        results.add([row])
+        assert results.has(row.key, "f") is alone
+        assert not results.solved(row.key, "f")
+        path = results.schedule_path(row.key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        assert results.has(row.key, "f") is with_schedule
+        assert results.solved(row.key, "f")
+        assert not results.has(row.key, "another fingerprint")
+        path.unlink()
+    assert not results.has(Key("a-2", "NO", "ded", "default"), "f")
+
+
+GOOD = ROWS.format([ROW])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "instance"),
+        (GOOD.replace("status", "state"), "status: required column is missing"),
+        (GOOD.replace(",date", ",date,extra"), "line 2"),
+        (GOOD.replace("Optimal", "Splendid"), "line 2, status"),
+        (GOOD.replace("0.30000000000000004", "nan"), "line 2, solve_s"),
+        (GOOD.replace("0.30000000000000004", "fast"), "line 2, solve_s"),
+        (GOOD.replace(",True,", ",perhaps,"), "line 2, feasible"),
+        (GOOD.replace("a-1", "../../a"), "line 2, instance"),
+        (GOOD + "a,b\n", "line 3"),
+    ],
+)
+def test_wrong_tables_are_refused_with_line_and_column(text: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "results.csv"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        Results(tmp_path)
+    assert str(path) in str(caught.value)
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", [b"", b"\n", b"\r\n\n"])
+def test_a_mark_and_blank_lines_of_an_editor_are_accepted(tmp_path: Path, ending: bytes) -> None:
+    """Also where rows are added after them."""
+    row = Row(*("x-0", "test", "NO", "ded", "default", "Optimal"), objective=1.0, case="x")
+    path = Results(tmp_path).path
+    Results(tmp_path).add([row])
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes() + ending)
+    opened = Results(tmp_path)
+    opened.add([dataclasses.replace(row, instance="x-1")])
+    assert [r.instance for r in Results(tmp_path).rows.values()] == ["x-0", "x-1"]
+    assert opened.rows == Results(tmp_path).rows

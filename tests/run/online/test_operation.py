@@ -1,0 +1,171 @@
+"""Rows of online.csv: the same every time, resumed, compared with hindsight, and the command's exit codes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import shutil
+
+import numpy as np
+import pytest
+
+from ded_bench.cli import main
+from ded_bench.results.timing import TIMING, TimingRow
+from ded_bench.methods.solution import Settings
+from ded_bench.run.online.loop import LoopOptions
+from ded_bench.results.online_results import OnlineResults, read_trajectory
+from ded_bench.run.online.operation import make_operations, operate
+from ded_bench.problem.scenario import load_scenarios
+from ded_bench.problem.scenario_sampling import scenario_files, write_scenarios
+from ded_bench.plants.lossless.servable import servable
+from tests.conftest import CASE_FILES
+
+#: What the clock and the day decide on.
+VARYING = {"method_s": None, "loop_s": None, "date": ""}
+
+
+@pytest.fixture(scope="module")
+def scenarios(threebus, tmp_path_factory):
+    """Files of two scenarios of the chain."""
+    folder = tmp_path_factory.mktemp("scenarios")
+    write_scenarios(threebus, 2, 0, folder, servable, threebus.sampling.horizon_s)
+    return scenario_files(folder)
+
+
+def operations(case, files, latency="0.3", method="ed", limit_s=60.0):
+    """Rows of one method in one regime."""
+    loaded = load_scenarios(files, case)
+    chosen = [(method, Settings("1s" if method == "ed" else "default"))]
+    return make_operations(case, loaded, chosen, ["TO"], LoopOptions(), latency, [], limit_s)
+
+
+@pytest.fixture(scope="module")
+def first_run(threebus, scenarios, tmp_path_factory):
+    """Rows of both scenarios, and the folder that holds them."""
+    folder = tmp_path_factory.mktemp("first")
+    return operate(threebus, operations(threebus, scenarios), OnlineResults(folder)), folder
+
+
+def test_rows_hold_all_that_is_judged(threebus, first_run):
+    """Costs over hindsight, counts, and a trajectory that has them."""
+    rows, folder = first_run
+    results = OnlineResults(folder)
+    assert [results.table.rows[row.key] for row in rows] == rows
+    for row in rows:
+        assert (row.plans, row.late, row.failed, row.error) == (6, 0, 0, "")
+        assert (row.latency_s, row.latency_source, row.period_s) == (0.3, "given", 1.0)
+        best = results.hindsight.rows[row.scenario, "TO", "paper"]
+        assert best.method == "ded-slp"
+        assert best.max_excess_hz < 1e-6
+        assert row.increase_percent == pytest.approx(100 * (row.objective / best.objective - 1))
+        assert row.max_excess_hz > row.mean_excess_hz >= 0
+        assert row.loop_s > 0
+        assert row.code != row.online_code != ""
+        kept = read_trajectory(results.files.trajectory(row.key))
+        np.testing.assert_allclose(kept["t"], np.arange(61) * 0.1, atol=1e-12)
+        assert kept["omega"].shape == (61, len(threebus.generators))
+        look = read_trajectory(results.files.hindsight_trajectory(row.scenario, "TO"))
+        assert np.abs(look["omega"]).max() <= threebus.omega_bound("TO") + 1e-5
+
+
+def test_a_given_latency_gives_the_same_to_the_last_bit(threebus, scenarios, first_run, tmp_path):
+    """Rows but for the clock, and trajectories; with two workers, too."""
+    rows, folder = first_run
+    again = operate(threebus, operations(threebus, scenarios), OnlineResults(tmp_path), workers=2)
+    for old, new in zip(rows, again, strict=True):
+        assert dataclasses.replace(old, **VARYING) == dataclasses.replace(new, **VARYING)
+        places = (OnlineResults(f).files.trajectory(old.key) for f in (folder, tmp_path))
+        assert len({place.read_bytes() for place in places}) == 1
+
+
+def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_path):
+    """But a row that a killed process has torn, and all with another limit."""
+    shutil.copytree(first_run[1], tmp_path, dirs_exist_ok=True)
+    results, made, wanted = OnlineResults(tmp_path), [], operations(threebus, scenarios)
+    assert operate(threebus, wanted, results, on_row=made.append) == first_run[0]
+    assert made == []
+    text = results.files.table.read_text()
+    results.files.table.write_text(text[:-20])
+    results = OnlineResults(tmp_path)
+    assert len(results.table.rows) == 1
+    again = operate(threebus, wanted, results, on_row=made.append)
+    assert len(made) == 1
+    assert [row.objective for row in again] == [row.objective for row in first_run[0]]
+    changed = operations(threebus, scenarios, limit_s=30.0)
+    assert not any(results.table.made_from(o.key, o.fingerprint) for o in changed)
+
+
+def test_faults_are_in_the_row(threebus, scenarios, tmp_path):
+    """A method that raises every third time."""
+    chosen = operations(threebus, scenarios[:1], method="tests.online.faulty_methods:raises")
+    (row,) = operate(threebus, chosen, OnlineResults(tmp_path))
+    assert (row.plans, row.late, row.failed) == (6, 0, 2)
+    assert row.method == "tests.online.faulty_methods.raises"
+    assert "no idea how" in row.error
+    assert row.objective is not None
+
+
+def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_path):
+    """Of the first folder that timed it; warm-ups, failures and other settings do not count."""
+    times = [(0, 9.0, ""), (1, 0.1, ""), (2, 0.3, ""), (3, 0.2, ""), (4, 7.0, "failed")]
+    rows = [
+        TimingRow("r", n, "TO", "ed", s, "i", "Feasible", 0.25, 5.0, solve, error=error, case="threebus")
+        for s, more in (("1s", 0.0), ("10s", 1.0))
+        for n, solve, error in ((n, solve + more, error) for n, solve, error in times)
+    ]
+    TIMING.write(tmp_path / "timing.csv", rows)
+    loaded = load_scenarios(scenarios, threebus)
+    folders = [tmp_path / "nothing", tmp_path]
+    (found, _) = make_operations(
+        threebus, loaded, [("ed", Settings("1s"))], ["TO"], LoopOptions(), "timing", folders
+    )
+    assert found.options.latency_s == pytest.approx(0.45)
+    assert found.latency_source == "timing"
+
+
+def test_settings_that_differ_in_operation_only_have_the_time_of_others(threebus, scenarios, tmp_path):
+    """On the same model."""
+    settings = Settings("receding", model="linear")
+    row = TimingRow("r", 1, "TO", "ded-ko-knots", "default-linear", "i", "Optimal", 0.25, 5.0, 0.5)
+    TIMING.write(tmp_path / "timing.csv", [dataclasses.replace(row, case="threebus")])
+    loaded = load_scenarios(scenarios[:1], threebus)
+    (found,) = make_operations(
+        threebus, loaded, [("ded-ko-knots", settings)], ["TO"], LoopOptions(), "timing", [tmp_path]
+    )
+    assert (found.key.settings, found.options.latency_s) == ("receding-linear", pytest.approx(0.75))
+
+
+def test_the_command(scenarios, tmp_path, capsys):
+    """Rows are printed as they are made, once."""
+    line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--settings", "1s"]
+    line += ["--regime", "TO", "--scenario", str(scenarios[0]), "--out", str(tmp_path)]
+    assert main([*line, "--latency", "zero"]) == 0
+    assert "over hindsight" in capsys.readouterr().out
+    assert main([*line, "--latency", "0"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main([*line, "--latency", "0,1.5", "--forecast", "announced,perfect"]) == 0
+    assert capsys.readouterr().out.count("over hindsight") == 3
+    rows = OnlineResults(tmp_path).table.rows
+    assert {(key.latency_s, key.forecast) for key in rows} == set(
+        itertools.product((0.0, 1.5), ("announced", "perfect"))
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (["--latency", "soon"], "--latency"),
+        (["--latency", "timing"], "not timed"),
+        (["--latency", "0,-1"], "neither timing nor zero nor a number"),
+        (["--method", "nobody"], "unknown method"),
+        (["--regime", "XX"], "unknown regime"),
+        (["--scenario", "nowhere.json"], "cannot be read"),
+    ],
+)
+def test_bad_input_is_one_line(scenarios, tmp_path, capsys, change, said):
+    """Exit code 2, and no table."""
+    line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--regime", "TO"]
+    line += ["--latency", "0", "--scenario", str(scenarios[0]), "--out", str(tmp_path / "out"), *change]
+    assert main(line) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

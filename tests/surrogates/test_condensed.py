@@ -1,0 +1,64 @@
+"""The condensed rollout: what the step-by-step rollout gives, at every point or at some; its adjoint."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.surrogates.condensed import CondensedRollout, free_response, hat_functions
+from ded_bench.surrogates.linear import linear_model
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
+from ded_bench.plants.lossless.network import Network
+
+KNOTS = 7
+HORIZON = 2.0
+STRIDES = (1, 8)
+
+
+def condensed_of(case: Case, stride: int) -> CondensedRollout:
+    grid = np.arange(round(HORIZON / case.sampling.dt_s) + 1) * case.sampling.dt_s
+    return CondensedRollout.make(case, linear_model(case), grid, np.linspace(0.0, HORIZON, KNOTS), stride)
+
+
+@pytest.mark.parametrize("stride", STRIDES)
+def test_it_equals_the_sequential_rollout(case: Case, stride: int) -> None:
+    condensed, network, n_gen = condensed_of(case, stride), Network(case), len(case.generators)
+    model = condensed.model
+    drawn = [sample_instance(case, KOOPMAN_SEED, i) for i in range(3)]
+    instances = [i.model_copy(update={"horizon_s": HORIZON}) for i in drawn]
+    powers = np.random.default_rng(3).uniform(case.p_min, case.p_max, (3, KNOTS, n_gen))
+    p_load = np.stack([i.p_load(case) for i in instances])
+    p_gen = hat_functions(instances[0].grid, condensed.knots) @ powers
+    psi = model.initial(network, instances)
+    inputs = np.concatenate([p_gen, p_load], axis=-1).swapaxes(0, 1)
+    sequential = model.rollout(psi, inputs)[::stride, :, : n_gen + 1].transpose(1, 2, 0)
+    free = condensed.free_response(psi, p_load)
+    np.testing.assert_allclose(free + condensed.apply(powers), sequential, atol=1e-11)
+    flat = np.einsum("opx,bx->bop", condensed.gamma, powers.reshape(3, -1))
+    np.testing.assert_allclose(condensed.apply(powers), flat, atol=1e-11)
+    np.testing.assert_array_equal(free, free_response(model, psi, p_load, stride))
+
+
+@pytest.mark.parametrize("stride", STRIDES)
+def test_the_adjoint_is_the_transpose(case: Case, stride: int) -> None:
+    condensed, rng = condensed_of(case, stride), np.random.default_rng(4)
+    p_knots = rng.normal(size=(5, KNOTS, condensed.n_gen))
+    outputs = rng.normal(size=(5, condensed.n_gen + 1, len(condensed.points)))
+    forward = (condensed.apply(p_knots) * outputs).sum(axis=(1, 2))
+    backward = (condensed.adjoint(outputs) * p_knots).sum(axis=(1, 2))
+    np.testing.assert_allclose(forward, backward, rtol=1e-9)
+    assert np.abs(forward).min() > 1e-3
+
+
+@pytest.mark.parametrize("stride", STRIDES)
+def test_weights_sum_over_the_whole_grid(case: Case, stride: int) -> None:
+    """Exact for functions that are linear between the knots, or between the points."""
+    condensed, rng = condensed_of(case, stride), np.random.default_rng(5)
+    grid = np.arange(round(HORIZON / case.sampling.dt_s) + 1) * case.sampling.dt_s
+    for at, weights in (
+        (condensed.knots, condensed.hat_weights),
+        (condensed.points, condensed.quadrature_weights),
+    ):
+        values = rng.normal(size=len(at))
+        assert weights @ values == pytest.approx(np.interp(grid, at, values).sum(), rel=1e-12)

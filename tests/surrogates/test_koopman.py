@@ -1,0 +1,250 @@
+"""The surrogate: guarantees by construction, exactness near equilibrium, condensed rollout, files."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ded_bench.analysis.rollouts import rollout_table
+from ded_bench.files.errors import InputError
+from ded_bench.surrogates.identification_data import KINDS, load_ramps, random_knots, sample_trajectories, trajectories
+from ded_bench.surrogates.energy_form import EPSILON, energy_form, injection_lift, steady_state
+from ded_bench.surrogates.identify import (
+    held_out,
+    identify,
+    make_model,
+    n_parameters,
+    predict,
+    unpack,
+)
+from ded_bench.surrogates.linear import linear_model, nominal_model, single_sample
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.find import find_model, model_file
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.simulate import SimulationError, simulate
+
+
+def nominal_form(case: Case):
+    network = Network(case)
+    return energy_form(case, network.power_flow(case.p_nominal, case.load_nominal))
+
+
+def test_every_parameter_value_is_stable_with_exact_equilibria(case: Case) -> None:
+    form, b, dt = nominal_form(case), steady_state(case), case.sampling.dt_s
+    rng = np.random.default_rng(1)
+    n_gen, n_in = len(case.generators), b.shape[1]
+    for draw in range(10_000):
+        x = rng.normal(size=n_parameters(*form.feedthrough.shape)) * 10.0 ** rng.uniform(-2, 1)
+        k, g = unpack(form, x).discretise(b, dt)
+        assert np.abs(np.linalg.eigvals(k)).max() < 1.0, draw
+        inputs = rng.normal(size=n_in)
+        rest = b @ inputs
+        step = k @ (rest - b @ inputs) + b @ inputs + g @ np.zeros(n_in)
+        assert np.abs(step - rest).max() <= 1e-12
+        assert np.abs(rest[:n_gen]).max() == 0.0
+        assert rest[n_gen] == pytest.approx(-inputs.sum(), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["9bus", "two-area", "39bus", "68bus", "140bus"])
+def test_models_rest_at_the_equilibria_of_the_nonlinear_system(name: str) -> None:
+    case = Case.load(name)
+    network, b = Network(case), steady_state(case)
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        p_gen = rng.uniform(case.p_min, case.p_max)
+        p_load = case.load_nominal * rng.uniform(0.95, 1.05, len(case.loads))
+        theta = network.power_flow(p_gen, p_load)
+        for model in (nominal_model(case), make_model(case, nominal_form(case))):
+            psi = model.observables(network, theta, np.zeros(len(p_gen)), p_load)
+            np.testing.assert_allclose(psi, b @ np.concatenate([p_gen, p_load]), atol=1e-10)
+            np.testing.assert_array_equal(model.b, b)
+
+
+def test_energy_form_starts_at_the_linearisation(case: Case) -> None:
+    linear, model = linear_model(case), make_model(case, nominal_form(case))
+    # The forms differ by the stability floor only, whose rates are a few EPSILON per second.
+    np.testing.assert_allclose(model.k, linear.k, atol=10 * EPSILON * linear.dt_s)
+    np.testing.assert_allclose(model.g, linear.g, atol=10 * EPSILON * linear.dt_s)
+    modes = Network(case).linearise(Network(case).power_flow(case.p_nominal, case.load_nominal)).modes()
+    rates = np.log(np.linalg.eigvals(linear.k)) / linear.dt_s
+    np.testing.assert_allclose(np.sort_complex(rates), np.sort_complex(modes), atol=1e-8)
+
+
+def test_linear_model_is_exact_to_second_order(case: Case, quiet_instance, alter) -> None:
+    """Small load ramps from the nominal point: halving them quarters the model's error."""
+    errors = []
+    for size in (0.02, 0.01):
+        ramps = {
+            bus: {"initial": value, "start": 0.505, "duration": 1.0, "rate": -size}
+            for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+        }
+        instance = quiet_instance(case, load=ramps, horizon_s=4.0)
+        schedule = Schedule(instance.grid, load_ramps(case, instance, np.random.default_rng(0)))
+        data = trajectories(case, [instance], [schedule], ["load ramps"])
+        errors.append(np.abs(predict(linear_model(case), Network(case), data) - data.outputs).max())
+    assert errors[0] < 1e-3
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
+    """Whole blocks of steps, a part of one, a single step; one ψ_0 for all and one for each."""
+    model = linear_model(case)
+    rng = np.random.default_rng(1)
+    n, n_in = model.b.shape
+    for n_points, batch, own in (
+        (1, (), True),
+        (2, (3,), True),
+        (77, (3,), False),
+        (201, (2, 3), True),
+    ):
+        psi = rng.normal(size=(*(batch if own else ()), n))
+        inputs = rng.normal(size=(n_points, *batch, n_in))
+        states = model.rollout(psi, inputs)
+        expected = np.broadcast_to(psi, states.shape[1:])
+        for i in range(n_points):
+            np.testing.assert_allclose(states[i], expected, atol=1e-10)
+            if i + 1 < n_points:
+                deviation = (expected - inputs[i] @ model.b.T) @ model.k.T
+                expected = deviation + inputs[i] @ model.b.T + (inputs[i + 1] - inputs[i]) @ model.g.T
+
+
+def test_single_sample_form_is_the_paper_s_and_agrees_to_half_a_step(case: Case) -> None:
+    """Same modes, equilibria and start as the first-order hold; one sample of the input, half a step off."""
+    hold, network = linear_model(case), Network(case)
+    single = single_sample(hold, case)
+    np.testing.assert_allclose(single.g, (np.eye(len(single.k)) - single.k) @ single.b, atol=1e-15)
+    n_gen = len(case.generators)
+    assert not single.k[:, : n_gen + 1].any()  # P_s of a load change does not depend on the old P_s
+    modes = np.sort_complex(np.linalg.eigvals(single.k))[n_gen + 1 :]
+    np.testing.assert_allclose(modes, np.sort_complex(np.linalg.eigvals(hold.k)), atol=1e-9)
+    errors = []
+    for part in (1.0, 0.5):
+        steps = case.sampling.model_copy(update={"dt_s": part * case.sampling.dt_s})
+        finer = case.model_copy(update={"sampling": steps})
+        hold = linear_model(finer)
+        instance = sample_instance(finer, KOOPMAN_SEED, 0).model_copy(update={"horizon_s": 8.0})
+        rng = np.random.default_rng(0)
+        schedule = Schedule(instance.grid, random_knots(finer, instance, rng))
+        data = trajectories(finer, [instance], [schedule], ["random knots"])
+        difference = predict(single_sample(hold, finer), network, data) - predict(hold, network, data)
+        errors.append(np.abs(difference).max())
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)  # first order in the step
+
+
+def test_identified_model_beats_the_linearisation_and_is_repeatable(case: Case) -> None:
+    model, again = identify(case, seed=5, count=8), identify(case, seed=5, count=8)
+    assert model.fingerprint == again.fingerprint
+    assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0
+    table = rollout_table(case, [linear_model(case), model], held_out(case, seed=5, count=8))
+    mean = table.groupby("model")[["mean max |Δω| (Hz)", "mean RMS ΔP_s (pu)"]].mean()
+    assert (mean.loc["koopman"] < mean.loc["linear"]).all()
+
+
+def test_training_schedules_obey_the_limits(case: Case) -> None:
+    data = sample_trajectories(case, seed=1, count=2 * len(KINDS))
+    n_gen = len(case.generators)
+    p_gen = data.inputs[..., :n_gen]
+    most = case.ramp * case.sampling.dt_s
+    assert (np.abs(np.diff(p_gen, axis=0)) <= most + 1e-12).all()
+    coast = 0.5 * case.ramp  # the longest smoothing at the ramp limit: a smoothed kind may overshoot
+    assert (p_gen >= case.p_min - coast).all()
+    assert (p_gen <= case.p_max + coast).all()
+    assert set(data.kinds) == set(KINDS)
+
+
+def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkeypatch) -> None:
+    """A third of them is; the others are what they were. Where most are, that is said."""
+    complete, calls = sample_trajectories(case, seed=1, count=6), itertools.count()
+
+    def failing(period: int):
+        def run(case, instance, schedule):
+            if next(calls) % period == 0:
+                raise SimulationError("no power flow")
+            return simulate(case, instance, schedule)
+
+        return run
+
+    monkeypatch.setattr("ded_bench.surrogates.identification_data.simulate", failing(3))
+    part = sample_trajectories(case, seed=1, count=6)
+    assert [i.id for i in part.instances] == [complete.instances[k].id for k in (1, 2, 4, 5)]
+    assert (part.omega == complete.omega[:, [1, 2, 4, 5]]).all()
+    assert (part.theta_initial == complete.theta_initial[[1, 2, 4, 5]]).all()
+    monkeypatch.setattr("ded_bench.surrogates.identification_data.simulate", failing(1))
+    with pytest.raises(InputError, match="cannot follow 6 of 6 drawn schedules"):
+        sample_trajectories(case, seed=1, count=6)
+
+
+def test_model_files_round_trip(case: Case, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    width = 2 * len(case.generators) + 1
+    n_extra = 3
+    plain = linear_model(case)
+    n = len(plain.k) + n_extra
+    model = dataclasses.replace(
+        plain,
+        k=rng.normal(size=(n, n)),
+        b=rng.normal(size=(n, plain.b.shape[1])),
+        g=rng.normal(size=(n, plain.b.shape[1])),
+        lift=injection_lift(case, n_extra),
+        mlp=(
+            (rng.normal(size=(5, width)), rng.normal(size=5)),
+            (rng.normal(size=(3, 5)), rng.normal(size=3)),
+        ),
+    )
+    path = model_file(tmp_path, "koopman")
+    model.save(path)
+    loaded = find_model(case, "koopman", [tmp_path / "nowhere", tmp_path])
+    assert loaded.fingerprint == model.fingerprint
+    network = Network(case)
+    theta = network.power_flow(case.p_nominal, case.load_nominal)
+    state = theta, np.full(len(case.generators), 0.01), case.load_nominal
+    np.testing.assert_array_equal(loaded.observables(network, *state), model.observables(network, *state))
+
+
+def test_model_files_are_checked(ninebus: Case, threebus: Case, tmp_path: Path) -> None:
+    model = linear_model(ninebus)
+    path = tmp_path / "m.safetensors"
+    model.save(path)
+    with pytest.raises(InputError, match="another case"):
+        Koopman.load(path, threebus)
+    dataclasses.replace(model, k=model.k[:3]).save(path)
+    with pytest.raises(InputError, match=r"m\.safetensors: k"):
+        Koopman.load(path, ninebus)
+    path.write_bytes(b"not a model")
+    with pytest.raises(InputError, match="is not a model"):
+        Koopman.load(path, ninebus)
+    with pytest.raises(InputError, match="train-ko"):
+        find_model(ninebus, "koopman", [tmp_path])
+    with pytest.raises(InputError, match="no such file"):
+        find_model(ninebus, "nonsense", [tmp_path])
+
+
+def test_paper_identification_is_stable_exact_at_equilibria_and_learns(case: Case) -> None:
+    from ded_bench.surrogates.koopman_paper import PaperKoopman, identify_paper
+
+    model = identify_paper(case, seed=1, count=4, steps=300)
+    assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0
+    n_gen = len(case.generators)
+    assert (model.b[:n_gen] == 0).all()
+    np.testing.assert_allclose(model.b[n_gen], -1.0, rtol=1e-12)
+    # The newer input sample: one step from ψ = B P under P⁺ lands where K (ψ - B P⁺) + B P⁺ does.
+    rng = np.random.default_rng(0)
+    old, new = rng.normal(size=(2, model.b.shape[1]))
+    stepped = model.rollout(model.b @ old, np.stack([old, new]))[1]
+    np.testing.assert_allclose(stepped, model.k @ (model.b @ (old - new)) + model.b @ new, atol=1e-12)
+    untrained = identify_paper(case, seed=1, count=4, steps=1)
+    assert model.training["one_step_loss"] < 0.5 * untrained.training["one_step_loss"]
+    torch.manual_seed(0)
+    for _ in range(200):
+        drawn = PaperKoopman(n_gen, model.b.shape[1], model.dt_s).double()
+        for parameter in drawn.parameters():
+            torch.nn.init.normal_(parameter, std=2.0)
+        assert torch.linalg.eigvals(drawn.matrices()[0]).abs().max() < 1.0

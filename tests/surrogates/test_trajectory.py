@@ -1,0 +1,148 @@
+"""The linear model along a trajectory: exact to first order, its rows and adjoint those of its rollout."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ded_bench.surrogates.trajectory import TrajectoryModel, linearise_along
+from ded_bench.methods import ed
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.simulate import Trajectory, simulate
+
+STEPS = 400
+#: Knots at unequal distances, as after rounding to the grid.
+POINTS = np.array([0, 37, 75, 112, 150, 153, 230, 301, 400])
+
+
+class Made(NamedTuple):
+    """An instance, a schedule on the knots, what it does, and the linear model along that."""
+
+    instance: Instance
+    schedule: Schedule
+    trajectory: Trajectory
+    model: TrajectoryModel
+
+
+@pytest.fixture(scope="module")
+def made(case: Case) -> Made:
+    instance = sample_instance(case, 77, 3).model_copy(update={"horizon_s": STEPS * case.sampling.dt_s})
+    times = instance.grid[POINTS]
+    schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
+    trajectory = simulate(case, instance, schedule)
+    return Made(instance, schedule, trajectory, linearise_along(case, trajectory, POINTS))
+
+
+def increments(model: TrajectoryModel) -> Array:
+    """Random input increments at the knots, none at the first."""
+    u = np.random.default_rng(5).normal(size=model.p_gen.shape)
+    u[0] = 0.0
+    return u
+
+
+def test_without_increments_it_is_the_trajectory(made):
+    """Outputs are those simulated."""
+    omega, p_slack = made.model.outputs(np.zeros_like(made.model.p_gen))
+    assert np.array_equal(omega, made.trajectory.omega)
+    assert np.array_equal(p_slack, made.trajectory.p_slack)
+
+
+def test_error_is_of_second_order(case, quiet_instance, constant):
+    """Along an equilibrium, against simulations: half the increments, a quarter of the error."""
+    instance = quiet_instance(case, horizon_s=STEPS * case.sampling.dt_s)
+    trajectory = simulate(case, instance, constant(instance, case.p_nominal))
+    model = linearise_along(case, trajectory, POINTS)
+    u = 0.1 * increments(model)
+    errors = []
+    for size in (1.0, 0.5, 0.25):
+        omega, p_slack = model.outputs(size * u)
+        moved = simulate(case, instance, Schedule(t=instance.grid[POINTS], p=model.p_gen + size * u))
+        errors.append((np.abs(omega - moved.omega).max(), np.abs(p_slack - moved.p_slack).max()))
+    ratio = np.divide(errors[:-1], errors[1:])
+    assert ratio == pytest.approx(4.0, rel=0.25)
+
+
+def test_along_a_moving_trajectory_it_is_nearly_exact(case, made):
+    """One stiffness per interval: what increments change is met within 5 % of the change."""
+    u = 0.05 * increments(made.model)
+    omega, p_slack = made.model.outputs(u)
+    moved = simulate(case, made.instance, Schedule(t=made.schedule.t, p=made.schedule.p + u))
+    for linear, true, before in (
+        (omega, moved.omega, made.trajectory.omega),
+        (p_slack, moved.p_slack, made.trajectory.p_slack),
+    ):
+        assert np.abs(linear - true).max() < 0.05 * np.abs(true - before).max()
+
+
+def test_maps_are_the_matrix_exponential(case, made):
+    """Over a step and over an interval, against `expm` of the system with its inputs."""
+    network, n, dt = Network(case), len(case.generators), made.instance.dt_s
+    for j, length in enumerate(made.model.lengths):
+        linear = network.linearise(made.trajectory.theta[(POINTS[j] + POINTS[j + 1]) // 2])
+        whole = np.zeros((4 * n, 4 * n))  # (δθ, δω, u, slope of u)
+        whole[:n, n : 2 * n] = np.eye(n)
+        whole[n : 2 * n, :n] = -linear.stiffness / linear.m[:, None]
+        whole[n : 2 * n, n : 2 * n] = -np.diag(linear.d / linear.m)
+        whole[n : 2 * n, 2 * n : 3 * n] = np.diag(1 / linear.m)
+        whole[2 * n : 3 * n, 3 * n :] = np.eye(n)
+        for hold, steps in ((made.model.step, 1), (made.model.across, length)):
+            exact = expm(whole * dt * steps)[: 2 * n]
+            assert hold.f[j] == pytest.approx(exact[:, : 2 * n], abs=1e-12)
+            assert hold.g[j] == pytest.approx(exact[:, 2 * n : 3 * n], abs=1e-12)
+            assert hold.h[j] * dt == pytest.approx(exact[:, 3 * n :], abs=1e-12)
+
+
+def test_states_at_knots_are_those_of_the_steps(made):
+    """Maps across intervals against the rollout step by step: ω at the knots."""
+    u = increments(made.model)
+    n_gen = u.shape[1]
+    state, states = np.zeros(2 * n_gen), [np.zeros(2 * n_gen)]
+    for j, length in enumerate(made.model.lengths):
+        slope = (u[j + 1] - u[j]) / length
+        for r in range(length):
+            f, g, h = (part[j] for part in made.model.step)
+            state = f @ state + g @ (u[j] + r * slope) + h @ slope
+        states.append(state)
+    assert made.model.states(u) == pytest.approx(np.array(states), abs=1e-11)
+    omega, _ = made.model.outputs(u)
+    expected = made.trajectory.omega[POINTS] + np.array(states)[:, n_gen:]
+    assert omega[POINTS] == pytest.approx(expected, abs=1e-11)
+
+
+def test_adjoint_is_the_transpose(made):
+    """Dot products of weights with outputs and of gradient with increments agree."""
+    model, rng = made.model, np.random.default_rng(6)
+    on_omega, on_slack = rng.normal(size=model.omega.shape), rng.normal(size=model.p_slack.shape)
+    u = rng.normal(size=model.p_gen.shape)
+    omega, p_slack = model.outputs(u)
+    forward = (on_omega * (omega - model.omega)).sum() + on_slack @ (p_slack - model.p_slack)
+    assert (model.adjoint(on_omega, on_slack) * u).sum() == pytest.approx(forward, rel=1e-10)
+
+
+def test_rows_are_local_to_their_interval(made):
+    """With x and u at the ends of its interval a row gives ω at its point, or its sum of P_s."""
+    model, u = made.model, increments(made.model)
+    omega, p_slack = model.outputs(u)
+    x = model.states(u)
+    generators, points = (
+        np.array([g for g in range(u.shape[1]) for _ in range(5)]),
+        np.tile([1, 37, 38, 152, 399], u.shape[1]),
+    )
+    first = np.array([0, 20, 37, 75, 112, 150, 151, 153, 230, 301, 350])
+    stretches = np.add.reduceat(p_slack - model.p_slack, first)
+    for rows, expected in (
+        (model.frequency_rows(generators, points), (omega - model.omega)[points, generators]),
+        (model.slack_rows(first), stretches),
+    ):
+        j = rows.interval
+        value = (
+            (rows.x * x[j]).sum(axis=1) + (rows.start * u[j]).sum(axis=1) + (rows.end * u[j + 1]).sum(axis=1)
+        )
+        assert value == pytest.approx(expected, abs=1e-10)

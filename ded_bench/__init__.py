@@ -16,17 +16,16 @@ if TYPE_CHECKING:
 
     from ded_bench.files.errors import InputError
     from ded_bench.methods.solution import Settings, Solution, Solver
+    from ded_bench.plants.plant import Plant, SimulationError
     from ded_bench.plants.score import Score
-    from ded_bench.plants.simulate import SimulationError, Trajectory
-    from ded_bench.problem.ac_case import AcCase
     from ded_bench.problem.benchmark import SplitName
     from ded_bench.problem.case import Case
     from ded_bench.problem.instance import Instance
     from ded_bench.problem.schedule import Schedule
+    from ded_bench.problem.trajectory import Trajectory
     from ded_bench.solvers.status import Status
 
 __all__ = [
-    "AcCase",
     "Case",
     "InputError",
     "Instance",
@@ -45,17 +44,16 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AcCase": "ded_bench.problem.ac_case",
     "Case": "ded_bench.problem.case",
     "InputError": "ded_bench.files.errors",
     "Instance": "ded_bench.problem.instance",
     "Schedule": "ded_bench.problem.schedule",
     "Score": "ded_bench.plants.score",
     "Settings": "ded_bench.methods.solution",
-    "SimulationError": "ded_bench.plants.simulate",
+    "SimulationError": "ded_bench.plants.plant",
     "Solution": "ded_bench.methods.solution",
     "Status": "ded_bench.solvers.status",
-    "Trajectory": "ded_bench.plants.simulate",
+    "Trajectory": "ded_bench.problem.trajectory",
 }
 
 
@@ -84,7 +82,7 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
         InputError: there is no such case or split, the limit is negative, or a file is missing or wrong.
     """
     from ded_bench.files.errors import InputError
-    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.plants.plant import servable
     from ded_bench.problem.benchmark import select_split
 
     if limit is not None and limit < 0:
@@ -133,32 +131,25 @@ def simulate(
     instance: Instance,
     schedule: Schedule | pd.DataFrame,
     case: Case | None = None,
-    truth: str | AcCase = "paper",
+    plant: str | Plant | None = None,
 ) -> Trajectory:
-    """Simulate a schedule on a true DAE; see `truth.simulate.simulate` and `truth.ac_simulate.simulate_ac`.
+    """Simulate a schedule on a plant; see `plants.simulate.simulate`.
 
     Args:
         instance: its loads and its initial state.
         schedule: generator powers; arrays or nested lists, or a data frame with columns `t` and `P_<bus>`.
         case: needed if the instance's case is not a shipped one.
-        truth: `paper`: the lossless network; `ac`: the full AC network, by the data of the shipped case;
-            or AC data of another one.
+        plant: its name, or a plant of the case; None: the case's own.
 
     Raises:
-        InputError: the schedule does not span the horizon, the case or truth is unknown, or has no AC data.
-        SimulationError: the system loses synchronism under this schedule.
+        InputError: the schedule does not span the horizon, or the case or plant is unknown.
+        SimulationError: the plant cannot follow this schedule.
     """
+    from ded_bench.plants import simulate
     from ded_bench.problem.schedule_input import as_schedule
 
     own = _case_of(instance, case)
-    given = as_schedule(schedule, own)
-    if (data := _ac_data(own, truth)) is not None:
-        from ded_bench.truth.ac_simulate import simulate_ac
-
-        return simulate_ac(own, data, instance, given)
-    from ded_bench.plants import simulate
-
-    return simulate.simulate(own, instance, given)
+    return simulate.simulate(own, instance, as_schedule(schedule, own), _plant_of(own, plant))
 
 
 def score(
@@ -166,32 +157,26 @@ def score(
     schedule: Schedule | pd.DataFrame,
     regime: str,
     case: Case | None = None,
-    truth: str | AcCase = "paper",
+    plant: str | Plant | None = None,
 ) -> Score:
-    """Simulate a schedule and judge it: cost and violations; see `truth.score.score`.
+    """Simulate a schedule and judge it: cost and violations; see `plants.score.score`.
 
     Args:
         instance: its loads and its initial state.
         schedule: as for `simulate`.
         regime: one of the case's.
         case: needed if the instance's case is not a shipped one.
-        truth: as for `simulate`.
+        plant: as for `simulate`.
 
     Raises:
         InputError: unknown regime, or as for `simulate`.
-        SimulationError: the system loses synchronism under this schedule.
+        SimulationError: the plant cannot follow this schedule.
     """
+    from ded_bench.plants import score
     from ded_bench.problem.schedule_input import as_schedule
 
     own = _case_of(instance, case)
-    given = as_schedule(schedule, own)
-    if (data := _ac_data(own, truth)) is not None:
-        from ded_bench.truth.ac_simulate import score_ac
-
-        return score_ac(own, data, instance, given, regime)
-    from ded_bench.plants import score
-
-    return score.score(own, instance, given, regime)
+    return score.score(own, instance, as_schedule(schedule, own), regime, _plant_of(own, plant))
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:
@@ -205,14 +190,10 @@ def _case_of(instance: Instance, case: Case | None) -> Case:
     return _shipped(instance.case)
 
 
-def _ac_data(case: Case, truth: str | AcCase) -> AcCase | None:
-    """The AC data that a truth needs; None for the paper's."""
-    from ded_bench.problem.ac_case import AcCase, check_truth
+def _plant_of(case: Case, plant: str | Plant | None) -> Plant | None:
+    from ded_bench.plants.plant import plant_of
 
-    if isinstance(truth, AcCase):
-        return truth
-    check_truth(truth)
-    return AcCase.of(case) if truth == "ac" else None
+    return plant_of(case, plant) if isinstance(plant, str) else plant
 
 
 @functools.cache

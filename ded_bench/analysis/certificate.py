@@ -30,9 +30,9 @@ from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.plants import score as scorer
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.plants.plant import servable
 from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score, score
-from ded_bench.plants.simulate import SimulationError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances

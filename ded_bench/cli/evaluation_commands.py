@@ -95,7 +95,7 @@ def add_commands(commands: Any) -> None:
 
 def _bench(a: argparse.Namespace) -> int:
     from ded_bench.methods.registry import get_method, registered
-    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.plants.plant import servable
     from ded_bench.results.rows import Results
 
     chosen = select_split(a.case)

@@ -53,7 +53,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _instances(a: argparse.Namespace) -> int:
-    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.plants.plant import servable
 
     case = _drawable(a.case, None)
     home = problem_folder(a.case, case)
@@ -180,7 +180,7 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 
 
 def _scenarios(a: argparse.Namespace) -> int:
-    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.plants.plant import servable
 
     case = _drawable(a.case, DURATION_S)
     folder = a.out or scenario_folder(problem_folder(a.case, case))

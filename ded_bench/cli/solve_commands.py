@@ -146,7 +146,7 @@ def _score_one(a: argparse.Namespace) -> int:
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
     from ded_bench.plants.score import score
-    from ded_bench.plants.simulate import SimulationError
+    from ded_bench.plants.plant import SimulationError
     from ded_bench.truth.ac_simulate import score_ac
 
     try:
@@ -272,8 +272,7 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
-    from ded_bench.plants.lossless.network import check_servable
-    from ded_bench.plants.lossless.servable import servable
+    from ded_bench.plants.plant import plant_of, servable
 
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
@@ -285,7 +284,7 @@ def _chosen(a: argparse.Namespace) -> Selection:
     places = a.instance or [f"instance {instance.id}" for instance, _ in chosen.instances]
     for place, (instance, _) in zip(places, chosen.instances, strict=True):
         check_plausible(chosen.case, instance, place)
-        check_servable(chosen.case, instance, str(place))
+        plant_of(chosen.case).check_servable(instance, str(place))
         if a.instance:
             check_own_name(instance, place, problems, chosen.case)
     return chosen

@@ -21,12 +21,14 @@ from ded_bench.methods.knot_program import KnotProgram, Limit, solve_with_rows_a
 from ded_bench.methods.knots import is_reachable, knot_points
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.simulate import SimulationError, Trajectory, simulate
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.trajectory import Indices, linearise_along
+from ded_bench.plants.time_varying import Indices, linearise_along
 
 #: The case's own knots, or others this far apart.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}}

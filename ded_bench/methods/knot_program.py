@@ -28,7 +28,7 @@ from ded_bench.solvers.highs import solve_form as solve_by_highs
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.trajectory import Indices, LocalRows, TrajectoryModel
+from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
@@ -72,7 +72,7 @@ class KnotProgram:
         model: a linear model along a trajectory that starts at P_0.
     """
 
-    def __init__(self, case: Case, instance: Instance, bound: float, model: TrajectoryModel) -> None:
+    def __init__(self, case: Case, instance: Instance, bound: float, model: TimeVarying) -> None:
         self.model, self.bound = model, bound
         #: How far powers may differ from the trajectory's, pu.
         self.radius = np.inf
@@ -89,9 +89,10 @@ class KnotProgram:
         self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
         self._speed = self._x[:, model.speed]
         self._n_columns = len(self.pieces) + at_end * self._n
-        self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._durations = model.lengths * instance.dt_s
         self._price = instance.cost_slack(case)
+        self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
+        self._cost = self._columns_cost()
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
@@ -211,12 +212,10 @@ class KnotProgram:
         ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
         slack = np.add.reduceat(model.p_slack, self.pieces)
         omega = model.omega[limits[:, 1], limits[:, 0]]
-        cost = np.zeros(self._n_columns)
-        cost[self._u], cost[self._s] = self._generation[1:], self._price
         lower, upper = self._column_limits()
         rows = [self._ramp_rows(), self._slack, self._frequency_rows(limits)]
         return FreeForm(
-            cost=cost,
+            cost=self._cost,
             equal=self._dynamics,
             right=np.zeros(self._x.size),
             between=sp.csc_matrix(sp.vstack(rows)),
@@ -234,8 +233,27 @@ class KnotProgram:
         p_gen = np.array(model.p_gen)
         p_gen[1:] = np.clip(p_gen[1:] + columns[self._u], self._case.p_min, self._case.p_max)
         omega, p_slack = model.outputs(p_gen - model.p_gen)
-        objective = float((self._generation * p_gen).sum() + self._price * np.abs(p_slack).sum())
-        return Prediction(p_gen, omega, p_slack, objective)
+        if model.delivered is None:
+            generation = float((self._generation * p_gen).sum())
+        else:
+            priced = [self._cost[part] @ columns[part] for part in (self._u.ravel(), self._x.ravel())]
+            generation = float(
+                (model.delivered.p_gen @ self._instance.cost_gen(self._case)).sum() + sum(priced)
+            )
+        return Prediction(p_gen, omega, p_slack, generation + self._price * float(np.abs(p_slack).sum()))
+
+    def _columns_cost(self) -> Array:
+        """Cost of all columns: of what generators deliver, and of |P_s|."""
+        cost = np.zeros(self._n_columns)
+        cost[self._s] = self._price
+        if self.model.delivered is None:
+            cost[self._u] = self._generation[1:]
+            return cost
+        rows = self.model.cost_rows(self._instance.cost_gen(self._case))
+        cost[self._u] = rows.end
+        cost[self._u[:-1]] += rows.start[1:]
+        cost[self._x[:-1]] = rows.x[1:]
+        return cost
 
     def _column_limits(self) -> tuple[Array, Array]:
         """Limits of all columns: of s, P and, at the knots, ω."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.surrogates.trajectory import Indices
+from ded_bench.plants.time_varying import Indices
 
 #: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
 #: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.

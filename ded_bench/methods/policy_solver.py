@@ -10,7 +10,7 @@ import numpy as np
 
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Solution, Solver
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.plants.plant import servable
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule

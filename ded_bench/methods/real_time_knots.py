@@ -34,7 +34,7 @@ from ded_bench.methods.model_artifact import model_artifact
 from ded_bench.methods.receding_knots import receding_points, tightened
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import reference
-from ded_bench.plants.simulate import SimulationError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -45,7 +45,7 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
 from ded_bench.surrogates.instance_model import model_along
 from ded_bench.surrogates.planned_trajectory import simulate_plan
-from ded_bench.surrogates.trajectory import Indices, TrajectoryModel, linearise_along
+from ded_bench.plants.time_varying import Indices, TimeVarying, linearise_along
 
 #: Part of the frequency bound that plans leave free.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
@@ -160,7 +160,7 @@ class RealTimeSolver:
             error=status.sentence if exceeds else "",
         )
 
-    def _model(self, instance: Instance, last: Schedule | None, points: Indices) -> TrajectoryModel:
+    def _model(self, instance: Instance, last: Schedule | None, points: Indices) -> TimeVarying:
         """The surrogate's model along the plan in force, or what the network can carry instead."""
         wanted = self._within_ramps(instance, last, points)
         for p_gen in first_schedules(self.case, instance, wanted, points):

@@ -18,7 +18,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.surrogates.find import find_surrogate
-from ded_bench.surrogates.trajectory import Indices
+from ded_bench.plants.time_varying import Indices
 
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"reserve": real_time_knots.SETTINGS["real-time"]}
 #: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to

@@ -28,7 +28,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import Surrogate, find_surrogate
-from ded_bench.surrogates.trajectory import Indices
+from ded_bench.plants.time_varying import Indices
 
 #: Part of the frequency bound that plans leave free.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

@@ -15,14 +15,14 @@ from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, solve_with_rows_added
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.solution import Solution
-from ded_bench.plants.simulate import SimulationError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate
 from ded_bench.surrogates.instance_model import model_along
-from ded_bench.surrogates.trajectory import Indices, TrajectoryModel
+from ded_bench.plants.time_varying import Indices, TimeVarying
 
 #: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7
@@ -58,7 +58,7 @@ def solve_on_surrogate(
         soft: `Infeasible` comes with the schedule of least frequency excess, summed over knot intervals.
     """
 
-    def along(p_gen: Array) -> TrajectoryModel:
+    def along(p_gen: Array) -> TimeVarying:
         return model_along(case, surrogate, instance, p_gen, points)
 
     return solve_along(case, instance, regime, points, along, time_limit_s, soft)
@@ -69,7 +69,7 @@ def solve_along(
     instance: Instance,
     regime: str,
     points: Indices,
-    along: Callable[[Array], TrajectoryModel],
+    along: Callable[[Array], TimeVarying],
     time_limit_s: float | None = None,
     soft: bool = False,
 ) -> Solution:

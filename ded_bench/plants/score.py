@@ -1,4 +1,4 @@
-"""The scorer: what a schedule costs and which limits it breaks, re-simulated on the true DAE.
+"""The scorer: what a schedule costs and which limits it breaks, simulated on a plant.
 
 It sees an instance and a schedule, never a model, a network or a solver's status.
 """
@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.plants.simulate import Trajectory, simulate
+from ded_bench.plants.plant import Plant
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
 
 #: What counts as feasible: excess frequency in Hz, excess of power limits in pu.
 FEASIBLE_HZ, FEASIBLE_PU = 1e-4, 1e-6
@@ -44,30 +46,31 @@ class Score:
         return self.freq_violation_hz <= hz and all(excess <= pu for excess in power)
 
 
-def score(case: Case, instance: Instance, schedule: Schedule, regime: str) -> Score:
-    """Simulate one schedule and judge it.
+def score(
+    case: Case, instance: Instance, schedule: Schedule, regime: str, plant: Plant | None = None
+) -> Score:
+    """Simulate one schedule on a plant, the case's own unless another is given, and judge it.
 
     Raises:
         InputError: unknown regime, or the schedule does not span the horizon.
-        SimulationError: the system loses synchronism under this schedule.
+        SimulationError: the plant cannot follow this schedule.
     """
     case.check_regimes([regime])
-    return judge(case, instance, simulate(case, instance, schedule), regime)
+    return judge(case, instance, simulate(case, instance, schedule, plant), regime)
 
 
 def judge(case: Case, instance: Instance, trajectory: Trajectory, regime: str) -> Score:
-    """Cost and violations of a simulated trajectory."""
-    p_gen = trajectory.p_gen
-    cost = p_gen @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(trajectory.p_slack)
+    """Cost of what was delivered, and violations: ramps and limits are of the set-points."""
+    p_set = trajectory.p_set
     excess_omega = np.abs(trajectory.omega) - case.omega_bound(regime)
-    excess_ramp = np.abs(np.diff(p_gen, axis=0)) - case.ramp * instance.dt_s
-    excess_bound = np.maximum(p_gen - case.p_max, case.p_min - p_gen)
+    excess_ramp = np.abs(np.diff(p_set, axis=0)) - case.ramp * instance.dt_s
+    excess_bound = np.maximum(p_set - case.p_max, case.p_min - p_set)
     return Score(
-        objective=float(cost.sum()),
+        objective=trajectory.cost(instance.cost_gen(case), instance.cost_slack(case)),
         freq_violation_hz=_positive(excess_omega.max()) / (2 * np.pi),
         ramp_violation=_positive(excess_ramp.max()),
         bound_violation=_positive(excess_bound.max()),
-        initial_violation=float(np.abs(p_gen[0] - instance.p_initial(case)).max()),
+        initial_violation=float(np.abs(p_set[0] - instance.p_initial(case)).max()),
     )
 
 

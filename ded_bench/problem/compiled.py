@@ -1,22 +1,40 @@
-"""Compiled functions: loops over plain arrays, where NumPy would be felt by users.
-
-Numba's cache on disk notices that a function's own file changed, not that a function which it calls did:
-compiled functions call only those of their own file.
-"""
+"""Compiled functions: loops over plain arrays, where NumPy would be felt by users."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Callable
-from typing import TypeVar, cast
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+
 
 def compiled(function: Function) -> Function:
-    """Compile when first called; kept on disk, if the package's or the user's folder can be written."""
+    """Compile when first called; kept on disk, if the package's or the user's folder can be written.
+
+    What is kept is of use as long as no compiled source of the package changes: Numba itself looks at a
+    function's own file only, not at those of the functions that it calls.
+    """
     try:
-        return cast(Function, numba.njit(cache=True, nogil=True)(function))
+        made: Any = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError:  # there is no such folder
         return cast(Function, numba.njit(nogil=True)(function))
+    made._cache._cache_file._source_stamp = sources_stamp()
+    return cast(Function, made)
+
+
+@functools.cache
+def sources_stamp(package: Path = _PACKAGE) -> str:
+    """Changes with any source below a folder that holds compiled functions."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        if b"@compiled" in content:
+            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + content)
+    return digest.hexdigest()

@@ -25,7 +25,9 @@ from ded_bench.analysis.summary import (
 from ded_bench.evaluate.ablation import main_rows
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.simulate import SimulationError, Trajectory, simulate
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance

@@ -11,7 +11,7 @@ import numpy as np
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table, cell, plain_name
-from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.ac_case import TRUTHS
 from ded_bench.problem.forecast import QUALITIES
 

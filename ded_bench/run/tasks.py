@@ -12,7 +12,7 @@ from ded_bench.methods.plugin import accept
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.plants.score import Score, score
-from ded_bench.plants.simulate import SimulationError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -91,9 +91,7 @@ def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | Non
         for folder in search:
             if model_file(folder, name).is_file():
                 return model_file(folder, name)
-        problem = (
-            f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
-        )
+        problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
         raise InputError("--model", name, problem)
     if Path(name).is_file():
         return Path(name)

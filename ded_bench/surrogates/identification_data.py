@@ -10,13 +10,14 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.lossless.servable import servable
-from ded_bench.plants.simulate import SimulationError, Trajectory, simulate
+from ded_bench.plants.plant import SimulationError, servable
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
 
 #: Range of a uniform draw.
 Span = tuple[float, float]
@@ -57,8 +58,8 @@ def trajectories(
 
 def _signals(run: Trajectory, generators: Array) -> tuple[Array, ...]:
     """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""
-    inputs = np.hstack([run.p_gen, run.p_load])
-    return inputs, run.theta[0].copy(), run.theta[:, generators], run.omega, run.p_slack
+    inputs, theta = np.hstack([run.p_gen, run.p_load]), run.states
+    return inputs, theta[0].copy(), theta[:, generators], run.omega, run.p_slack
 
 
 def _stacked(instances: list[Instance], kinds: list[str], runs: list[tuple[Array, ...]]) -> Trajectories:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.koopman.ac_trajectory import linearise_along_ac
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import plant_of
 from ded_bench.plants.simulate import simulate
+from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, repeated
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import Surrogate
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.trajectory import Hold, Indices, TrajectoryModel, linearise_along, repeated
-from ded_bench.truth.ac_network import AcNetwork
-from ded_bench.truth.ac_simulate import simulate_ac
 
 
 def model_along(
     case: Case, surrogate: Surrogate, instance: Instance, p_gen: Array, points: Indices
-) -> TrajectoryModel:
+) -> TimeVarying:
     """The linear model of one instance by which a surrogate answers to schedules linear between knots.
 
     Args:
@@ -38,16 +36,13 @@ def model_along(
     if isinstance(surrogate, Koopman):
         surrogate.check_step(instance)
         return _lifted_along(case, surrogate, instance, p_gen, points)
-    schedule = Schedule(t=instance.grid[points], p=p_gen)
-    if surrogate.data is not None:
-        trajectory = simulate_ac(case, surrogate.data, instance, schedule)
-        return linearise_along_ac(AcNetwork(case, surrogate.data), trajectory, points)
-    return linearise_along(case, simulate(case, instance, schedule), points)
+    schedule, plant = Schedule(t=instance.grid[points], p=p_gen), plant_of(case)
+    return plant.linearise_along(simulate(case, instance, schedule, plant), points)
 
 
 def _lifted_along(
     case: Case, model: Koopman, instance: Instance, p_gen: Array, points: Indices
-) -> TrajectoryModel:
+) -> TimeVarying:
     """A lifted model around its own rollout.
 
     Args:
@@ -68,7 +63,7 @@ def _lifted_along(
     over = [repeated(one, int(length)) for length in kinds]
     slack = np.zeros((1, len(psi)))
     slack[0, n_gen] = 1.0
-    return TrajectoryModel(
+    return TimeVarying(
         points=points,
         step=Hold(*(np.broadcast_to(part, (len(lengths), *part.shape[1:])) for part in one)),
         across=Hold(*(np.concatenate(parts)[kind] for parts in zip(*over, strict=True))),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ded_bench.methods.admm.admm_policy import SharedPolicy
 from ded_bench.methods.policy_file import Scope
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import SimulationError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 

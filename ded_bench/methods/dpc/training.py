@@ -25,7 +25,7 @@ from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances

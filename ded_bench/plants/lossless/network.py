@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.state import State
 
 if TYPE_CHECKING:
-    from ded_bench.plants.lossless.integrator import Grid, Indices
+    from ded_bench.plants.lossless.stepper import CompiledGrid, Indices
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
@@ -87,12 +85,12 @@ class Network:
         )
 
     @functools.cached_property
-    def grid(self) -> Grid:
+    def grid(self) -> CompiledGrid:
         """What compiled functions see of this network."""
-        from ded_bench.plants.lossless.integrator import Grid  # and with it Numba: help does without
+        from ded_bench.plants.lossless.stepper import CompiledGrid  # and with it Numba: help does without
 
         places = self.generators, self.algebraic, self.slack
-        return Grid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
+        return CompiledGrid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
@@ -190,7 +188,7 @@ class Network:
         return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
 
     def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
-        from ded_bench.plants.lossless.integrator import solve_angles  # here only, as in `grid`
+        from ded_bench.plants.lossless.stepper import solve_angles  # here only, as in `grid`
 
         theta = np.array(theta)
         f = np.empty(theta.shape)
@@ -203,27 +201,3 @@ class Network:
         if not solved:
             raise PowerFlowError("the power flow has no solution")
         return theta, f
-
-
-def check_servable(case: Case, instance: Instance, source: str) -> None:
-    """Check that the power flow can serve an instance's loads at t = 0 and at every kink after it.
-
-    Raises:
-        InputError: it cannot; names the source and the field.
-    """
-    network = Network(case)
-    try:
-        network.initial_angles(instance)
-    except PowerFlowError as error:
-        given = "power" if instance.initial.theta is None else "theta"
-        problem = f"initial loads and {given} cannot be served: {error}"
-        raise InputError(source, f"load, initial.{given}", problem) from None
-    kinks = {0.0, instance.horizon_s, *(t for load in instance.load.values() for t in load.kinks)}
-    times = np.array(sorted(t for t in kinks if t <= instance.horizon_s))
-    p_load = instance.p_load(case, times)
-    p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
-    for t, gen, load in zip(times, p_gen, p_load, strict=True):
-        try:
-            network.power_flow(gen, load)
-        except PowerFlowError as error:
-            raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.report.figures.style import (
     BLACK,

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ded_bench.analysis.summary import title
-from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Case
 from ded_bench.report.figures.style import (
     BLACK,

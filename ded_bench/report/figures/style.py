@@ -24,7 +24,7 @@ from ded_bench.analysis.reference import ACCURATE
 from ded_bench.analysis.summary import title
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
-from ded_bench.plants.simulate import Trajectory
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.plants.simulate import SimulationError, Trajectory
+from ded_bench.plants.plant import SimulationError
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Initial, Instance

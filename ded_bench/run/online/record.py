@@ -9,7 +9,9 @@ import numpy as np
 
 from ded_bench.plants.lossless.integrator import Inputs, integrate
 from ded_bench.plants.lossless.network import Network, PowerFlowError
-from ded_bench.plants.simulate import METHOD, STEP_BY_MODE, SimulationError, Trajectory
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.simulate import METHOD, STEP_BY_MODE
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.state import State

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import DOP853
 
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
@@ -30,7 +31,16 @@ class Tableau(NamedTuple):
     c: Array  # (s,)
 
 
-class Grid(NamedTuple):
+#: Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential
+#: Equations I, II.5), with SciPy's coefficients.
+DORMAND_PRINCE_8 = Tableau(DOP853.A.copy(), DOP853.B.copy(), DOP853.C.copy())
+#: Kutta's method of order 4 (ibid., II.1).
+KUTTA_4 = Tableau(
+    a=np.diag([0.5, 0.5, 1.0], -1), b=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0, c=np.array([0.0, 0.5, 0.5, 1.0])
+)
+
+
+class CompiledGrid(NamedTuple):
     """A lossless network and its machines."""
 
     lines: Indices  # (n_line, 2): the buses that each joins
@@ -53,7 +63,13 @@ class Inputs(NamedTuple):
 
 @compiled
 def integrate(
-    tableau: Tableau, grid: Grid, inputs: Inputs, steps: int, theta: Array, omega: Array, p_slack: Array
+    tableau: Tableau,
+    grid: CompiledGrid,
+    inputs: Inputs,
+    steps: int,
+    theta: Array,
+    omega: Array,
+    p_slack: Array,
 ) -> int:
     """Integrate from the first point of time to the last.
 
@@ -129,7 +145,7 @@ def integrate(
 
 
 @compiled
-def _solve_algebraic(grid: Grid, wanted: Array, inverse: Array, angle: Array, f: Array) -> bool:
+def _solve_algebraic(grid: CompiledGrid, wanted: Array, inverse: Array, angle: Array, f: Array) -> bool:
     """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
 
     Returns:
@@ -167,7 +183,7 @@ def _solve_algebraic(grid: Grid, wanted: Array, inverse: Array, angle: Array, f:
 
 
 @compiled
-def _invert(grid: Grid, angle: Array, inverse: Array) -> None:
+def _invert(grid: CompiledGrid, angle: Array, inverse: Array) -> None:
     """Set the inverse of the algebraic buses' Jacobian ∂f/∂θ; LinAlgError if it is singular."""
     place = np.full(len(angle), -1)
     for i in range(len(grid.algebraic)):
@@ -187,7 +203,7 @@ def _invert(grid: Grid, angle: Array, inverse: Array) -> None:
 
 
 @compiled
-def solve_angles(grid: Grid, free: Indices, wanted: Array, theta: Array, f: Array) -> bool:
+def solve_angles(grid: CompiledGrid, free: Indices, wanted: Array, theta: Array, f: Array) -> bool:
     """Find the angles of some buses that give wanted injections there, one instance after another.
 
     Newton's method, whose equations are solved anew in every step.

@@ -1,15 +1,14 @@
-"""Linear models along a trajectory, by the knots of the schedules that they answer to.
+"""Linear time-varying models along a trajectory, by the knots of the schedules that they answer to.
 
-Two kinds. The swing DAE linearised along a simulated trajectory is linear and time-varying, with nothing to
-train: between two knots the reduced stiffness S is that of the middle of the interval (generator angles
-and loads determine the angles of all other buses, see `Network.linearise`), and deviations from the
-trajectory under an input increment δP, linear between grid points, obey
+Deviations x of any plant's state from the trajectory, under an increment u of the set-points that is linear
+between knots, go from grid point to grid point by a map that is the same throughout an interval between
+knots (first-order hold):
 
-    dδθ/dt = δω,    M dδω/dt = -D δω - S δθ + δP,    δP_s = -1ᵀ S δθ,
+    x⁺ = f x + g u + h Δu,    δω = C x,    δP_s = c x,    δP = C_p x + D_p u
 
-advanced from grid point to grid point by the exact map of that equation (first-order hold). A lifted model
-(`Koopman`) has the same form, the same for all intervals, around its own rollout under any powers.
-The loads are those of the trajectory, so that they enter through it alone.
+with δP what is delivered, on plants where that differs from the set-points. The loads are those of the
+trajectory, so that they enter through it alone. A lifted model (`Koopman`) has the same form, the same for
+all intervals, around its own rollout under any powers.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.simulate import Trajectory
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array
 
 Indices = NDArray[np.intp]
 
@@ -60,22 +57,30 @@ class LocalRows(NamedTuple):
     end: Array  # (n_rows, n_gen)
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryModel:
-    """(ω, P_s) at all grid points as affine functions of generator power at the knots.
+class Delivered(NamedTuple):
+    """What generators deliver where that is not their set-points."""
 
-    The state x is (δθ, δω) of the generators at a knot, or δψ of a lifted model; the input is u = δP at the
-    knots; both are deviations from the trajectory. Interval j lies between knots j and j + 1.
+    c: Array  # C_p, (n_intervals, n_gen, n_state)
+    d: Array  # D_p, (n_intervals, n_gen, n_gen)
+    p_gen: Array  # of the trajectory, (n_points, n_gen), pu
+
+
+@dataclass(frozen=True, eq=False)
+class TimeVarying:
+    """(ω, P_s) at all grid points as affine functions of set-points at the knots.
+
+    Interval j lies between knots j and j + 1.
     """
 
     points: Indices  # (n_knots,): grid point of each knot
     step: Hold  # over one grid step, of each interval
     across: Hold  # over the whole of each interval
-    speed: slice  # the entries δω of the state
+    speed: slice | Array  # C: the entries δω of the state, or (n_intervals, n_gen, n_state)
     slack: Array  # (n_intervals, n_state): δP_s / δx
     omega: Array  # (n_points, n_gen): of the trajectory, rad/s
     p_slack: Array  # (n_points,): of the trajectory, pu
-    p_gen: Array  # (n_knots, n_gen): of the trajectory, pu
+    p_gen: Array  # (n_knots, n_gen): set-points of the trajectory, pu
+    delivered: Delivered | None = None  # None: the set-points are delivered
 
     @property
     def lengths(self) -> Indices:
@@ -142,7 +147,21 @@ class TrajectoryModel:
 
     def _outputs(self, deviation: Array) -> tuple[Array, Array]:
         p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
-        return self.omega + deviation[:, self.speed], self.p_slack + p_slack
+        if isinstance(self.speed, slice):
+            return self.omega + deviation[:, self.speed], self.p_slack + p_slack
+        change = np.empty_like(self.omega)
+        ends = [*self.points[1:-1], len(change)]  # the point at a knot belongs to the interval after it
+        for c, first, last in zip(self.speed, self.points, ends, strict=False):
+            change[first:last] = deviation[first:last] @ c.T
+        return self.omega + change, self.p_slack + p_slack
+
+    def _speed_rows(self, interval: Indices, generators: Indices) -> Array:
+        """Rows of C, shape (n_rows, n_state)."""
+        if not isinstance(self.speed, slice):
+            return np.asarray(self.speed[interval, generators])
+        rows = np.zeros((len(interval), self.slack.shape[1]))
+        rows[np.arange(len(interval)), self.speed.start + generators] = 1.0
+        return rows
 
     def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
         """δω at single grid points, as rows in the variables of the intervals that they lie in.
@@ -156,7 +175,7 @@ class TrajectoryModel:
 
         def add(r: int, costate: Array) -> None:
             here = np.flatnonzero(steps == r)
-            costate[interval[here], slot[here], self.speed.start + generators[here]] += 1.0
+            costate[interval[here], slot[here]] += self._speed_rows(interval[here], generators[here])
 
         count = int(slot.max(initial=-1)) + 1
         rows = self._costates(count, add)
@@ -184,6 +203,35 @@ class TrajectoryModel:
             interval, rows.x[interval, slot], rows.start[interval, slot], rows.end[interval, slot]
         )
 
+    def cost_rows(self, cost: Array) -> LocalRows:
+        """Sums of cost · δP, as delivered, over the grid points of every interval, a row for each.
+
+        Args:
+            cost: of the generators, shape (n_gen,).
+
+        Raises:
+            ValueError: the set-points are delivered.
+        """
+        if self.delivered is None:
+            raise ValueError("the set-points are delivered")
+        on_state, on_input = (np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2])
+
+        def add(r: int, costate: Array) -> None:
+            here = self._within(r)
+            costate[here, 0] += on_state[here]
+
+        rows, count = self._costates(1, add), self.lengths.astype(float)
+        count[-1] += 1.0
+        # u rises linearly over an interval: Σ r / length over its points, of which the last has one more.
+        risen = (count - 1.0) * count / 2.0 / self.lengths
+        start, end = on_input * (count - risen)[:, None], on_input * risen[:, None]
+        return LocalRows(rows.interval, rows.x[:, 0], rows.start[:, 0] + start, rows.end[:, 0] + end)
+
+    def _within(self, r: int) -> Indices:
+        """Intervals with a point r steps after their start; the point at a knot is of the one after it."""
+        length = self.lengths
+        return np.flatnonzero((r < length) | ((r == length) & (self.points[1:] == self.points[-1])))
+
     def adjoint(self, on_omega: Array, on_slack: Array) -> Array:
         """Gradient with respect to u of Σ on_omega · ω + on_slack · P_s over all grid points.
 
@@ -197,10 +245,12 @@ class TrajectoryModel:
         n_gen, length = self.p_gen.shape[1], self.lengths
 
         def add(r: int, costate: Array) -> None:
-            # The point at a knot belongs to the interval after it.
-            here = np.flatnonzero((r < length) | ((r == length) & (self.points[1:] == self.points[-1])))
+            here = self._within(r)
             at = self.points[here] + r
-            costate[here, 0, self.speed] += on_omega[at]
+            if isinstance(self.speed, slice):
+                costate[here, 0, self.speed] += on_omega[at]
+            else:
+                costate[here, 0] += np.einsum("jg,jgi->ji", on_omega[at], self.speed[here])
             costate[here, 0] += on_slack[at, None] * self.slack[here]
 
         rows = self._costates(1, add)
@@ -247,86 +297,42 @@ def _places(interval: Indices) -> Indices:
     return places
 
 
-def linearise_along(case: Case, trajectory: Trajectory, points: Indices) -> TrajectoryModel:
-    """Linearise along a simulated trajectory.
-
-    Args:
-        case: the grid.
-        trajectory: what `truth.simulate` says about one schedule.
-        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
-    """
-    network = Network(case)
-    middle = trajectory.theta[(points[:-1] + points[1:]) // 2]
-    stiffness = np.stack([network.linearise(theta).stiffness for theta in middle])
-    return time_varying(trajectory, points, stiffness, -stiffness.sum(axis=1), network.m, network.d)
-
-
-def time_varying(
-    trajectory: Trajectory, points: Indices, stiffness: Array, slack: Array, m: Array, d: Array
-) -> TrajectoryModel:
-    """The linear model around a trajectory with one stiffness for each interval between knots.
-
-    Args:
-        trajectory: the reference.
-        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
-        stiffness: change of the generators' electrical powers by their angles, shape
-            (n_intervals, n_gen, n_gen), pu/rad.
-        slack: of the slack's power likewise, shape (n_intervals, n_gen), pu/rad.
-        m: inertia, shape (n_gen,), s² pu/rad.
-        d: damping, shape (n_gen,), s pu/rad.
-    """
-    dt_s = float(trajectory.t[1] - trajectory.t[0])
-    step, n_gen = _one_step(stiffness / m[:, None], d / m, 1.0 / m, dt_s), len(m)
-    lengths = np.diff(points)
+def across_intervals(step: Hold, lengths: Indices) -> Hold:
+    """Maps over whole intervals of so many grid steps, from those over one step of each."""
     across = Hold(*(np.empty_like(part) for part in step))
     for length in np.unique(lengths):
         chosen = np.flatnonzero(lengths == length)
         for whole, part in zip(across, repeated(step.take(chosen), int(length)), strict=True):
             whole[chosen] = part
-    return TrajectoryModel(
-        points=points,
-        step=step,
-        across=across,
-        speed=slice(n_gen, 2 * n_gen),
-        slack=np.concatenate([slack, np.zeros((len(lengths), n_gen))], axis=1),
-        omega=trajectory.omega,
-        p_slack=trajectory.p_slack,
-        p_gen=trajectory.p_gen[points],
-    )
+    return across
 
 
-def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hold:
-    """The exact map over one grid step, by the series of the matrix exponential.
+def series_step(
+    derivative: Callable[[Array], Array], n_maps: int, n_state: int, size: float
+) -> tuple[Array, Array, Array]:
+    """exp(A dt), φ_1 and φ_2 of several A by the series, where A dt is known by its products alone.
 
-    With A the system's matrix and φ_2 = Σ (A dt)^i / (i + 2)!, it is f = I + A dt φ_1, g = dt φ_1 B and
-    h = dt φ_2 B, where φ_1 = I + A dt φ_2.
+    φ_2 = Σ (A dt)^i / (i + 2)!, φ_1 = I + A dt φ_2 and exp(A dt) = I + A dt φ_1; with these the first-order
+    hold of dx/dt = A x + B u is f = exp(A dt), g = dt φ_1 B, h = dt φ_2 B.
 
     Args:
-        stiffness: M⁻¹ S, shape (n_maps, n_gen, n_gen), 1/s².
-        damping: M⁻¹ D, shape (n_gen,), 1/s.
-        gain: M⁻¹, shape (n_gen,).
-        dt_s: grid step, s.
+        derivative: A dt times a value of shape (n_maps, n_state, n_state).
+        n_maps: how many A.
+        n_state: their size.
+        size: a bound of |A dt| in some norm.
+
+    Returns:
+        Each of shape (n_maps, n_state, n_state).
     """
-    n_maps, n, _ = stiffness.shape
-    eye = np.broadcast_to(np.eye(2 * n), (n_maps, 2 * n, 2 * n))
-
-    def derivative(value: Array) -> Array:
-        angle, speed = value[:, :n], value[:, n:]
-        rate = -(stiffness @ angle) - damping[:, None] * speed
-        return np.concatenate([speed, rate], axis=1) * dt_s
-
-    # |A dt| of (θ, ω / ω_fastest), in which the matrix is balanced.
-    size = dt_s * (np.sqrt(np.abs(stiffness).sum(axis=2).max()) + damping.max())
-    term, total, degree = eye / 2.0, eye / 2.0, 0
-    remainder = 1.0
+    eye = np.broadcast_to(np.eye(n_state), (n_maps, n_state, n_state))
+    term, total, degree, remainder = eye / 2.0, eye / 2.0, 0, 1.0
     while remainder > SERIES_END:
         degree += 1
         term = derivative(term) / (degree + 2)
         total = total + term
         remainder *= size / degree
     first = eye + derivative(total)
-    one = eye + derivative(first)
-    return Hold(one, dt_s * first[:, :, n:] * gain, dt_s * total[:, :, n:] * gain)
+    return eye + derivative(first), first, total
 
 
 def repeated(step: Hold, times: int) -> Hold:

@@ -1,0 +1,204 @@
+"""The plant `lossless`: the paper's structure-preserving network behind an infinite bus.
+
+Classical machines on a lossless network; the delivered power is the set-point, and the slack bus takes what
+is missing. See `network` for the equations.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.files.errors import InputError
+from ded_bench.plants.lossless.network import Network, PowerFlowError
+from ded_bench.plants.plant import Piece, SimulationError
+from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, series_step
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance, LoadRamp
+from ded_bench.problem.state import State
+from ded_bench.problem.trajectory import Trajectory
+
+#: Longest step times the fastest mode: far inside the region of stability; errors of the exact method are
+#: below 1e-12.
+STEP_BY_MODE = 0.25
+#: Mismatch of the algebraic equations where a linearisation follows, pu: ω is then within 1e-6 Hz (140bus).
+PLANNING_MISMATCH = 1e-7
+#: Numbers in the Jacobians of power flows that are solved together.
+BATCH = 1_000_000
+
+
+class LosslessState(NamedTuple):
+    """Where the grid is: angles and frequency deviations, the powers, and how finely steps are divided."""
+
+    theta: Array  # of all buses, (n_bus,), rad, relative to the slack
+    omega: Array  # (n_gen,), rad/s
+    p_gen: Array  # (n_gen,), pu
+    divisions: float  # steps per second of the integrator
+
+
+@dataclass(frozen=True)
+class LosslessPlant:
+    """The lossless network of one case."""
+
+    case: Case
+    name: str = "lossless"
+
+    @functools.cached_property
+    def network(self) -> Network:
+        """Its equations."""
+        return Network(self.case)
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the case, which holds all of its data."""
+        return self.case.fingerprint
+
+    def initial(self, instance: Instance) -> LosslessState:
+        """See `Plant.initial`; angles are those of `Network.initial_angles`."""
+        try:
+            theta = self.network.initial_angles(instance)
+        except PowerFlowError as error:
+            raise SimulationError(f"the system cannot follow this schedule: {error}") from None
+        fastest = float(np.abs(self.network.linearise(theta).modes()).max())
+        omega, p_gen = instance.omega_initial(self.case), instance.p_initial(self.case)
+        return LosslessState(theta, omega, p_gen, fastest / STEP_BY_MODE)
+
+    def advance(
+        self, state: LosslessState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
+    ) -> Piece:
+        """See `Plant.advance`; steps of fixed length lead from point to point, so that none spans a kink."""
+        from ded_bench.plants.lossless.stepper import DORMAND_PRINCE_8, KUTTA_4, Inputs, integrate
+
+        network, n = self.network, len(p_set)
+        theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
+        theta[0], omega[0], p_slack = state.theta, state.omega, np.empty(n)
+        inputs = Inputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
+        steps = max(int(np.ceil(state.divisions * dt_s)), 1)
+        grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
+        try:
+            done = integrate(
+                DORMAND_PRINCE_8 if exact else KUTTA_4, grid, inputs, steps, theta, omega, p_slack
+            )
+        except np.linalg.LinAlgError:
+            done = 0
+        if done < n:
+            raise SimulationError("the system cannot follow this schedule: the power flow has no solution")
+        end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions)
+        return Piece(omega, p_set, p_slack, theta, end)
+
+    def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
+        """See `Plant.linearise_along`.
+
+        Between two knots the reduced stiffness S is that of the middle of the interval: generator angles and
+        loads determine the angles of all other buses (see `Network.linearise`). Deviations obey
+
+            dδθ/dt = δω,    M dδω/dt = -D δω - S δθ + δP,    δP_s = -1ᵀ S δθ,
+
+        advanced from grid point to grid point by the exact map of that equation (first-order hold).
+        """
+        network, n_gen = self.network, len(self.case.generators)
+        middle = trajectory.states[(points[:-1] + points[1:]) // 2]
+        stiffness = np.stack([network.linearise(theta).stiffness for theta in middle])
+        dt_s = float(trajectory.t[1] - trajectory.t[0])
+        step = _one_step(stiffness / network.m[:, None], network.d / network.m, 1.0 / network.m, dt_s)
+        slack = -stiffness.sum(axis=1)
+        return TimeVarying(
+            points=points,
+            step=step,
+            across=across_intervals(step, np.diff(points)),
+            speed=slice(n_gen, 2 * n_gen),
+            slack=np.concatenate([slack, np.zeros_like(slack)], axis=1),
+            omega=trajectory.omega,
+            p_slack=trajectory.p_slack,
+            p_gen=trajectory.p_set[points],
+        )
+
+    def observed(self, state: LosslessState) -> State:
+        """Angles, frequency deviations and powers of the generators."""
+        return State(state.theta[self.network.generators], state.omega, state.p_gen)
+
+    def columns(self, states: Array) -> Mapping[str, Array]:
+        """Angles of all buses, `theta_<bus>`, rad, relative to the slack."""
+        return {f"theta_{bus.id}": column for bus, column in zip(self.case.buses, states.T, strict=True)}
+
+    def servable(self, instances: Sequence[Instance]) -> NDArray[np.bool_]:
+        """See `Plant.servable`.
+
+        The power flow must serve the initial loads from P_0, and the loads at 0, at each kink and at the
+        horizon from the static dispatch. The loads of drawn instances ramp once each.
+        """
+        powers = [self._kink_powers(instance) for instance in instances]
+        p_gen = np.concatenate([gen for gen, _ in powers])
+        p_load = np.concatenate([load for _, load in powers])
+        return np.asarray(self._served(p_gen, p_load).reshape(len(instances), -1).all(axis=1))
+
+    def check_servable(self, instance: Instance, source: str) -> None:
+        """See `Plant.check_servable`."""
+        case, network = self.case, self.network
+        try:
+            network.initial_angles(instance)
+        except PowerFlowError as error:
+            given = "power" if instance.initial.theta is None else "theta"
+            problem = f"initial loads and {given} cannot be served: {error}"
+            raise InputError(source, f"load, initial.{given}", problem) from None
+        kinks = {0.0, instance.horizon_s, *(t for load in instance.load.values() for t in load.kinks)}
+        times = np.array(sorted(t for t in kinks if t <= instance.horizon_s))
+        p_load = instance.p_load(case, times)
+        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+        for t, gen, load in zip(times, p_gen, p_load, strict=True):
+            try:
+                network.power_flow(gen, load)
+            except PowerFlowError as error:
+                raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
+
+    def _kink_powers(self, instance: Instance) -> tuple[Array, Array]:
+        """Powers that must be servable, shapes (2 n_load + 3, n_gen) and (2 n_load + 3, n_load), pu."""
+        case = self.case
+        ramps = [load for load in instance.load.values() if isinstance(load, LoadRamp)]
+        ends = [t for ramp in ramps for t in (ramp.start, ramp.start + ramp.duration)]
+        times = np.minimum([0.0, *ends, instance.horizon_s], instance.horizon_s)
+        p_load = instance.p_load(case, times)
+        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+        return np.vstack([instance.p_initial(case), p_gen]), np.vstack([p_load[0], p_load])
+
+    def _served(self, p_gen: Array, p_load: Array) -> NDArray[np.bool_]:
+        """Tell which rows of powers can be served; a batch that fails is halved until one is left."""
+        n = len(p_gen)
+        if n == 1 or n * self.network.n_bus**2 <= BATCH:
+            try:
+                self.network.power_flow(p_gen, p_load)
+            except PowerFlowError:
+                if n == 1:
+                    return np.zeros(1, dtype=np.bool_)
+            else:
+                return np.ones(n, dtype=np.bool_)
+        halves = (self._served(p_gen[s], p_load[s]) for s in (slice(n // 2), slice(n // 2, n)))
+        return np.concatenate(list(halves))
+
+
+def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hold:
+    """The exact map over one grid step of (δθ, δω).
+
+    Args:
+        stiffness: M⁻¹ S, shape (n_maps, n_gen, n_gen), 1/s².
+        damping: M⁻¹ D, shape (n_gen,), 1/s.
+        gain: M⁻¹, shape (n_gen,).
+        dt_s: grid step, s.
+    """
+    n_maps, n, _ = stiffness.shape
+
+    def derivative(value: Array) -> Array:
+        angle, speed = value[:, :n], value[:, n:]
+        rate = -(stiffness @ angle) - damping[:, None] * speed
+        return np.concatenate([speed, rate], axis=1) * dt_s
+
+    # |A dt| of (θ, ω / ω_fastest), in which the matrix is balanced.
+    size = dt_s * (np.sqrt(np.abs(stiffness).sum(axis=2).max()) + damping.max())
+    one, phi_1, phi_2 = series_step(derivative, n_maps, 2 * n, size)
+    return Hold(one, dt_s * phi_1[:, :, n:] * gain, dt_s * phi_2[:, :, n:] * gain)

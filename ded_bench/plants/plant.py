@@ -1,0 +1,130 @@
+"""Plants: what is simulated, behind one protocol. A new one is a folder and a line in PLANTS.
+
+A plant is a differential-algebraic system with a state, set-points and loads as inputs, and outputs. Its
+state is opaque to all others; what a planner may know of it is `observed`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.files.errors import InputError
+from ded_bench.plants.time_varying import Indices, TimeVarying
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.state import State
+from ded_bench.problem.trajectory import Trajectory
+
+#: Only the plant that made it knows what is in it.
+PlantState = Any
+
+
+class SimulationError(ArithmeticError):
+    """The plant cannot follow its set-points: its algebraic equations have no solution any more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What a plant does from one grid point of time to another, both included."""
+
+    omega: Array  # (n, n_gen), rad/s, deviation from nominal
+    p_gen: Array  # (n, n_gen), pu, delivered
+    p_slack: Array  # (n,), pu
+    states: Any  # at all points, for the plant's own use
+    end: PlantState
+
+
+class Plant(Protocol):
+    """A plant of one case: frozen, picklable."""
+
+    @property
+    def name(self) -> str:
+        """Its name in PLANTS."""
+
+    @property
+    def case(self) -> Case:
+        """The grid."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change with the plant's data."""
+
+    def initial(self, instance: Instance) -> PlantState:
+        """The state at t = 0.
+
+        Raises:
+            SimulationError: there is none.
+        """
+
+    def advance(
+        self, state: PlantState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
+    ) -> Piece:
+        """Integrate over the points of some inputs, which are linear between them.
+
+        Args:
+            state: at the first point.
+            p_set: set-points at n ≥ 1 points, (n, n_gen), pu.
+            p_load: load injections, (n, n_load), pu.
+            dt_s: between points, s.
+            exact: as the scorer needs it; else as a linearisation along it needs it, which is cheaper.
+
+        Raises:
+            SimulationError: the plant cannot follow.
+        """
+
+    def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
+        """Linearise along a trajectory of this plant.
+
+        Args:
+            trajectory: of `plants.simulate`.
+            points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        """
+
+    def observed(self, state: PlantState) -> State:
+        """What a planner is told of a state."""
+
+    def columns(self, states: Any) -> Mapping[str, Array]:
+        """What only this plant has, of `Piece.states`, as named columns of shape (n,)."""
+
+    def servable(self, instances: Sequence[Instance]) -> NDArray[np.bool_]:
+        """Tell which instances static dispatch can serve throughout, shape (n,): the rule of drawing them."""
+
+    def check_servable(self, instance: Instance, source: str) -> None:
+        """Raise InputError, which names the source and the field, unless static dispatch can serve it."""
+
+
+#: Plants by name: `module:class`, called with the case.
+PLANTS: dict[str, str] = {"lossless": "ded_bench.plants.lossless.lossless_plant:LosslessPlant"}
+#: The plant of a case that names none.
+DEFAULT_PLANT = "lossless"
+
+
+@functools.lru_cache(maxsize=16)
+def plant_of(case: Case, name: str = DEFAULT_PLANT) -> Plant:
+    """The plant of a case, by its name in PLANTS.
+
+    Raises:
+        InputError: there is no such plant, or the case lacks its data.
+    """
+    check_plant(name)
+    module, _, kind = PLANTS[name].partition(":")
+    plant: Plant = getattr(importlib.import_module(module), kind)(case)
+    return plant
+
+
+def check_plant(name: str) -> None:
+    """Raise InputError unless there is a plant of this name."""
+    if name not in PLANTS:
+        raise InputError("plant", name[:40], f"is not one of {', '.join(PLANTS)}")
+
+
+def servable(case: Case, instances: Sequence[Instance]) -> NDArray[np.bool_]:
+    """Tell which instances the case's plant can serve, shape (n,); see `Plant.servable`."""
+    return plant_of(case).servable(instances)

@@ -81,7 +81,7 @@ def suggested_knots(case: Case, fastest_hz: float) -> int:
 
 def _peak(case: Case, instance: Instance) -> float:
     """Largest |ω| in Hz under static dispatch; ∞ where the system collapses."""
-    schedule = ed.dispatch(case, instance, **ed.SETTINGS["default"])
+    schedule = ed.dispatch(case, instance, ed.Options().every)
     try:
         run = simulate(case, instance, schedule)
     except SimulationError:

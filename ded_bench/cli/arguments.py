@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import fnmatch
-import sys
-import textwrap
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.registry import get_method, registered
+from ded_bench.methods.options import DEFAULT
+from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.run.environment import version
 from ded_bench.surrogates.find import MODELS
-
-if TYPE_CHECKING:
-    from _typeshed import SupportsWrite
 
 #: The shipped case that is meant where none is named.
 DEFAULT_CASE = "9bus"
 RESULTS_HELP = "results folder; default: results/<case>"
 CASE_HELP = "name of a shipped case, or a folder"
+METHOD_HELP = "see `ded-bench methods`; or module:function"
 MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 
 #: The order of the list of commands: those of the road, then what judges results, then the closed loop.
 ORDER = (
-    *("cases", "instances", "train-ko", "solve", "train-dpc", "bench", "report"),
+    *("cases", "instances", "methods", "train-ko", "solve", "train-dpc", "bench", "report"),
     *("score", "compare", "certify", "rollouts", "scenarios", "online", "overview"),
 )
 #: Under the list of commands, which must fit a terminal 80 columns wide.
@@ -38,16 +34,7 @@ ROAD = (
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one-line errors, and help that may end with what takes a moment to find out."""
-
-    ending: Callable[[], str] | None = None
-
-    def print_help(self, file: SupportsWrite[str] | None = None) -> None:
-        """Options at once, then the ending."""
-        super().print_help(file)
-        if self.ending is not None:
-            sys.stdout.flush()
-            print(f"\n{self.ending()}", file=file)
+    """argparse with one-line errors."""
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with code 2."""
@@ -108,47 +95,27 @@ def command(commands: Any, name: str, text: str) -> Parser:
     return made
 
 
-def methods_text() -> str:
-    """Every method that has a name, of this package or another one, with its settings."""
-    lines = ["methods and their settings:"]
-    for method in registered().values():
-        try:
-            known = ", ".join(method.settings)
-        except InputError as error:
-            known = f"cannot be used: {error}"
-        text = f"  {method.name:<16} {known}"
-        lines += textwrap.wrap(text, 79, subsequent_indent=" " * 19, break_on_hyphens=False)
-    return "\n".join(lines)
-
-
 def add_methods(p: Parser) -> None:
     """Declare which methods answer, in which regimes, and with what."""
-    p.ending = methods_text
-    p.add_argument(
-        "--method", type=names, required=True, metavar="M[,M]", help="as listed below, or module:function"
-    )
+    p.add_argument("--method", type=names, required=True, metavar="M[,M]", help=METHOD_HELP)
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the methods; may hold *")
-    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--set", default=DEFAULT, metavar="NAME=VALUE[,...]", help="options of the one method")
+    p.add_argument("--model", default="", help=f"{MODEL_HELP}; default: the method's own")
     p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
 
 
 def chosen_methods(
     a: argparse.Namespace, search: tuple[Path, ...], time_limit_s: float | None = None
 ) -> list[tuple[str, Settings]]:
-    """The methods that `add_methods` let the user choose, each with one of its settings.
+    """The methods that `add_methods` let the user choose, with their settings.
 
     Raises:
-        InputError: an unknown method, or none has settings of this name.
+        InputError: an unknown method, options of several methods, or options that the method refuses.
     """
-    chosen = [
-        (method.name, Settings(slug, a.model, a.policy, time_limit_s, search))
-        for method in map(get_method, a.method)
-        for slug in matching(a.settings, method.settings)
-    ]
-    if not chosen:
-        raise InputError("--settings", a.settings, f"matches none of {', '.join(a.method)}")
-    return chosen
+    if a.set != DEFAULT and len(a.method) > 1:
+        raise InputError("--set", a.set, "needs exactly one --method")
+    given = Settings(a.set, a.model, a.policy, time_limit_s, search)
+    return [(method.name, method.canonical(given)) for method in map(get_method, a.method)]
 
 
 def names(text: str) -> tuple[str, ...]:
@@ -157,18 +124,6 @@ def names(text: str) -> tuple[str, ...]:
     if not found:
         raise argparse.ArgumentTypeError("names nothing")
     return tuple(dict.fromkeys(found))
-
-
-def matching(pattern: str, known: Iterable[str]) -> list[str]:
-    """The settings that `--settings` names: slugs separated by commas, `*` as in file names.
-
-    A slug without `*` is returned whether it is known or not; its method tells what is wrong.
-    """
-    slugs = list(known)
-    found: list[str] = []
-    for part in names(pattern):
-        found += [part] if "*" not in part else [s for s in slugs if fnmatch.fnmatchcase(s, part)]
-    return list(dict.fromkeys(found))
 
 
 def natural(text: str) -> int:

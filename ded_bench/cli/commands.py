@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from ded_bench.cli import (
     evaluation_commands,
+    method_commands,
     online_commands,
     problem_commands,
     solve_commands,
@@ -29,7 +30,10 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action=ShowVersion, nargs=0, help="show the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for group in (problem_commands, solve_commands, training_commands, evaluation_commands, online_commands):
+    for group in (
+        *(problem_commands, method_commands, solve_commands, training_commands),
+        *(evaluation_commands, online_commands),
+    ):
         group.add_commands(commands)
     return top
 

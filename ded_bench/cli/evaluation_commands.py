@@ -14,7 +14,6 @@ from ded_bench.cli.arguments import (
     MODEL_HELP,
     RESULTS_HELP,
     command,
-    methods_text,
     names,
     natural,
     not_negative,
@@ -46,15 +45,14 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--force", action="store_true", help="time again what the table holds")
     p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.add_argument("--out", type=Path, help="table of the run; default: timing.csv in the results folder")
-    p.ending = methods_text
     p.set_defaults(run=_bench)
 
     p = command(commands, "certify", "certify a policy on fresh instances")
     p.add_argument("--method", default="ded-dpc", help="a policy")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--settings", default="default", help="of the policy")
-    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--set", default="default", metavar="NAME=VALUE[,...]", help="options of the policy")
+    p.add_argument("--model", default="", help=MODEL_HELP)
     p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
     p.add_argument("--count", type=positive, default=10_000, metavar="M", help="how many fresh instances")
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
@@ -141,7 +139,7 @@ def _certify(a: argparse.Namespace) -> int:
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
     folder = a.results or default_results(case)
-    settings = Settings(a.settings, a.model, a.policy, search=search_folders(case, folder))
+    settings = Settings(a.set, a.model, a.policy, search=search_folders(case, folder))
     for regime in regimes:
         get_method(a.method).artifacts(case, regime, settings)  # says what is missing
     say(f"{a.method} and ded-ko-knots on {counted(a.count, 'fresh instance')}, {' and '.join(regimes)}")

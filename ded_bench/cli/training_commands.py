@@ -14,8 +14,6 @@ from ded_bench.cli.arguments import (
     DEFAULT_CASE,
     MODEL_HELP,
     command,
-    matching,
-    methods_text,
     names,
     natural,
     positive,
@@ -67,7 +65,6 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "train-dpc", "train policies, by default all")
     p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
-    p.add_argument("--settings", default="default", metavar="S[,S]", help="of the training; may hold *")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--model", default="koopman", help=MODEL_HELP)
@@ -83,7 +80,6 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
-    p.ending = methods_text
     p.set_defaults(run=_train_dpc)
 
     p = command(commands, "rollouts", "errors of the surrogates under several kinds of schedules")
@@ -159,18 +155,11 @@ def _train_dpc(a: argparse.Namespace) -> int:
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
     methods = [get_method(name) for name in a.method or trainable()]
-    jobs = [
-        (method.name, slug, regime)
-        for method in methods
-        for slug in matching(a.settings, method.settings)
-        for regime in regimes
-    ]
-    if not jobs:
-        raise InputError("--settings", a.settings, "matches no settings of a method that is trained")
-    if a.start and {name for name, _, _ in jobs} != {FITS_EVERY_GRID}:
+    jobs = [(method.name, regime) for method in methods for regime in regimes]
+    if a.start and {name for name, _ in jobs} != {FITS_EVERY_GRID}:
         raise InputError("--start", str(a.start), f"is for {FITS_EVERY_GRID} alone")
     if a.out and len(jobs) > 1:
-        raise InputError(a.out, "", "is one file; name one method, settings and regime with --out")
+        raise InputError(a.out, "", "is one file; name one method and regime with --out")
     for method in methods:
         if not method.trainer:
             _ = method.train  # says that it is not trained
@@ -191,20 +180,18 @@ def _train_dpc(a: argparse.Namespace) -> int:
     return 1 if failures else 0
 
 
-def train_one(a: argparse.Namespace, name: str, slug: str, regime: str) -> str:
+def train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     """Train one policy as the command's options say; returns what to tell."""
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
-    from ded_bench.methods.solution import Settings
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
     from ded_bench.run.code import code_of
     from ded_bench.surrogates.find import find_model
 
     method, case = get_method(name), Case.load(a.case)
-    setting: dict[str, Any] = dict(method.options(Settings(slug)))
-    setting |= {"epochs": a.epochs} if a.epochs else {}
+    setting: dict[str, Any] = {"epochs": a.epochs} if a.epochs else {}
     results = a.results or default_results(case)
-    out: Path = a.out or policy_file(results, name, regime, a.model, slug)
+    out: Path = a.out or policy_file(results, name, regime, a.model)
     if out.exists() and not (a.force or a.resume):
         return f"{out} is there already (--force trains anew)"
     with _needing_torch():

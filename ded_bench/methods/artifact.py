@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.surrogates.find import find_model_file, find_surrogate
+
 
 @dataclass(frozen=True)
 class Artifact:
@@ -22,3 +26,15 @@ class Artifact:
     name: str
     fingerprint: str
     path: Path | None = None
+
+
+def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> Artifact:
+    """The surrogate that the settings name, else the method's own.
+
+    Raises:
+        InputError: there is no such model, or its file is wrong.
+    """
+    name = settings.model or default
+    model = find_surrogate(case, name, settings.search)
+    path = find_model_file(case, name, settings.search)
+    return Artifact("model", model.kind, model.fingerprint, path)

@@ -1,19 +1,25 @@
-"""Full DED: the swing DAE discretised by Pyomo.DAE (backward Euler), solved by IPOPT."""
+"""Full DED: the swing DAE discretised by Pyomo.DAE (backward Euler), solved by IPOPT.
+
+With the option `accelerated` a short sequence of linear programs (see `euler_program`) solves the same
+problem first; where it does not get through, IPOPT decides in what is left of the time.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyomo.dae as dae
 import pyomo.environ as pyo
 
-from ded_bench.methods.memory import too_large
-from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solver_answer import answer
+from ded_bench.methods.euler_program import EulerPrograms
+from ded_bench.methods.options import option, read_options
+from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -21,57 +27,74 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
 from ded_bench.solvers.outcome import Compiled
+from ded_bench.solvers.status import Status
 
-#: What sets the point that a solver starts from: called with the model and its instance.
-Start = Callable[[pyo.ConcreteModel, Instance], None]
+#: Raised when answers change.
+VERSION = 1
 #: One solution of the linear system per iteration, refined only where its residual asks for it: the
 #: iterates are the same, without a tenth of the time.
 _IPOPT_OPTIONS = {"min_refinement_steps": 0}
-#: Solver of `solvers` by settings slug. IPOPT has its default tolerances in all of them.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {"solver": "ipopt"},
-    "executable": {"solver": "ipopt-executable"},
-}
 #: Memory that model and solver take for each line and point: the peak of a process that solves one instance
 #: in TO, less what imports take, was 12 KB on two-area (1.2 GiB in all) and 11 KB on 39bus (3.6 GiB). After
 #: several instances it is 4.2 GiB there.
 BYTES_PER_FLOW = 12_000
+#: Memory for each entry of the stiffness of all points, as linear programs take it: the peak on 39bus.
+BYTES_PER_ENTRY = 28
+
+
+@dataclass(frozen=True)
+class Options:
+    """How the program is solved."""
+
+    accelerated: bool = option(False, "linear programs first; IPOPT where they do not get through")
+    solver: str = option(
+        "ipopt",
+        "of the whole program: from the casadi wheel, or an executable on the PATH",
+        choices=("ipopt", "ipopt-executable"),
+    )
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
-    return prepare_with(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
-
-
-def prepare_with(
-    case: Case, regime: str, time_limit_s: float | None, solver: str = "ipopt", start: Start | None = None
-) -> Solver:
-    """Return a solver of single instances.
-
-    Args:
-        case: the grid.
-        regime: whose frequency bound.
-        time_limit_s: of the solver, s.
-        solver: a name of `solvers`.
-        start: sets the point that the solver starts from in a model that is set to an instance; without it,
-            that is the state at t = 0.
-    """
     case.check_regimes([regime])
+    options = read_options(Options, settings.options)
+    solve = _accelerated if options.accelerated else _solve
+    return functools.partial(solve, case, regime, options.solver, settings.time_limit_s)
 
-    def solve(instance: Instance) -> Solution:
-        if refusal := too_large(program_bytes(case, instance), "the Pyomo model", "`ded-slp` takes less"):
-            return refusal
-        started = time.perf_counter()
-        model = _built(case, instance.steps, instance.dt_s)
-        set_instance(model, case, instance, regime)
-        if start is not None:
-            start(model, instance)
-        build_s = time.perf_counter() - started
-        compiled = _compiled(case, instance.steps, instance.dt_s, solver)
-        outcome = compiled.solve(time_limit_s)
-        return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
-    return solve
+def _solve(case: Case, regime: str, solver: str, time_limit_s: float | None, instance: Instance) -> Solution:
+    """IPOPT on the whole program."""
+    if refusal := too_large(program_bytes(case, instance), "the Pyomo model", "`ded-slp` takes less"):
+        return refusal
+    started = time.perf_counter()
+    model = _built(case, instance.steps, instance.dt_s)
+    set_instance(model, case, instance, regime)
+    build_s = time.perf_counter() - started
+    outcome = _compiled(case, instance.steps, instance.dt_s, solver).solve(time_limit_s)
+    return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
+
+
+def _accelerated(
+    case: Case, regime: str, solver: str, time_limit_s: float | None, instance: Instance
+) -> Solution:
+    """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
+    needed = BYTES_PER_ENTRY * (instance.steps + 1) * len(case.buses) ** 2
+    if refusal := too_large(needed, "the sequence of programs", "`ded-slp` takes less"):
+        return refusal
+    started = time.perf_counter()
+    programs = _programs(case, regime, instance.steps, instance.dt_s)
+    build_s = time.perf_counter() - started
+    outcome, schedule = programs.solve(instance, time_limit_s)
+    if outcome.status != Status.FAILED:
+        return answer(outcome, build_s, lambda: schedule)
+    rest = None if time_limit_s is None else max(time_limit_s - outcome.solve_s, 1e-3)
+    verdict = _solve(case, regime, solver, rest, instance)
+    return dataclasses.replace(
+        verdict,
+        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
+        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
+        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
+    )
 
 
 def program_bytes(case: Case, instance: Instance) -> int:
@@ -87,6 +110,11 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 @functools.lru_cache(maxsize=1)
 def _compiled(case: Case, steps: int, dt: float, solver: str) -> Compiled:
     return compile_model(_built(case, steps, dt), solver, _IPOPT_OPTIONS)
+
+
+@functools.lru_cache(maxsize=2)
+def _programs(case: Case, regime: str, steps: int, dt: float) -> EulerPrograms:
+    return EulerPrograms(case, regime, steps, dt)
 
 
 def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
@@ -228,41 +256,22 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
             for variable in variables:
                 variable.setlb(-bound)
                 variable.setub(bound)
-    points = (len(p_load), 1)
-    still = np.zeros((len(p_load), len(case.generators)))
-    slack = np.tile(network.injections(angles)[network.slack], len(p_load))
-    set_start(m, case, np.tile(angles, points), still, np.tile(p_initial, points), slack)
+    p_slack = float(network.injections(angles)[network.slack])
+    start = {
+        "theta": angles[network.generators],
+        "omega": np.zeros(len(case.generators)),
+        "p_gen": p_initial,
+        "angle": angles[network.algebraic],
+        "p_slack_up": [max(p_slack, 0.0)],
+        "p_slack_down": [max(-p_slack, 0.0)],
+    }
+    for name, values in start.items():
+        for variables, value in zip(along[name], values, strict=True):
+            assign(variables, np.full(len(variables), value))
     for j, g in enumerate(case.generators):
         fix(m.p_gen[g, 0], float(p_initial[j]))
         fix(m.omega[g, 0], float(omega_initial[j]))
         fix(m.theta[g, 0], float(angles[network.generators[j]]))
-
-
-def set_start(
-    m: pyo.ConcreteModel, case: Case, theta: Array, omega: Array, p_gen: Array, p_slack: Array
-) -> None:
-    """Set the values of all variables but the data: the point that the solver starts from.
-
-    Args:
-        m: the built model.
-        case: its case.
-        theta: angles of all buses, shape (n_points, n_bus), rad.
-        omega: frequencies of the generators, shape (n_points, n_gen), rad/s.
-        p_gen: their powers, shape (n_points, n_gen), pu.
-        p_slack: slack power, shape (n_points,), pu.
-    """
-    network, along = Network(case), _along_time(m)
-    wanted = {
-        "theta": theta[:, network.generators],
-        "omega": omega,
-        "p_gen": p_gen,
-        "angle": theta[:, network.algebraic],
-        "p_slack_up": np.maximum(p_slack, 0.0)[:, None],
-        "p_slack_down": np.maximum(-p_slack, 0.0)[:, None],
-    }
-    for name, columns in wanted.items():
-        for variables, column in zip(along[name], columns.T, strict=True):
-            assign(variables, column)
 
 
 @functools.lru_cache(maxsize=1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,11 +16,9 @@ import numpy as np
 import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.memory import too_large
-from ded_bench.methods.model_artifact import model_artifact
-from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solver_answer import answer
+from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.options import option, read_options
+from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
@@ -34,12 +31,14 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 
-#: Solver of the Pyomo model and its options by settings slug.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {"solver": "piqp"},
-    "ipopt": {"solver": "ipopt", "options": LINEAR_OPTIONS},
-    "executable": {"solver": "ipopt-executable", "options": LINEAR_OPTIONS},
-    "highs": {"solver": "highs"},
+#: Raised when answers change.
+VERSION = 1
+#: Solvers of the Pyomo model, and their options.
+SOLVERS: dict[str, dict[str, Any] | None] = {
+    "piqp": None,
+    "ipopt": LINEAR_OPTIONS,
+    "ipopt-executable": LINEAR_OPTIONS,
+    "highs": None,
 }
 #: Entries of the equations up to which the default is a Pyomo model; half of it takes 10 s and 0.5 GB
 #: (two-area), once.
@@ -50,6 +49,15 @@ TIME_LIMIT_S = 1800.0
 ARRAYS_BYTES, PYOMO_BYTES = 150, 1000
 
 
+@dataclass(frozen=True)
+class Options:
+    """How the program is solved."""
+
+    solver: str = option(
+        "piqp", "piqp makes arrays where the Pyomo model would be too large", choices=tuple(SOLVERS)
+    )
+
+
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The surrogate that `prepare` would use."""
     return (model_artifact(case, settings),)
@@ -57,25 +65,27 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances on the surrogate that the settings name."""
-    return prepare_with(case, find_surrogate(case, settings.model, settings.search), regime, settings)
+    return prepare_with(
+        case, find_surrogate(case, settings.model or "koopman", settings.search), regime, settings
+    )
 
 
 def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances.
 
     Raises:
-        InputError: the settings want a lifted model, and this surrogate is none.
+        InputError: the solver wants a lifted model, and this surrogate is none.
     """
     case.check_regimes([regime])
-    if settings.name != "default":
+    solver = read_options(Options, settings.options).solver
+    if solver != "piqp":
         if not isinstance(surrogate, Koopman):
-            problem = f"only its default settings solve `ded-ko` on {surrogate.kind}"
-            raise InputError("--settings", settings.name, problem)
-        return _pyomo_solver(case, surrogate, regime, settings)
+            raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")
+        return _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
     by_arrays = _array_solver(case, surrogate, regime, settings)
     if not isinstance(surrogate, Koopman):
         return by_arrays
-    by_pyomo = _pyomo_solver(case, surrogate, regime, settings)
+    by_pyomo = _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
 
     def solve(instance: Instance) -> Solution:
         small = _entries(case, surrogate, instance.steps) <= PYOMO_ENTRIES
@@ -107,20 +117,22 @@ def _entries(case: Case, surrogate: Surrogate, steps: int) -> int:
     return steps * n_state * (n_state + 2 * n_gen + 1)
 
 
-def _pyomo_solver(case: Case, koopman: Koopman, regime: str, settings: Settings) -> Solver:
+def _pyomo_solver(
+    case: Case, koopman: Koopman, regime: str, solver: str, time_limit_s: float | None
+) -> Solver:
     """A solver through the Pyomo model; one compiled program per process serves all instances."""
 
     def solve(instance: Instance) -> Solution:
         koopman.check_step(instance)
         needed = PYOMO_BYTES * _entries(case, koopman, instance.steps)
-        if refusal := too_large(needed, "the Pyomo model", "the default settings make arrays instead"):
+        if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
             return refusal
         started = time.perf_counter()
         program = _Program(case, koopman.fingerprint, instance.steps, koopman)
         model = _built(program)
         set_instance(model, case, koopman, instance, regime)
         build_s = time.perf_counter() - started
-        outcome = _compiled(program, settings.name).solve(settings.time_limit_s)
+        outcome = _compiled(program, solver).solve(time_limit_s)
         return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
     return solve
@@ -142,8 +154,8 @@ def _built(program: _Program) -> pyo.ConcreteModel:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled(program: _Program, slug: str) -> Compiled:
-    return compile_model(_built(program), **SETTINGS[slug])
+def _compiled(program: _Program, solver: str) -> Compiled:
+    return compile_model(_built(program), solver, SOLVERS[solver])
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:

@@ -5,25 +5,36 @@ the static dispatch of every second, followed slowly, and linearised once; unlik
 the answer.
 
 In operation a frequency limit may be out of reach: a load has begun to ramp that nobody announced. Then
-every interval between knots has a frequency excess of its own, and the sum of all is the least one.
+every interval between knots has a frequency excess of its own, and the sum of all is the least one. Two
+options matter there alone: knots may keep their places in time, and plans a margin below the bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
 from dataclasses import dataclass
-from typing import Any
 
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.knots import knot_points
-from ded_bench.methods.model_artifact import model_artifact
+from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.knots import case_knots, receding_knots, tightened
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 
-SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {}}
+#: Raised when answers change.
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """How plans are made in operation."""
+
+    receding: bool = option(False, "knots keep their places from plan to plan", in_operation=True)
+    margin: float = option(
+        0.0, "part of the bound that plans leave free", lowest=0.0, highest=0.99, in_operation=True
+    )
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -33,13 +44,14 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances on the surrogate that the settings name."""
-    return prepare_with(case, find_surrogate(case, settings.model, settings.search), regime, settings)
+    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
+    return prepare_with(case, surrogate, regime, settings)
 
 
 def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances."""
     case.check_regimes([regime])
-    return KnotSolver(case, surrogate, regime, settings.time_limit_s)
+    return KnotSolver(case, surrogate, regime, read_options(Options, settings.options), settings.time_limit_s)
 
 
 @dataclass(frozen=True)
@@ -49,23 +61,27 @@ class KnotSolver:
     case: Case
     surrogate: Surrogate
     regime: str
+    options: Options = Options()
     time_limit_s: float | None = None
 
     def __call__(self, instance: Instance) -> Solution:
-        """Solve."""
-        return self._solution(instance, soft=False)
+        """Solve with the case's knots and bound."""
+        points = case_knots(self.case, instance)
+        return solve_on_surrogate(self.case, self.surrogate, instance, self.regime, points, self.time_limit_s)
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
 
         Args:
             instance: what to solve.
-            last: of no use to this method.
+            last: its schedule, if it has one, gives receding knots; its time is the instance's.
         """
-        return self._solution(instance, soft=True)
-
-    def _solution(self, instance: Instance, soft: bool) -> Solution:
-        points = knot_points(self.case.knot_times(instance.horizon_s), instance.dt_s)
+        plan = last.schedule if last is not None and self.options.receding else None
+        points, case = receding_knots(self.case, instance, plan), self._planning_case
         return solve_on_surrogate(
-            self.case, self.surrogate, instance, self.regime, points, self.time_limit_s, soft
+            case, self.surrogate, instance, self.regime, points, self.time_limit_s, soft=True
         )
+
+    @functools.cached_property
+    def _planning_case(self) -> Case:
+        return tightened(self.case, self.options.margin)

@@ -9,39 +9,44 @@ from __future__ import annotations
 import functools
 import itertools
 import time
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.collocation import POINTS
-from ded_bench.methods.memory import too_large
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.radau_program import RadauProgram
-from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solver_answer import answer
+from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 
-#: Mean length of an element: at most `length_s`, and at most a part of the period of the grid's fastest mode.
-#: The default was chosen on validation instances (docs/model.md).
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {"length_s": 0.1, "periods": 0.125},
-    "200ms": {"length_s": 0.2},
-    "500ms": {"length_s": 0.5},
-    "1s": {"length_s": 1.0},
-}
+#: Raised when answers change.
+VERSION = 1
+#: Longest mean element where none is given, s and in periods of the fastest mode (validation draws).
+LONGEST_S, LONGEST_PERIODS = 0.1, 0.125
 #: Memory that IPOPT takes for an entry of `program_bytes`. Measured as the peak of a
 #: process that solves one instance in TO, less what imports take: 21 bytes on 39bus (0.7 GiB in all), 13 on
 #: 68bus (1.4 GiB); on 9bus and two-area over 90, but 0.3 GiB in all. Larger grids are extrapolated.
 BYTES_PER_ENTRY = 20
 
 
+@dataclass(frozen=True)
+class Options:
+    """How finely time is divided."""
+
+    element_s: float | None = option(
+        None,
+        "mean length of an element, s; none: 0.1, or an eighth of the fastest period",
+        lowest=1e-3,
+    )
+
+
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one program per process serves them all."""
     case.check_regimes([regime])
-    length_s = element_length(case, **SETTINGS[settings.name])
+    length_s = read_options(Options, settings.options).element_s or default_element(case)
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
@@ -71,17 +76,11 @@ def program_bytes(case: Case, elements: int) -> int:
     return BYTES_PER_ENTRY * elements * columns**2
 
 
-def element_length(case: Case, length_s: float, periods: float | None = None) -> float:
-    """Mean length of an element, s: `length_s`, or so many periods of the fastest mode if that is shorter.
-
-    Modes are those of the linearisation at the nominal point.
-    """
-    if periods is None:
-        return length_s
+def default_element(case: Case) -> float:
+    """Mean length of an element by the fastest mode of the linearisation at the nominal point, s."""
     network = Network(case)
     modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
-    fastest = float(np.abs(modes.imag).max())
-    return min(length_s, periods * 2 * np.pi / fastest)
+    return min(LONGEST_S, LONGEST_PERIODS * 2 * np.pi / float(np.abs(modes.imag).max()))
 
 
 def element_count(case: Case, instance: Instance, length_s: float) -> int:

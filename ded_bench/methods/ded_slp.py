@@ -4,43 +4,51 @@ A schedule is simulated on the true DAE; the linear program around its trajector
 gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
 costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
 surrogate. It takes one to three programs, since the linear models differ only by the second order
-of what one schedule changes. Setting `ac` does the same on the full AC network (see `ded_slp_ac`).
+of what one schedule changes.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from ded_bench.methods import ed
 from ded_bench.methods.knot_program import KnotProgram, Limit, solve_with_rows_added
 from ded_bench.methods.knots import is_reachable, knot_points
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.plants.simulate import simulate
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.solvers.status import Status
-from ded_bench.plants.time_varying import Indices, linearise_along
 
-#: The case's own knots, or others this far apart.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {"default": {}, "100ms": {"knot_interval_s": 0.1}}
-
+#: Raised when answers change.
+VERSION = 1
 #: Trajectories, and halvings of a step that the system cannot follow.
 MAX_ROUNDS, MAX_HALVINGS = 15, 6
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where schedules bend."""
+
+    knot_s: float | None = option(None, "distance of knots, s; none: the case's knots", lowest=1e-3)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """Return a solver of single instances, which may start from an earlier solution."""
     case.check_regimes([regime])
-    return SlpSolver(case, regime, settings.time_limit_s, **SETTINGS[settings.name])
+    options = read_options(Options, settings.options)
+    return SlpSolver(case, regime, settings.time_limit_s, options.knot_s)
 
 
 class Sequence(Protocol):
@@ -161,7 +169,7 @@ class _Sequence:
             excess = float(np.abs(trajectory.omega[1:]).max()) - self.bound
             if excess <= ACCEPTED and self._confirmed(trajectory, schedule):
                 return Status.OPTIMAL, schedule
-            model = linearise_along(self.case, trajectory, self.points)
+            model = plant_of(self.case).linearise_along(trajectory, self.points)
             program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
             if is_near:
                 self.limits |= program.near(trajectory.omega)

@@ -8,11 +8,11 @@ is missing. Frequency limits play no role in it.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Array, Case
@@ -21,22 +21,25 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
-#: Seconds from one dispatch to the next by settings slug; by default one serves a whole minute.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "default": {"interval_s": 60.0},
-    "10s": {"interval_s": 10.0},
-    "1s": {"interval_s": 1.0},
-}
+#: Raised when answers change.
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """How often is dispatched."""
+
+    every: float = option(60.0, "s from one dispatch to the next", lowest=1e-3)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a dispatcher of single instances; both regimes get the same schedules."""
     case.check_regimes([regime])
-    options = SETTINGS[settings.name]
+    every = read_options(Options, settings.options).every
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
-        schedule = dispatch(case, instance, **options)
+        schedule = dispatch(case, instance, every)
         return Solution(Status.FEASIBLE, schedule, solve_s=time.perf_counter() - started)
 
     return solve

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from ded_bench.methods import ed
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.plants.time_varying import Indices
 
 
 def first_schedules(case: Case, instance: Instance, wanted: Array, points: Indices) -> Iterator[Array]:

@@ -22,13 +22,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits
+from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.highs import solve_form as solve_by_highs
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
-from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13

@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.plants.time_varying import Indices
+from ded_bench.problem.schedule import Schedule
 
 #: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
 #: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
@@ -29,6 +30,43 @@ def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
 def knot_points(times: Array, dt_s: float) -> Indices:
     """Grid points of knots at `times` (s): inputs are linear between grid points, so knots lie on them."""
     return np.unique(np.rint(times / dt_s).astype(int))
+
+
+def case_knots(case: Case, instance: Instance) -> Indices:
+    """Grid points of the case's knots."""
+    return knot_points(case.knot_times(instance.horizon_s), instance.dt_s)
+
+
+def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Indices:
+    """Grid points of knots: those of the plan in force that lie ahead, and more at the end.
+
+    If every plan had its first knot as long after its own start, what the last plan goes on to do would be
+    linear between other knots, so that it is no solution of the new program. Where it rides on the frequency
+    bound, the new program may have no solution that keeps it.
+
+    Args:
+        case: gives the distance of knots.
+        instance: gives the grid.
+        last: the plan in force, on the time of the instance. What has fewer knots than a horizon has, or
+            others closer together than the case's, gives none.
+    """
+    times = case.knot_times(instance.horizon_s)
+    distance = times[1] - times[0]
+    # The last two points are the end of the plan in force, which no knot has, and the horizon.
+    ahead = np.empty(0) if last is None else last.t[1:-2]
+    if len(ahead) < 2 or np.diff(ahead).min() < distance / 2:
+        return knot_points(times, instance.dt_s)
+    beyond = np.arange(ahead[-1] + distance, instance.horizon_s - distance / 2, distance)
+    return knot_points(np.concatenate([[0.0], ahead, beyond, [instance.horizon_s]]), instance.dt_s)
+
+
+def tightened(case: Case, margin: float) -> Case:
+    """A case whose frequency bounds are smaller by a part of them."""
+    regimes = {
+        name: limits.model_copy(update={"omega_hz": (1 - margin) * limits.omega_hz})
+        for name, limits in case.regimes.items()
+    }
+    return case.model_copy(update={"regimes": regimes})
 
 
 def knot_weights(lengths: Indices) -> Array:

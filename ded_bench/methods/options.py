@@ -1,8 +1,8 @@
 """Options: the parameters of a method as one frozen dataclass, read from text and written as text.
 
-A method's module declares `Options`; each field is an `option` with its default and one line of help. Rows
-carry the canonical text: the options that differ from their defaults, in the order of the fields, or
-`default`.
+A method's module declares `Options`; each field is an `option` with its default and one line of help, or a
+plain field with a default. Rows carry the canonical text: the options that differ from their defaults, in the
+order of the fields, or `default`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from ded_bench.files.errors import InputError
 #: The text of options that are all as declared.
 DEFAULT = "default"
 _TRUE, _FALSE, _NONE = "on", "off", "none"
+_KINDS = {bool: f"{_TRUE} or {_FALSE}", int: "a whole number", float: "a number"}
+_ENDS = {"lowest": -math.inf, "highest": math.inf}
 
 T = TypeVar("T")
 
@@ -83,44 +85,36 @@ def options_text(options: Any, *, timed: bool = False) -> str:
     parts = []
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if value != field.default and not (timed and field.metadata["in_operation"]):
+        if value != field.default and not (timed and field.metadata.get("in_operation")):
             parts.append(f"{field.name}={_text(value)}")
     return ",".join(parts) or DEFAULT
 
 
 def described(kind: type[Any]) -> list[tuple[str, str, str]]:
     """Name, default and help of every option, as texts."""
-    return [(f.name, _text(f.default), f.metadata["text"]) for f in dataclasses.fields(kind)]
+    return [(f.name, _text(f.default), f.metadata.get("text", "")) for f in dataclasses.fields(kind)]
 
 
 def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
     kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     if types.NoneType in kinds and text == _NONE:
         return None
-    (kind,) = (k for k in kinds if k is not types.NoneType)
-    limits = field.metadata
+    kind = next(k for k in kinds if k is not types.NoneType)
+    choices = field.metadata.get("choices", ())
+    lowest, highest = (field.metadata.get(name, end) for name, end in _ENDS.items())
     try:
-        if kind is bool:
-            return {_TRUE: True, _FALSE: False}[text]
-        value = kind(text)
-        if kind is str and limits["choices"] and value not in limits["choices"]:
-            raise ValueError(text)
-        if kind is not str and not (math.isfinite(value) and limits["lowest"] <= value <= limits["highest"]):
+        value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
+        is_number = kind in (int, float)
+        fits = lowest <= value <= highest and math.isfinite(value) if is_number else True
+        if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):
-        raise InputError("--set", field.name, f"{text[:40]!r} is not {_wanted(kind, limits)}") from None
+        wanted = f"one of {', '.join(choices)}" if choices else _KINDS.get(kind, kind.__name__)
+        bounds = [f"at least {lowest:g}"] if math.isfinite(lowest) else []
+        bounds += [f"at most {highest:g}"] if math.isfinite(highest) else []
+        wanted = " ".join([wanted, " and ".join(bounds)]).strip()
+        raise InputError("--set", field.name, f"{text[:40]!r} is not {wanted}") from None
     return value
-
-
-def _wanted(kind: type, limits: Any) -> str:
-    if kind is bool:
-        return f"{_TRUE} or {_FALSE}"
-    if kind is str:
-        return f"one of {', '.join(limits['choices'])}"
-    name = "a whole number" if kind is int else "a number"
-    bounds = [f"at least {limits['lowest']:g}"] if math.isfinite(limits["lowest"]) else []
-    bounds += [f"at most {limits['highest']:g}"] if math.isfinite(limits["highest"]) else []
-    return " ".join([name, " and ".join(bounds)]).strip()
 
 
 def _text(value: Any) -> str:

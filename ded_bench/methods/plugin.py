@@ -8,8 +8,9 @@ A function is named `module:function`, on the command line or by an entry point 
 * `prepare(case, regime, settings)` - the first parameter is called `case` - which returns a function
   from an instance to a `Schedule` or `Solution`, as our own methods do, or an object with
   `solve(instance, last=None)`. In the closed loop `last` is the plan in force as a `Solution` on the
-  time of the instance, to start from; elsewhere it is None. The module may offer `SETTINGS`, slugs of
-  settings in a mapping.
+  time of the instance, to start from; elsewhere it is None. The module may offer `Options`, a frozen
+  dataclass whose fields have defaults: `read_options(Options, settings.options)` (`methods.options`) gives
+  what `--set` set.
 
 Either module may offer `artifact(case, regime, settings) -> str`, a fingerprint of data that the
 answers depend on; that of the sources is added here.
@@ -18,6 +19,7 @@ answers depend on; that of the sources is added here.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib
@@ -38,6 +40,7 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import LARGEST, Case
 from ded_bench.problem.instance import Instance
@@ -86,10 +89,10 @@ class Foreign:
     function: Callable[..., Any]
 
     @property
-    def SETTINGS(self) -> Mapping[str, Any]:  # noqa: N802  (the name that our modules use)
-        """The settings that a `prepare` declares in its module, by slug; else the default alone."""
-        declared = getattr(self.module, "SETTINGS", None) if self._prepares else None
-        return declared if isinstance(declared, Mapping) else {"default": {}}
+    def Options(self) -> type[Any]:  # noqa: N802  (the name that our modules use)
+        """What a `prepare` declares in its module; else there are none."""
+        declared = getattr(self.module, "Options", None) if self._prepares else None
+        return declared if isinstance(declared, type) and dataclasses.is_dataclass(declared) else NoOptions
 
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance and checks what comes back.

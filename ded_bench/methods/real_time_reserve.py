@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
-from ded_bench.methods import real_time_knots
-from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.ded_rti import RealTimeSolver, SoftProgram
 from ded_bench.methods.knot_program import Limit, Prediction
 from ded_bench.methods.knots import knot_weights
-from ded_bench.methods.real_time_knots import RealTimeSolver, SoftProgram
 from ded_bench.methods.reserve import Reserve
-from ded_bench.methods.solution import Settings
-from ded_bench.problem.case import Case
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
-from ded_bench.surrogates.find import find_surrogate
 from ded_bench.plants.time_varying import Indices
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 
-SETTINGS: Mapping[str, Mapping[str, Any]] = {"reserve": real_time_knots.SETTINGS["real-time"]}
 #: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to
 #: twice its steady speed. This and the price were chosen on scenarios drawn for it (docs/online.md).
 LIMIT = 0.5
@@ -28,19 +20,6 @@ LIMIT = 0.5
 PRICE = 1.0
 #: Knots so far ahead keep reserve, s: plans are made anew long before.
 AHEAD_S = 20.0
-
-
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The surrogate that `prepare` would use."""
-    return real_time_knots.artifacts(case, regime, settings)
-
-
-def prepare(case: Case, regime: str, settings: Settings) -> ReserveSolver:
-    """Return a solver that corrects the plan in force and keeps reserve."""
-    case.check_regimes([regime])
-    surrogate = find_surrogate(case, settings.model, settings.search)
-    limit_s = np.inf if settings.time_limit_s is None else settings.time_limit_s
-    return ReserveSolver(case, surrogate, regime, limit_s=limit_s, **SETTINGS[settings.name])
 
 
 class ReserveProgram(SoftProgram):

@@ -19,9 +19,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
-from ded_bench.plants.time_varying import Indices
 
 
 @dataclass(frozen=True, eq=False)

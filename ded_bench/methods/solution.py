@@ -1,4 +1,7 @@
-"""What a method answers: a frozen Solution, and the settings under which it was found."""
+"""What a method answers: a frozen Solution, and the settings under which it was found.
+
+A program that would take too much memory is refused by its size, before it is made (`too_large`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,11 @@ from pathlib import Path
 from ded_bench.methods.options import DEFAULT
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.outcome import Outcome
 from ded_bench.solvers.status import Status
+
+#: What the program of one worker may take, bytes.
+MAX_BYTES = 4 * 2**30
 
 
 @dataclass(frozen=True)
@@ -44,3 +51,32 @@ class Settings:
 
 #: What `prepare(case, regime, settings)` returns.
 Solver = Callable[[Instance], Solution]
+
+
+def answer(outcome: Outcome, build_s: float, schedule: Callable[[], Schedule | None]) -> Solution:
+    """A solver's outcome as the method's answer; the schedule is read only if there is one."""
+    return Solution(
+        status=outcome.status,
+        schedule=schedule() if outcome.has_values else None,
+        iterations=outcome.iterations,
+        build_s=build_s,
+        setup_s=outcome.setup_s,
+        solve_s=outcome.solve_s,
+        solver_objective=outcome.objective,
+        solver_version=outcome.version,
+        error="" if outcome.has_values else outcome.message,
+    )
+
+
+def too_large(needed: float, program: str, advice: str) -> Solution | None:
+    """Return a `Failed` answer if a program would take more than `MAX_BYTES`; None if it may be made.
+
+    Args:
+        needed: an estimate from its size, bytes.
+        program: what the message calls it.
+        advice: what to do instead, for the same message.
+    """
+    if needed <= MAX_BYTES:
+        return None
+    error = f"{program} would take {needed / 2**30:.0f} GiB; {advice}"
+    return Solution(Status.FAILED, build_s=0.0, setup_s=0.0, solve_s=0.0, error=error)

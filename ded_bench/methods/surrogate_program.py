@@ -16,13 +16,13 @@ from ded_bench.methods.knot_program import KnotProgram, solve_with_rows_added
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.solution import Solution
 from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate
 from ded_bench.surrogates.instance_model import model_along
-from ded_bench.plants.time_varying import Indices, TimeVarying
 
 #: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7

@@ -21,12 +21,12 @@ from ded_bench.methods.knot_program import Attempt, KnotProgram, Limit, solve_wi
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
 from ded_bench.plants.plant import SimulationError
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.solvers.status import Status
-from ded_bench.plants.time_varying import Indices, TimeVarying
 
 #: A step that brings less than the first part of what its program promises is not taken; below the second
 #: part the radius shrinks, above the third it grows if it limited the step.

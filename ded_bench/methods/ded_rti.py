@@ -20,21 +20,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.first_schedules import first_schedules
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
-from ded_bench.methods.knots import is_reachable
-from ded_bench.methods.model_artifact import model_artifact
-from ded_bench.methods.receding_knots import receding_points, tightened
+from ded_bench.methods.knots import is_reachable, receding_knots, tightened
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import reference
-from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.plant import SimulationError, plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -44,13 +43,9 @@ from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
 from ded_bench.surrogates.instance_model import model_along
-from ded_bench.surrogates.planned_trajectory import simulate_plan
-from ded_bench.plants.time_varying import Indices, TimeVarying, linearise_along
 
-#: Part of the frequency bound that plans leave free.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    "real-time": {"margin": 0.5},
-}
+#: Raised when answers change.
+VERSION = 1
 #: What an excess of 1 rad/s through one interval costs, in sums of all columns' costs.
 PRICE = 10.0
 #: Relative duality gap, and residuals, that are small enough; regularisation. All chosen on validation draws.
@@ -59,17 +54,31 @@ GAP, RESIDUAL, REGULARISATION = 1e-3, 1e-5, 1e-9
 OPEN, PROGRAMS = 0.02, 4
 
 
+@dataclass(frozen=True)
+class Options:
+    """How plans are made."""
+
+    margin: float = option(
+        0.5, "part of the bound that plans leave free", lowest=0.0, highest=0.99, in_operation=True
+    )
+    reserve: bool = option(False, "room to follow ramps that nobody announced")
+
+
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The surrogate that `prepare` would use."""
-    return (model_artifact(case, settings),)
+    return (model_artifact(case, settings, TRAJECTORY),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
     case.check_regimes([regime])
-    surrogate = find_surrogate(case, settings.model, settings.search)
+    from ded_bench.methods.real_time_reserve import ReserveSolver
+
+    surrogate = find_surrogate(case, settings.model or TRAJECTORY, settings.search)
     limit_s = np.inf if settings.time_limit_s is None else settings.time_limit_s
-    return RealTimeSolver(case, surrogate, regime, limit_s=limit_s, **SETTINGS[settings.name])
+    options = read_options(Options, settings.options)
+    kind = ReserveSolver if options.reserve else RealTimeSolver
+    return kind(case, surrogate, regime, options.margin, limit_s)
 
 
 class SoftProgram(KnotProgram):
@@ -133,7 +142,7 @@ class RealTimeSolver:
 
     def _step(self, case: Case, instance: Instance, last: Schedule | None) -> Solution:
         started = time.perf_counter()
-        points = receding_points(case, instance, last)
+        points = receding_knots(case, instance, last)
         if not is_reachable(case, instance, points):
             return Solution(Status.INFEASIBLE, error=Status.INFEASIBLE.sentence)
         try:
@@ -167,8 +176,9 @@ class RealTimeSolver:
             try:
                 if self.surrogate.kind != TRAJECTORY:
                     return model_along(self.case, self.surrogate, instance, p_gen, points)
-                plan = Schedule(instance.grid[points], p_gen)
-                return linearise_along(self.case, simulate_plan(self.case, instance, plan), points)
+                plan, plant = Schedule(instance.grid[points], p_gen), plant_of(self.case)
+                run = simulate(self.case, instance, plan, plant, exact=False)
+                return plant.linearise_along(run, points)
             except SimulationError as error:
                 reason = error
         raise reason

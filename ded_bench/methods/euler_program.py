@@ -5,25 +5,16 @@ Euler has one nonlinear part: f at the generators and the slack bus. It is linea
 trajectory, exactly in the loads, and a linear program without the other angles is solved; where
 f is met to `TOLERANCE` the trajectory meets the optimality conditions of the nonlinear program, since then
 both programs have the same derivatives there. Newton's convergence makes that two to four programs.
-This is the setting `accelerated` of `ded`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods import ded
-from ded_bench.methods.memory import too_large
-from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.methods.solver_answer import answer
 from ded_bench.plants.lossless.network import Network, PowerFlowError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -37,43 +28,6 @@ from ded_bench.solvers.status import Status
 TOLERANCE = 1e-8
 #: A sequence that is longer does not converge.
 MAX_PROGRAMS = 10
-#: Memory for each entry of the stiffness of all points: 28 bytes on 39bus, as the peak of a process.
-BYTES_PER_ENTRY = 28
-#: This setting of `ded` has no options.
-SETTINGS: Mapping[str, Mapping[str, Any]] = {"accelerated": {}}
-
-
-def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return a solver of single instances; one set of programs per process serves them all."""
-    case.check_regimes([regime])
-    return functools.partial(_solve, case, regime, settings)
-
-
-def _solve(case: Case, regime: str, settings: Settings, instance: Instance) -> Solution:
-    """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
-    needed = BYTES_PER_ENTRY * (instance.steps + 1) * len(case.buses) ** 2
-    if refusal := too_large(needed, "the sequence of programs", "`ded-slp` takes less"):
-        return refusal
-    started = time.perf_counter()
-    programs = _programs(case, regime, instance.steps, instance.dt_s)
-    build_s = time.perf_counter() - started
-    outcome, schedule = programs.solve(instance, settings.time_limit_s)
-    if outcome.status != Status.FAILED:
-        return answer(outcome, build_s, lambda: schedule)
-    limit = settings.time_limit_s
-    rest = None if limit is None else max(limit - outcome.solve_s, 1e-3)
-    verdict = ded.prepare_with(case, regime, rest)(instance)
-    return dataclasses.replace(
-        verdict,
-        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
-        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
-        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
-    )
-
-
-@functools.lru_cache(maxsize=2)
-def _programs(case: Case, regime: str, steps: int, dt: float) -> SequentialDed:
-    return SequentialDed(case, regime, steps, dt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +61,7 @@ def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injec
     return Injections(network.injections(theta)[:, rows], slope)
 
 
-class SequentialDed:
+class EulerPrograms:
     """The linear programs of one case, regime and grid: a fixed pattern of rows and columns.
 
     Columns at every t_k, k > 0: θ, ω and power of the generators, P_s up and down. Equations at every t_k:

@@ -6,7 +6,7 @@ repository's root. A block after `<!-- not tested: why -->` does not.
 
 from __future__ import annotations
 
-import ast
+import dataclasses
 import doctest
 import os
 import re
@@ -15,21 +15,20 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import pytest
 
 from ded_bench.cli.commands import parser
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import REPOSITORY
 
+REFERENCE = REPOSITORY / "results" / "9bus-reference"
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
-#: Languages of blocks that run; those of data, trees and formulas are shown only.
-RUN, SHOWN = ("python", "sh", "console"), ("text", "json", "csv", "toml")
+LINKED = [*PAGES, *sorted((REPOSITORY / "studies").rglob("*.md"))]
 BLOCK = re.compile(
     r"(?:<!-- not tested: (?P<why>.*?) -->\n+)?^```(?P<kind>\S*)\n(?P<text>.*?)^```$", re.M | re.S
 )
 LINK = re.compile(r"!?\[[^]]*\]\((?!https?:)([^)#]+)")
-#: Blocks that are too long or need another machine: the exception.
-MOST_SKIPPED = 6
 
 
 class Block(NamedTuple):
@@ -52,20 +51,12 @@ def blocks(page: Path) -> list[Block]:
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the repository's problems and reference run, and `ded-bench` on the path.
-
-    Of the schedules only those of one instance are there: to simulate all of them takes more than a minute.
-    """
-    reference, run = (place / "results" / "9bus-reference" for place in (REPOSITORY, tmp_path))
+    """A folder with the repository's problems and reference run, and `ded-bench` on the path."""
+    run = tmp_path / "results" / REFERENCE.name
     run.mkdir(parents=True)
     (tmp_path / "problems").symlink_to(REPOSITORY / "problems")
-    for entry in reference.iterdir():
-        if entry.name != "schedules":
-            (run / entry.name).symlink_to(entry)
-    for schedule in reference.glob("schedules/**/9bus-0001.csv.gz"):
-        kept = run / schedule.relative_to(reference)
-        kept.parent.mkdir(parents=True)
-        kept.symlink_to(schedule)
+    for entry in REFERENCE.iterdir():
+        (run / entry.name).symlink_to(entry)
     program = tmp_path / ".bin" / "ded-bench"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ded_bench "$@"\n')
@@ -101,37 +92,18 @@ def test_examples_run(page: Path, root: Path) -> None:
     """In the order of the page, Python in one namespace, as a reader would."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks(page):
-        if block.why_not or block.kind not in RUN:
+        if block.why_not:
             continue
         if block.kind == "python":
             code = compile("\n" * block.line + block.text, str(page), "exec")
             exec(code, namespace)
         elif block.kind == "sh":
             run_shell(block.text)
-        else:
+        elif block.kind == "console":
             run_console(block.text)
-    assert not list((REPOSITORY / "results" / "9bus-reference").glob("*.lock"))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_block_has_a_language(page: Path) -> None:
-    """A block that nobody named would not be tested; each fence opens or closes one."""
-    found = blocks(page)
-    assert {block.kind for block in found} <= {*RUN, *SHOWN}
-    assert 2 * len(found) == len(re.findall(r"^```", page.read_text(encoding="utf-8"), re.M))
-    for block in found:
-        if block.kind == "python":
-            ast.parse(block.text)  # those that do not run, too
-
-
-def test_few_blocks_are_left_out_each_for_a_reason() -> None:
-    skipped = [block for page in PAGES for block in blocks(page) if block.why_not]
-    runnable = [block for page in PAGES for block in blocks(page) if block.kind in RUN]
-    assert len(skipped) <= min(MOST_SKIPPED, len(runnable) // 2)
-    assert all(len(block.why_not.split()) >= 3 for block in skipped)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_links_lead_somewhere(page: Path) -> None:
     """Pages and pictures inside the repository."""
     for target in LINK.findall(page.read_text(encoding="utf-8")):
@@ -153,17 +125,24 @@ def test_commands_and_options_exist(page: Path) -> None:
             assert option.partition("=")[0] in known, line
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_files_named_exist(page: Path) -> None:
-    """Modules of ours that a page names in code style."""
-    text = page.read_text(encoding="utf-8")
-    for name in re.findall(r"`((?:ded_bench/)?[a-z_]+/[a-z_/]+\.py)`", text):
-        assert (REPOSITORY / "ded_bench" / name.removeprefix("ded_bench/")).is_file(), name
-
-
 def test_methods_are_documented() -> None:
-    """README and the model page name every registered method."""
-    for page in PAGES:
-        if page.name in ("README.md", "model.md"):
-            text = page.read_text(encoding="utf-8")
-            assert [name for name in METHODS if f"`{name}`" not in text] == [], page.name
+    """The page of the methods names every registered one, and its options in the same row."""
+    text = (REPOSITORY / "docs" / "methods.md").read_text(encoding="utf-8")
+    rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `")}
+    for name, method in METHODS.items():
+        cells = rows[name].split("|")
+        options = {field.name for field in dataclasses.fields(method.options)}
+        assert set(re.findall(r"`([a-z_]+)`", cells[3])) == options, name
+
+
+@pytest.mark.parametrize("table", ["table_v", "table_vi"])
+def test_readme_has_the_numbers_of_the_reference_run(table: str) -> None:
+    """Every row of its tables, to three digits."""
+    printed = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    found = pd.read_csv(REFERENCE / "tables" / f"{table}.csv").query("settings == 'default'")
+    for method in ("ded", "ded-ko", "ded-dpc-paper", "ded-dpc"):
+        for _, row in found[found["method"] == method].iterrows():
+            numbers = [row.iloc[4], row.iloc[6]]
+            cells = ["–" if pd.isna(number) else f"{number:.3g}" for number in numbers]
+            line = rf"\| {row['regime']} \| {re.escape(row['title'])} \| {cells[0]} \| \S+ \| {cells[1]} \|"
+            assert re.search(line, printed), line

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import shutil
@@ -12,16 +11,14 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.results.timing import read_timing, timing_summary
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import load_split, write_benchmark
-from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate
-from ded_bench.report.paper import paper_lines
 from ded_bench.results.rows import Results
-from tests.evaluate.test_summary import DED, with_gaps
+from ded_bench.results.timing import read_timing
 
 PYPROJECT = """\
 [project]
@@ -85,21 +82,10 @@ def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 
 
 def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, command, monkeypatch) -> None:
+    """It is solved in worker processes, timed without being asked, and has its line in the report."""
     assert len((PYPROJECT + MODULE).splitlines()) <= 20
     out = tmp_path / "out"
-    solve = [
-        "solve",
-        "--method",
-        "flat",
-        "--regime",
-        "NO,TO",
-        "--case",
-        problem,
-        "--workers",
-        2,
-        "--out",
-        out,
-    ]
+    solve = ["solve", "--method", "flat", "--case", problem, "--workers", 2, "--out", out]
     done = subprocess.run(
         [sys.executable, "-m", "ded_bench", *map(str, solve)],
         env=os.environ | {"PYTHONPATH": str(site)},
@@ -109,39 +95,18 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    results = Results(out)
-    assert len(results.rows) == 4
-    for row in results.rows.values():
-        assert (row.method, row.status, row.workers) == ("flat", "Feasible", 2)
-        assert row.objective > 0
-        assert 0 < row.solve_s < 5
-        cheaper = {"method": "ded", "objective": row.objective / 1.02}
-        results.add([dataclasses.replace(row, **cheaper)])
+    rows = list(Results(out).rows.values())
+    assert [(row.method, row.status, row.workers) for row in rows] == [("flat", "Feasible", 2)] * 4
     monkeypatch.syspath_prepend(site)
-    bench = (
-        "bench",
-        "--case",
-        problem,
-        "--method",
-        "flat",
-        "--instances",
-        1,
-        "--repeats",
-        1,
-        "--results",
-        out,
-    )
-    assert command(*bench)[0] == 0
-    frame, timing = with_gaps(Results(out).frame()), timing_summary(read_timing(out / "timing.csv"))
-    lines = paper_lines(frame, timing, None, DED)
-    five = tabulate(TABLE_V, lines).set_index(["regime", "title"])
-    six = tabulate(TABLE_VI, lines).set_index(["regime", "title"])
+    assert command("bench", "--case", problem, "--instances", 1, "--repeats", 1, "--results", out)[0] == 0
+    assert command("report", "--case", problem, "--workers", 1, "--results", out)[0] == 0
+    summary = pd.read_csv(out / "tables" / "summary.csv").set_index(["regime", "method"])
     for regime in ("NO", "TO"):
-        assert five.loc[(regime, "flat"), "increase_percent"] == pytest.approx(2.0)
-        assert five.loc[(regime, "flat"), "n"] == 2
-        assert 0 < five.loc[(regime, "flat"), "solve_s"] < 5
-        assert six.loc[(regime, "flat"), "n"] == 2
-        assert six.loc[(regime, "flat"), "ramp_violation"] == 0.0
+        assert summary.loc[(regime, "flat"), "n"] == 2
+    assert {(row.regime, row.method) for row in read_timing(out / "timing.csv")} == {
+        ("NO", "flat"),
+        ("TO", "flat"),
+    }
 
 
 def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
@@ -204,9 +169,7 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     assert (
         f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     )
-    assert "mine" in {
-        line.title for line in paper_lines(with_gaps(Results(out).frame()), timing_summary([]), None, DED)
-    }
+    assert {row.method for row in Results(out).rows.values()} == {"mine"}
     for wrong in (
         score,  # no name
         (*score, "--name", "ded"),

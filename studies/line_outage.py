@@ -17,13 +17,13 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench import Case, Settings, score, solve
-from ded_bench.results.reference_run import search_folders
 from ded_bench.methods.admm.admm_policy import find_policy
 from ded_bench.methods.admm.admm_refined import Refiner
 from ded_bench.methods.policy_file import find_policy_file
+from ded_bench.plants.lossless.network import PowerFlowError
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.sampling import sample_instance
-from ded_bench.plants.lossless.network import PowerFlowError
+from ded_bench.results.reference_run import search_folders
 
 REGIME, SEED = "TO", 20241
 

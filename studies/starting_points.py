@@ -1,0 +1,56 @@
+"""Is the optimum of full DED the same from every starting point? `python studies/starting_points.py 10`
+
+Instances of 9bus are solved from the state at t = 0, as `ded` does, and from what three schedules do on the
+grid: static dispatch, DED-KO on the linearised grid, random set-points followed at the ramp limit.
+"""
+
+import sys
+
+import numpy as np
+import pandas as pd
+
+from ded_bench import Case, Instance, Schedule, Settings, load_instances, simulate, solve
+from ded_bench.methods import ded, ed
+from ded_bench.solvers.compile import compile_model
+
+
+def random_schedule(case: Case, instance: Instance) -> Schedule:
+    """Set-points drawn every 5 s from within the limits, followed at the ramp limit; the same every time."""
+    rng = np.random.default_rng(list(instance.fingerprint.encode()))
+    targets = rng.uniform(
+        case.p_min, case.p_max, size=(round(instance.horizon_s / 5.0), len(case.generators))
+    )
+    return ed.follow_set_points(case, instance, targets, 5.0)
+
+
+def main(count: int) -> None:
+    """Print the change of the objective and the iterations from each starting point."""
+    case = Case.load("9bus")
+    instances = load_instances("9bus", limit=count)
+    model = ded.build_ded(case, instances[0].steps, instances[0].dt_s)
+    compiled = compile_model(model, "ipopt", {"min_refinement_steps": 0})
+    rows = []
+    for regime in case.regimes:
+        for instance in instances:
+            starts = {
+                "cold": None,
+                "ed": solve(instance, "ed", regime, settings=Settings("every=1")).schedule,
+                "ko": solve(instance, "ded-ko", regime, settings=Settings(model="linear")).schedule,
+                "random": random_schedule(case, instance),
+            }
+            for name, schedule in starts.items():
+                ded.set_instance(model, case, instance, regime)
+                if schedule is not None:
+                    path = simulate(instance, schedule, case)
+                    ded.set_start(model, case, path.theta, path.omega, path.p_gen, path.p_slack)
+                outcome = compiled.solve(None)
+                rows.append((regime, name, instance.id, outcome.objective, outcome.iterations))
+    table = pd.DataFrame(rows, columns=["regime", "start", "instance", "objective", "iterations"])
+    cold = table.groupby(["regime", "instance"])["objective"].transform("first")
+    table["change_percent"] = 100 * (table["objective"] / cold - 1)
+    grouped = table.groupby(["regime", "start"], sort=False)
+    print(grouped.agg({"change_percent": ["min", "max"], "iterations": "median"}).to_string())
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10)

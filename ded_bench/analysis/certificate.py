@@ -1,8 +1,8 @@
 """A statistical certificate of a policy: how surely it meets every limit near the condensed optimum.
 
 m fresh instances are drawn from seeds that nothing else uses. On each, the policy and a reference
-method answer, both answers are re-simulated on the true system, and a *success* is a schedule that
-meets every limit within the tolerances and costs at most `gap_percent` more than the reference's.
+method answer, both answers are re-simulated on the plant, and a *success* is a schedule that meets
+every limit within the tolerances and costs at most `gap_percent` more than the reference's.
 Successes are independent with one unknown probability, which is then, with confidence 1 - δ, at
 least the lower bound of Clopper and Pearson, or the weaker one of Hoeffding that the paper's
 reference for such guarantees uses. An instance on which either method fails is no success.
@@ -14,34 +14,33 @@ import dataclasses
 import functools
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.stats import binomtest
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
 from ded_bench.files.table import Table, cell
-from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.artifact import named
+from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solver
-from ded_bench.plants import score as scorer
-from ded_bench.plants.plant import servable
+from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score, score
-from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
-from ded_bench.problem.schedule import Schedule
-from ded_bench.run.code import code_of, code_of_method, named
-from ded_bench.run.environment import host, now, version
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.legacy import upgraded
+from ded_bench.results.timing import model_name
+from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
 
-FILE = "certificate.json"
 #: Instances answered, re-simulated and saved together.
 CHUNK = 50
 
@@ -50,7 +49,6 @@ CHUNK = 50
 class Criteria:
     """What counts as a success, and how sure a bound is: its confidence is 1 - delta."""
 
-    reference: str = "ded-ko-knots"
     gap_percent: float = 1.0
     tolerance_hz: float = STRICT_HZ
     tolerance_pu: float = STRICT_PU
@@ -93,20 +91,27 @@ class Certificate(Record):
     delta: float
     clopper_pearson: float
     hoeffding: float
-    artifacts: str  # changes with the case, the policy, the models and the code
-    policy: str = ""  # `name@fingerprint` of what shaped the policy's answers
+    artifacts: str  # changes with the case, the methods, the policy and the models
+    policy: str = ""  # `name@fingerprint` of what shaped the answers
     model: str = ""
-    code: str = ""  # of the policy, of the reference, and of the scorer
-    reference_code: str = ""
-    score_code: str = ""
+    commit: str = ""
     version: str
     host: str
     date: str
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_old_names(cls, data: Any) -> Any:
+        """One that was made before methods had options told the code by hashes."""
+        if not (isinstance(data, dict) and "code" in data):
+            return data
+        dropped = ("code", "reference_code", "score_code", "method_version")
+        return {name: value for name, value in upgraded(data).items() if name not in dropped}
+
     @property
-    def key(self) -> tuple[str, str, str, str]:
+    def key(self) -> tuple[str, str, str, str, str]:
         """What a results folder holds one certificate of."""
-        return self.case, self.method, self.settings, self.regime
+        return self.case, self.method, self.settings, self.regime, model_name(self.model)
 
     @property
     def sentence(self) -> str:
@@ -127,21 +132,52 @@ class Certificates(Record):
     certificates: tuple[Certificate, ...] = ()
 
 
+@dataclass(frozen=True)
+class Candidate:
+    """What is certified: a policy in one regime, beside a reference on the same surrogate."""
+
+    method: str
+    regime: str
+    settings: Settings
+    reference: str = "ded-ko-knots"
+
+    @property
+    def pair(self) -> tuple[tuple[str, Settings], tuple[str, Settings]]:
+        """The policy and the reference, each with its settings: the reference has its own defaults."""
+        own = self.settings
+        return (self.method, own), (self.reference, dataclasses.replace(own, options=DEFAULT, policy=None))
+
+    def facts(self, case: Case) -> dict[str, str]:
+        """What a certificate says of it: names, models and policies; InputError if one is missing."""
+        used = [a for method, own in self.pair for a in get_method(method).artifacts(case, self.regime, own)]
+        made_with = {kind: named(dict.fromkeys(used), kind) for kind in ("model", "policy")}
+        settings = get_method(self.method).canonical(self.settings).options
+        name = {"method": self.method, "settings": settings, "regime": self.regime}
+        return name | {"reference": self.reference} | made_with
+
+    def fingerprint(self, case: Case, seed: int) -> str:
+        """Twelve hex digits that change with whatever decides on its rows."""
+        versions = [str(get_method(method).version) for method, _ in self.pair]
+        parts = [case.fingerprint, str(seed), *versions, *self.facts(case).values()]
+        return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
+
+    def rows_file(self, case: Case, folder: Path) -> Path:
+        """Where a results folder keeps the rows that its certificate counts."""
+        facts = self.facts(case)
+        names = facts["method"], facts["settings"], model_name(facts["model"]), facts["regime"]
+        return ResultsFolder(folder).certificate_rows(*names)
+
+
 def read_certificates(folder: Path) -> tuple[Certificate, ...]:
     """Read the certificates of a results folder, none if it has none; InputError if the file is wrong."""
-    path = folder / FILE
+    path = ResultsFolder(folder).certificates
     return read_record(Certificates, path).certificates if path.is_file() else ()
 
 
 def save_certificate(folder: Path, certificate: Certificate) -> None:
-    """Add a certificate to a results folder; one for the same method, settings and regime is replaced."""
+    """Add a certificate to a results folder; one of the same key is replaced."""
     kept = [c for c in read_certificates(folder) if c.key != certificate.key]
-    write_record(Certificates(certificates=(*kept, certificate)), folder / FILE)
-
-
-def rows_file(folder: Path, method: str, regime: str, settings: Settings) -> Path:
-    """Where a results folder keeps the rows that a certificate counts."""
-    return folder / "certificates" / f"{method}-{settings.slug}-{regime}.csv"
+    write_record(Certificates(certificates=(*kept, certificate)), ResultsFolder(folder).certificates)
 
 
 def clopper_pearson(successes: int, count: int, delta: float) -> float:
@@ -162,52 +198,50 @@ def hoeffding(successes: int, count: int, delta: float) -> float:
 
 def certify(
     case: Case,
-    method: str,
-    regime: str,
-    settings: Settings,
-    rows_path: Path,
+    candidate: Candidate,
+    folder: Path,
     criteria: Criteria,
     *,
     count: int = 10_000,
     seed: int = 0,
     workers: int = 1,
 ) -> Certificate:
-    """Answer and re-simulate what `rows_path` lacks of the instances, and certify.
+    """Answer and re-simulate what a results folder lacks of the instances, and certify.
 
-    Rows are saved chunk by chunk; those of another policy, model or case are made anew.
+    Rows are saved chunk by chunk; those of another policy, model, version or case are made anew.
 
     Args:
-        rows_path: CSV with one row per instance (see CertificateRow).
-        criteria: what counts as a success, against which method, and how sure the bound is.
+        case: the grid.
+        candidate: what is certified.
+        folder: where rows are kept, one for each instance (see CertificateRow).
+        criteria: what counts as a success, and how sure the bound is.
         count: how many instances.
         seed: the instances are those of master seed CERTIFICATE_SEED + seed.
+        workers: processes.
 
     Raises:
         InputError: unknown method or regime, a missing policy or model, or a wrong file of rows.
     """
-    case.check_regimes([regime])
-    reference = criteria.reference
-    made_by = _made_by(case, method, reference, regime, settings)
-    fingerprint = _fingerprint(case, method, reference, settings, seed, made_by)
-    done = {r.index: r for r in read_rows(rows_path) if r.fingerprint == fingerprint and r.index < count}
+    case.check_regimes([candidate.regime])
+    path, fingerprint = candidate.rows_file(case, folder), candidate.fingerprint(case, seed)
+    done = {r.index: r for r in read_rows(path) if r.fingerprint == fingerprint and r.index < count}
     missing = [i for i in range(count) if i not in done]
-    chunks = [missing[start : start + CHUNK] for start in range(0, len(missing), CHUNK)]
-    calls = [(case, method, reference, regime, settings, seed, tuple(chunk)) for chunk in chunks]
-    with tqdm(total=count, initial=len(done), unit="instance", disable=None, desc=f"certify {regime}") as bar:
+    calls = [
+        (case, candidate, seed, tuple(missing[start : start + CHUNK]))
+        for start in range(0, len(missing), CHUNK)
+    ]
+    with tqdm(total=count, initial=len(done), unit="instance", disable=None, desc="certify") as bar:
         for made in _judged(calls, workers):
             done |= {row.index: dataclasses.replace(row, fingerprint=fingerprint) for row in made}
-            ROWS.write(rows_path, [done[index] for index in sorted(done)])
+            ROWS.write(path, [done[index] for index in sorted(done)])
             bar.update(len(made))
     rows = ROWS.frame(done.values())
     limits = meets_limits(rows, criteria.tolerance_hz, criteria.tolerance_pu)
     near = gaps(rows) <= criteria.gap_percent
     successes = int((limits & near).sum())
-    promise: dict[str, Any] = asdict(criteria) | made_by
+    facts: dict[str, Any] = asdict(criteria) | candidate.facts(case)
     return Certificate(
         case=case.id,
-        method=method,
-        regime=regime,
-        settings=settings.slug,
         seed=CERTIFICATE_SEED + seed,
         count=count,
         successes=successes,
@@ -216,10 +250,11 @@ def certify(
         clopper_pearson=clopper_pearson(successes, count, criteria.delta),
         hoeffding=hoeffding(successes, count, criteria.delta),
         artifacts=fingerprint,
+        commit=commit(),
         version=version(),
         host=host(),
         date=now(),
-        **promise,
+        **facts,
     )
 
 
@@ -239,28 +274,33 @@ def read_rows(path: Path) -> list[CertificateRow]:
     return ROWS.read(path) if path.is_file() else []
 
 
-def judge(
-    case: Case,
-    method: str,
-    reference: str,
-    regime: str,
-    settings: Settings,
-    seed: int,
-    indices: tuple[int, ...],
-) -> list[CertificateRow]:
+def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -> list[CertificateRow]:
     """Answer some instances with both methods and re-simulate; one row each, without fingerprint."""
-    instances = [next(sample_instances(case, CERTIFICATE_SEED + seed, 1, i, servable)) for i in indices]
-    plain = _plain(settings)
-    schedules = [
-        *_schedules(case, method, regime, settings, instances),
-        *_schedules(case, reference, regime, plain, instances),
-    ]
-    scores = _scores(case, [*instances, *instances], schedules, regime)
-    verdicts = scores[: len(instances)], scores[len(instances) :]
-    return [
-        CertificateRow(index, "", reference=other.objective if other else None, **asdict(own) if own else {})
-        for index, own, other in zip(indices, *verdicts, strict=True)
-    ]
+    rows = []
+    for index in indices:
+        instance = next(sample_instances(case, CERTIFICATE_SEED + seed, 1, index, servable))
+        own, other = (_score(case, m, candidate.regime, s, instance) for m, s in candidate.pair)
+        cells = asdict(own) if own else {}
+        rows.append(CertificateRow(index, "", reference=other.objective if other else None, **cells))
+    return rows
+
+
+def _score(case: Case, method: str, regime: str, settings: Settings, instance: Instance) -> Score | None:
+    """The score of an answer; None where there is no schedule, or its plant cannot follow it."""
+    solve = _prepared(case, method, regime, settings)
+    try:
+        schedule = solve(instance).schedule
+    except Exception:  # the boundary to the methods: an instance without an answer is no success
+        return None
+    try:
+        return None if schedule is None else score(case, instance, schedule, regime)
+    except SimulationError:
+        return None
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+    return get_method(method).prepare(case, regime, settings)
 
 
 def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:
@@ -272,71 +312,6 @@ def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[Certifi
             if not isinstance(answer, list):
                 raise RuntimeError(f"a chunk of the certificate failed: {answer}")
             yield answer
-
-
-def _schedules(
-    case: Case, method: str, regime: str, settings: Settings, instances: list[Instance]
-) -> list[Schedule | None]:
-    solve = _prepared(case, method, regime, settings)
-    return [_answer(solve, instance) for instance in instances]
-
-
-def _answer(solve: Solver, instance: Instance) -> Schedule | None:
-    try:
-        return solve(instance).schedule
-    except Exception:  # the boundary to the methods: an instance without an answer is no success
-        return None
-
-
-@functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    return get_method(method).prepare(case, regime, settings)
-
-
-def _scores(
-    case: Case, instances: list[Instance], schedules: list[Schedule | None], regime: str
-) -> list[Score | None]:
-    """Scores; None where there is no schedule or the system loses synchronism."""
-    result: list[Score | None] = []
-    for instance, schedule in zip(instances, schedules, strict=True):
-        try:
-            result.append(None if schedule is None else score(case, instance, schedule, regime))
-        except SimulationError:
-            result.append(None)
-    return result
-
-
-def _made_by(case: Case, method: str, reference: str, regime: str, settings: Settings) -> dict[str, str]:
-    """What the answers and their scores depend on, as fields of a certificate."""
-    found = {}
-    used: list[Artifact] = []
-    for name, field, own in ((method, "code", settings), (reference, "reference_code", _plain(settings))):
-        answering = get_method(name)
-        artifacts = answering.artifacts(case, regime, own)
-        found[field] = code_of_method(answering, own.name, artifacts)
-        used += [artifact for artifact in artifacts if artifact not in used]
-    for kind in ("model", "policy"):
-        found[kind] = named(used, kind)
-    return found | {"score_code": code_of(scorer.__name__)}
-
-
-def _fingerprint(
-    case: Case, method: str, reference: str, settings: Settings, seed: int, made_by: dict[str, str]
-) -> str:
-    parts = [
-        case.fingerprint,
-        method,
-        reference,
-        settings.slug,
-        str(seed),
-        *map(str, sorted(made_by.items())),
-    ]
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-
-
-def _plain(settings: Settings) -> Settings:
-    """The reference method's settings: its own defaults, on the same Koopman model."""
-    return Settings("default", settings.model, None, settings.time_limit_s, settings.search)
 
 
 def _check_trials(successes: int, count: int, delta: float) -> None:

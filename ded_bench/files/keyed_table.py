@@ -82,7 +82,7 @@ class KeyedTable(Generic[K, T]):
     def add(self, rows: Iterable[T]) -> None:
         """Save rows at once, replacing those with the same key; other processes' rows are kept."""
         rows = list(rows)
-        with self._locked():
+        with self.locked():
             self.reload()
             if self._seen is None or not set(self._table.names) <= set(self._header):
                 self._take((row, {}) for row in rows)
@@ -104,7 +104,7 @@ class KeyedTable(Generic[K, T]):
 
     def compact(self) -> None:
         """Leave one line per key."""
-        with self._locked():
+        with self.locked():
             self.reload()
             if self._superseded:
                 self._write_all()
@@ -159,7 +159,8 @@ class KeyedTable(Generic[K, T]):
         self._seen = _Seen(self.path.stat().st_ino, len(data), data[-_TAIL:])
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing to the folder; not to be nested."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path.parent / ".lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -94,14 +94,27 @@ class Column:
         return value
 
 
+#: The cells of a row by the names of their columns.
+Cells = dict[str, str]
+
+
 class Table(Generic[T]):
     """Reads and writes tables whose rows are instances of one frozen dataclass.
 
     Its fields are of type str, int, float or bool, or one of these or None.
     """
 
-    def __init__(self, kind: type[T]) -> None:
-        self.kind = kind
+    def __init__(
+        self, kind: type[T], since: str = "", upgrade: Callable[[Cells], Cells] | None = None
+    ) -> None:
+        """Declare a table.
+
+        Args:
+            kind: of its rows.
+            since: a column that files of older versions lack.
+            upgrade: what turns the rows of such files into those of today.
+        """
+        self.kind, self._since, self._upgrade = kind, since, upgrade
         hints = typing.get_type_hints(kind)
         self.columns = tuple(_column(field, hints[field.name]) for field in dataclasses.fields(kind))  # type: ignore[arg-type]
         self.names = tuple(column.name for column in self.columns)
@@ -130,7 +143,7 @@ class Table(Generic[T]):
 
     def rows(
         self, found: Iterable[tuple[int, list[str]]], header: Sequence[str], source: str | Path
-    ) -> Iterator[tuple[T, dict[str, str]]]:
+    ) -> Iterator[tuple[T, Cells]]:
         """Yield every row, and its cells of columns that are not declared here, by name.
 
         Args:
@@ -140,19 +153,22 @@ class Table(Generic[T]):
         Raises:
             InputError: a line has too many or too few values, or a wrong one.
         """
-        places = [(column, header.index(column.name)) for column in self.columns if column.name in header]
-        others = [(name, i) for i, name in enumerate(header) if name not in self.names]
-        for line, cells in found:
-            if len(cells) != len(header):
-                raise InputError(source, f"line {line}", f"{len(cells)} values for {len(header)} columns")
+        upgrade = self._upgrade if self._since not in header else None
+        for line, texts in found:
+            if len(texts) != len(header):
+                raise InputError(source, f"line {line}", f"{len(texts)} values for {len(header)} columns")
+            cells = dict(zip(header, texts, strict=True))
+            cells = upgrade(cells) if upgrade else cells
             values = {}
-            for column, i in places:
+            for column in self.columns:
                 try:
-                    values[column.name] = column.parse(cells[i])
+                    if column.name in cells:
+                        values[column.name] = column.parse(cells.pop(column.name))
                 except ValueError:
-                    where, what = f"line {line}, {column.name}", f"{cells[i][:30]!r} is not a valid value"
+                    text = texts[header.index(column.name)] if column.name in header else ""
+                    where, what = f"line {line}, {column.name}", f"{text[:30]!r} is not a valid value"
                     raise InputError(source, where, what) from None
-            yield self.kind(**values), {name: cells[i] for name, i in others}
+            yield self.kind(**values), cells
 
     def format(self, rows: Iterable[T]) -> str:
         """Rows as CSV text under a header of all columns; missing values are empty."""

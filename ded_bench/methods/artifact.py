@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -38,3 +39,8 @@ def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> 
     model = find_surrogate(case, name, settings.search)
     path = find_model_file(case, name, settings.search)
     return Artifact("model", model.kind, model.fingerprint, path)
+
+
+def named(artifacts: Iterable[Artifact], kind: str) -> str:
+    """The models, or the policies, that shaped an answer, as rows say it: `name@fingerprint`, joined by +."""
+    return "+".join(f"{a.name}@{a.fingerprint}" for a in artifacts if a.kind == kind)

@@ -33,9 +33,14 @@ class ResultsFolder:
         """Folder of the schedules of the results' rows."""
         return self.path / "schedules"
 
-    def schedule(self, method: str, settings: str, regime: str, instance: str) -> Path:
-        """The schedule of one row."""
-        return self.schedules / method / settings / regime / f"{instance}.csv.gz"
+    def archive(self, method: str, settings: str, regime: str) -> Path:
+        """The schedules of some rows (see `results.archive`)."""
+        return self.schedules / method / settings / f"{regime}.npz"
+
+    @property
+    def validated(self) -> Path:
+        """Kept schedules on plants other than those of their rows."""
+        return self.path / "validated.csv"
 
     @property
     def koopman(self) -> Path:
@@ -79,9 +84,9 @@ class ResultsFolder:
         """Certificates of policies."""
         return self.path / "certificate.json"
 
-    def certificate_rows(self, method: str, settings: str, regime: str) -> Path:
-        """What one certificate counts, one row per instance."""
-        return self.path / "certificates" / f"{method}-{settings}-{regime}.csv"
+    def certificate_rows(self, *name: str) -> Path:
+        """What one certificate counts, one row per instance; `name` is what makes it unique."""
+        return self.path / "certificates" / f"{'-'.join(filter(None, name))}.csv"
 
     @property
     def tables(self) -> Path:

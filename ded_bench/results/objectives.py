@@ -37,11 +37,14 @@ def objectives_file(folder: Path) -> Path:
 
 
 def objectives_of(rows: Iterable[Row]) -> list[Objective]:
-    """The scored rows with default settings, by regime, method and instance."""
+    """The scored rows with default settings and nothing trained, by regime, method and instance."""
     found = [
         Objective(row.case, row.instance, row.regime, row.method, row.objective, row.problems_version)
         for row in rows
-        if row.objective is not None and row.settings == "default" and row.split != _LEFT_OUT
+        if row.objective is not None
+        and row.settings == "default"
+        and not (row.model or row.policy)
+        and row.split != _LEFT_OUT
     ]
     return sorted(found, key=lambda o: (o.regime, o.method, o.instance))
 

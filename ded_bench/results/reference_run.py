@@ -1,7 +1,7 @@
-"""Committed reference runs, one per case: whole in a checkout; an installed package has what answers need.
+"""Where results of a case lie unless told otherwise: the default folder, and the committed reference run.
 
-The package keeps of each `results/<case>-reference/` its models, its policies and the table of objectives
-(`run.objectives`), so that every method answers, and every gap has a reference, in an empty folder.
+A checkout has whole reference runs, one per case. An installed package has of each its models, its policies
+and the table of objectives (`results.objectives`), so that every method answers in an empty folder.
 """
 
 from __future__ import annotations
@@ -9,13 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from ded_bench.problem.case import REPOSITORY, Case
-from ded_bench.surrogates import find as surrogates
 
 #: Where reference runs lie: inside an installed package, or in a checkout's results.
 REFERENCE_RUNS = next(
     (p for p in (REPOSITORY / "ded_bench" / "_reference_runs", REPOSITORY / "results") if p.is_dir()),
     REPOSITORY / "results",
 )
+
+
+def default_results(case: Case) -> Path:
+    """Where results of a case lie unless told otherwise, below the working directory."""
+    return Path("results") / case.id
 
 
 def reference_run(case: Case) -> Path:
@@ -25,4 +29,4 @@ def reference_run(case: Case) -> Path:
 
 def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
     """Where models and policies are looked for: `first`, the default results, then the reference run."""
-    return tuple(dict.fromkeys((*surrogates.search_folders(case, *first), reference_run(case))))
+    return tuple(dict.fromkeys((*first, default_results(case), reference_run(case))))

@@ -1,8 +1,9 @@
-"""The results table of a folder: one row per (instance, regime, method, settings)."""
+"""The results table of a folder: one row per instance, regime, method and what the method was run with."""
 
 from __future__ import annotations
 
-from collections.abc import Container
+import contextlib
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,7 +14,9 @@ from ded_bench.files.table import Table, cell, plain_name
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.results.archive import Archive
 from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.legacy import upgraded
 from ded_bench.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -25,21 +28,25 @@ SCORING_FAILED = "scoring failed: "
 
 
 class Key(NamedTuple):
-    """What makes a row unique."""
+    """What makes a row unique. `model` and `policy` are `name@fingerprint`, or empty."""
 
+    case: str
     instance: str
     regime: str
     method: str
     settings: str
+    model: str = ""
+    policy: str = ""
+    time_limit_s: float | None = None
 
 
 @dataclass(frozen=True)
 class Row:
-    """One result. `status` is the solver's claim; objective and violations are re-simulated.
+    """One result. `status` is the solver's claim; objective and violations are re-simulated on `plant`.
 
-    Units are in the names; ramp, bound and initial violations are in pu. `model` and `policy` are
-    `name@fingerprint` of what shaped the answer, `code` and `score_code` say which sources computed the
-    answer and its score (see `run.code`). A row is valid for a task of the same `fingerprint`.
+    Units are in the names; ramp, bound and initial violations are in pu. `settings` is the canonical text of
+    the method's options, `commit` and `version` tell the code that made the row, and `method_version` is the
+    method's then. A row is valid for a task of the same `fingerprint`.
     """
 
     instance: str = cell(check=plain_name)
@@ -69,25 +76,61 @@ class Row:
     date: str = ""
     case: str = ""
     seed: str = ""
-    fingerprint: str = ""
+    fingerprint: str = cell(default="", check=plain_name)
     time_limit_s: float | None = None
     model: str = ""
     policy: str = ""
-    code: str = ""
-    score_code: str = ""
+    plant: str = "lossless"
+    commit: str = ""
+    method_version: int = 0
 
     @property
     def key(self) -> Key:
         """The row's place in the table."""
-        return Key(self.instance, self.regime, self.method, self.settings)
+        return Key(*(getattr(self, name) for name in Key._fields))
 
     @property
     def scored(self) -> bool:
         """The scorer has spoken, or has failed and said why."""
         return self.objective is not None or self.error.startswith(SCORING_FAILED)
 
+    @property
+    def member(self) -> str:
+        """What the row's schedule is called in its archive."""
+        return f"{self.instance}-{self.fingerprint}"
 
-ROWS = Table(Row)
+
+@dataclass(frozen=True)
+class ValidatedRow:
+    """The kept schedule of one row, judged on another plant than the row's."""
+
+    case: str
+    instance: str
+    regime: str
+    method: str
+    settings: str
+    plant: str
+    model: str = ""
+    policy: str = ""
+    time_limit_s: float | None = None
+    objective: float | None = None
+    freq_violation_hz: float | None = None
+    ramp_violation: float | None = None
+    bound_violation: float | None = None
+    initial_violation: float | None = None
+    feasible: bool | None = None
+    feasible_strict: bool | None = None
+    error: str = ""
+    fingerprint: str = ""
+
+    @property
+    def key(self) -> tuple[Key, str]:
+        """The row's place in the table."""
+        return Key(*(getattr(self, name) for name in Key._fields)), self.plant
+
+
+ROWS = Table(Row, since="method_version", upgrade=upgraded)
+VALIDATED = Table(ValidatedRow)
 
 
 class Results(KeyedTable[Key, Row]):
@@ -100,30 +143,52 @@ class Results(KeyedTable[Key, Row]):
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.paths = ResultsFolder(self.folder)
+        self._archives: dict[Path, Archive] = {}
         super().__init__(self.paths.results, ROWS)
 
-    def has(self, key: Key, fingerprint: str) -> bool:
-        """Whether a row is finished: same fingerprint, and scored.
+    def finished(self, key: Key, fingerprint: str, version: int = 0) -> bool:
+        """Whether a row is there: same fingerprint, not of an older version of the method, and scored.
 
         One without an objective, for which scoring has failed, needs its schedule as well. Others are
         finished without: a published folder keeps a part of its schedules only.
         """
-        if not self.made_from(key, fingerprint):
+        if not self._made(key, fingerprint, version):
             return False
         row = self.rows[key]
-        return row.objective is not None or (row.scored and self.schedule_path(key).is_file())
+        return row.objective is not None or (row.scored and self.has_schedule(row))
 
-    def solved(self, key: Key, fingerprint: str) -> bool:
-        """Whether a schedule for this row is on disk, scored or not."""
-        return self.made_from(key, fingerprint) and self.schedule_path(key).is_file()
+    def solved(self, key: Key, fingerprint: str, version: int = 0) -> bool:
+        """Whether a schedule for this row is kept, scored or not."""
+        return self._made(key, fingerprint, version) and self.has_schedule(self.rows[key])
 
-    def schedule_path(self, key: Key) -> Path:
+    def _made(self, key: Key, fingerprint: str, version: int) -> bool:
+        return self.made_from(key, fingerprint) and self.rows[key].method_version >= version
+
+    def archive(self, row: Row) -> Archive:
         """Where the schedule of a row is kept."""
-        return self.paths.schedule(key.method, key.settings, key.regime, key.instance)
+        path = self.paths.archive(row.method, row.settings, row.regime)
+        return self._archives.setdefault(path, Archive(path))
 
-    def schedule(self, key: Key, case: Case, instance: Instance) -> Schedule:
+    def has_schedule(self, row: Row) -> bool:
+        """Whether the schedule of a row is kept; InputError if its archive is damaged."""
+        return row.member in self.archive(row)
+
+    def schedule(self, row: Row, case: Case, instance: Instance) -> Schedule:
         """Read the schedule of a row; InputError if it is missing or wrong."""
-        return Schedule.read(self.schedule_path(key), case, instance.horizon_s)
+        return self.archive(row).read(row.member, case, instance.horizon_s)
+
+    def keep(self, row: Row, schedule: Schedule | None, case: Case) -> None:
+        """Save a row and its schedule, which comes first: one without a row is no loss.
+
+        A row that has no schedule takes away what an earlier one of its key has left.
+        """
+        archive, before = self.archive(row), self.rows.get(row.key, row)
+        if schedule is not None:
+            archive.write(row.member, schedule, case)
+        elif left := [name for name in (row.member, before.member) if name in archive]:
+            with self.locked():
+                archive.drop(left)
+        self.add([row])
 
     def kept(self, instances: Container[str]) -> list[Row]:
         """The rows of some instances, by id, whose schedules are kept.
@@ -131,11 +196,32 @@ class Results(KeyedTable[Key, Row]):
         Raises:
             InputError: there is none.
         """
-        known = [row for row in self.rows.values() if row.instance in instances]
-        kept = [row for row in known if self.schedule_path(row.key).is_file()]
+        kept = [row for row in self.rows.values() if row.instance in instances and self.has_schedule(row)]
         if not kept:
             raise InputError(self.paths.schedules, "", "holds no schedule of these rows")
         return kept
+
+    def pack(self) -> None:
+        """Move schedules that are saved one by one into their archives, and drop those of replaced rows."""
+        if not any(self.paths.schedules.glob("*/*/*/*.npy")):
+            return
+        with self.locked():
+            self.reload()
+            members: dict[Archive, set[str]] = {}
+            for row in self.rows.values():
+                members.setdefault(self.archive(row), set()).add(row.member)
+            for archive, named in members.items():
+                archive.pack(named)
+
+    @contextlib.contextmanager
+    def packed(self) -> Iterator[None]:
+        """Pack schedules before and after a block, and leave one line per row, also if it is interrupted."""
+        self.pack()
+        try:
+            yield
+        finally:
+            self.pack()
+            self.compact()
 
     def frame(self) -> pd.DataFrame:
         """The table, one row each, typed columns; empty cells are missing values."""

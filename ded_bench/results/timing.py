@@ -1,7 +1,8 @@
-"""The table of times: one row per call of a method, and medians per method and regime."""
+"""The table of times: one row per call of a method, and medians per method, settings, model and regime."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.summary import quartiles
 from ded_bench.files.table import Table, cell
+from ded_bench.results.legacy import upgraded
 
 #: Round of a process's very first call, on the warm-up instance; it enters no median.
 WARM_UP = 0
@@ -22,10 +23,11 @@ PARTS = ("build_s", "setup_s", "solve_s")
 class TimingRow:
     """One call of one method, wall-clock seconds.
 
-    `call_s` is the whole call as its process saw it, `load_average` the machine's over the last minute,
-    when the call ended: at most about 1 if bench was alone. `schedule_difference_pu` is max |ΔP| between
-    this call's schedule and the one that the results folder keeps, `peak_memory_mib` the most that its
-    process had held by the end of the call, all that it imports included.
+    `settings` are those that matter outside the closed loop. `call_s` is the whole call as its process saw
+    it, `load_average` the machine's over the last minute, when the call ended: at most about 1 if bench was
+    alone. `schedule_difference_pu` is max |ΔP| between this call's schedule and the one that the results
+    folder keeps, `peak_memory_mib` the most that its process had held by the end of the call, all that it
+    imports included.
     """
 
     run: str
@@ -45,21 +47,37 @@ class TimingRow:
     error: str = ""
     model: str = ""
     policy: str = ""
-    code: str = ""
     case: str = ""
     problems_version: str = ""
     version: str = ""
+    commit: str = ""
+    method_version: int = 0
     solver_version: str = ""
     host: str = ""
     date: str = ""
 
     @property
-    def key(self) -> tuple[int, str, str, str, str]:
+    def job(self) -> tuple[str, str, str, str]:
+        """Regime, method, settings and the surrogate's name: what is timed."""
+        return self.regime, self.method, self.settings, model_name(self.model)
+
+    @property
+    def key(self) -> tuple[Any, ...]:
         """What makes a row unique within its run."""
-        return self.round, self.regime, self.method, self.settings, self.instance
+        return self.round, *self.job, self.instance
+
+    @property
+    def counts(self) -> bool:
+        """Whether it enters medians: a call that succeeded, and no process's first."""
+        return self.round != WARM_UP and not self.error
 
 
-TIMING: Table[TimingRow] = Table(TimingRow)
+TIMING: Table[TimingRow] = Table(TimingRow, since="method_version", upgrade=upgraded)
+
+
+def model_name(model: str) -> str:
+    """The surrogate's name in `name@fingerprint`; empty for none."""
+    return model.partition("@")[0]
 
 
 def read_timing(path: Path) -> list[TimingRow]:
@@ -72,7 +90,7 @@ def read_timing(path: Path) -> list[TimingRow]:
 
 
 def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
-    """Median and quartiles per (case, regime, method, settings) over instances and rounds, s.
+    """Median and quartiles per case and job over instances and rounds, s; `model` is the surrogate's name.
 
     The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
     enter no median. `load_average` is the median of the calls', `schedule_difference_pu` and
@@ -80,47 +98,42 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     """
     parts: dict[tuple[str, ...], list[TimingRow]] = {}
     for row in rows:
-        parts.setdefault((row.case, row.regime, row.method, row.settings), []).append(row)
-    found = [_summary(calls) for calls in parts.values()]
-    frame = pd.DataFrame(found, columns=list(SUMMARY_COLUMNS))
-    numbers = [
-        name for name in SUMMARY_COLUMNS if name.endswith(("_s", "_q1", "_q3", "_pu", "_average", "_mib"))
-    ]
-    return frame.astype(dict.fromkeys(numbers, "float64"))
+        parts.setdefault((row.case, *row.job), []).append(row)
+    frame = pd.DataFrame([_summary(calls) for calls in parts.values()], columns=list(SUMMARY_COLUMNS))
+    return frame.astype(dict.fromkeys(_NUMBERS, "float64"))
 
 
-_NAMES = ("case", "problems_version", "version", "solver_version", "host", "date", "model", "policy", "code")
+_TIMES = tuple(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3"))
+_FIRST = tuple(f"first_{name}" for name in PARTS)
+_MORE = ("load_average", "schedule_difference_pu", "peak_memory_mib")
+_NUMBERS = (*_TIMES, *_FIRST, *_MORE)
+_SAID = ("run", "case", "problems_version", "version", "commit", "solver_version", "host", "date", "policy")
 SUMMARY_COLUMNS = (
-    *("regime", "method", "settings", "instances", "repeats", "failures"),
-    *(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3")),
-    *(f"first_{name}" for name in PARTS),
-    *("load_average", "schedule_difference_pu", "peak_memory_mib", "error", "run", *_NAMES),
+    *("regime", "method", "settings", "model", "instances", "repeats", "failures"),
+    *(*_NUMBERS, "error", *_SAID),
 )
 
 
 def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
+    last = calls[-1]
     first = next((row for row in calls if row.round == WARM_UP), None)
     warm = [row for row in calls if row.round != WARM_UP]
-    good = [row for row in warm if not row.error]
-    last = calls[-1]
-    errors = [row.error for row in warm if row.error]
-    facts: dict[str, Any] = {
-        "regime": last.regime,
-        "method": last.method,
-        "settings": last.settings,
+    good = [row for row in warm if row.counts]
+    facts: dict[str, Any] = dict(zip(SUMMARY_COLUMNS, last.job, strict=False))
+    facts |= {
         "instances": len({row.instance for row in warm}),
         "repeats": max((row.round for row in warm), default=0),
-        "failures": len(errors),
-        "load_average": float(np.median(_values(warm, "load_average") or [np.nan])),
+        "failures": len(warm) - len(good),
+        "load_average": np.median(_values(warm, "load_average") or [math.nan]),
         "schedule_difference_pu": max(_values(warm, "schedule_difference_pu"), default=None),
         "peak_memory_mib": max(_values(warm, "peak_memory_mib"), default=None),
-        "error": "" if good or not errors else errors[0],
-        "run": last.run,
+        "error": "" if good else next((row.error for row in warm if row.error), ""),
     }
-    facts |= {f"first_{name}": getattr(first, name, None) for name in PARTS}
     for name in PARTS:
-        facts |= quartiles(name, np.array(_values(good, name), dtype=float))
-    return facts | {name: getattr(last, name) for name in _NAMES}
+        times = np.quantile(_values(good, name) or [math.nan], (0.5, 0.25, 0.75))
+        facts |= dict(zip((name, f"{name}_q1", f"{name}_q3"), times.tolist(), strict=True))
+        facts[f"first_{name}"] = getattr(first, name, None)
+    return facts | {name: getattr(last, name) for name in _SAID}
 
 
 def _values(rows: Sequence[TimingRow], name: str) -> list[float]:

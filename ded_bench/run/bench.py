@@ -1,23 +1,21 @@
 """Times of methods alone on the machine, in turns: one process and thread each, one computing at a time.
 
-Every method and regime has a process of its own. In each round every method gets one turn: it answers a
-warm-up instance, untimed, and then all timed instances in a row, so that its calls find memory caches as
-they are in use, not as the other methods left them. A method's turns are spread over the run, in an order
-that rotates, so that a passing disturbance meets few of its calls. Python's garbage collector waits while a
-call is timed, as in `timeit`. `timing.csv` holds one row per call and one run: a new run replaces the table
-when it is complete. Times of the results table, taken while several workers share the machine, never enter
-it.
+Every job, a method with its settings in a regime, has a process of its own. In each round every job gets one
+turn: it answers a warm-up instance, untimed, and then all timed instances in a row, so that its calls find
+memory caches as they are in use, not as the other methods left them. A job's turns are spread over the run,
+in an order that rotates, so that a passing disturbance meets few of its calls. Python's garbage collector
+waits while a call is timed, as in `timeit`. `timing.csv` holds one row per call and one run: a new run
+replaces the table when it is complete. Times of the results table, taken while several workers share the
+machine, never enter it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import gc
 import hashlib
 import itertools
-import math
 import os
 import resource
 import sys
@@ -29,28 +27,29 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from ded_bench.analysis.summary import in_own_table
 from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import named
 from ded_bench.methods.registry import Method, get_method, registered
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Results, Row
-from ded_bench.results.timing import PARTS, TIMING, WARM_UP, TimingRow, read_timing
-from ded_bench.run.code import code_of_method, named
-from ded_bench.run.environment import host, now, version
+from ded_bench.results.timing import PARTS, TIMING, WARM_UP, TimingRow, model_name, read_timing
+from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import failed
 from ded_bench.surrogates.find import MODELS
 
 #: Instances that are timed, unless the caller says otherwise.
 SAMPLE = 10
-#: How many rounds a method takes part in, as in `timeit.Timer.autorange`: the least of these numbers whose
+#: How many rounds a job takes part in, as in `timeit.Timer.autorange`: the least of these numbers whose
 #: calls come to so many seconds, the largest for a method that is faster still.
 ROUNDS, ENOUGH_S = (1, 2, 5, 10), 5.0
 #: Changes with the way in which calls are timed: a run that was timed in another way is timed anew.
 PROCEDURE = "all instances in a row"
+#: What is the same in all rows of a job.
+Facts = Mapping[str, Any]
 
 
 class Job(NamedTuple):
@@ -87,152 +86,152 @@ def bench(
     force: bool = False,
     problems_version: str = "",
 ) -> list[TimingRow]:
-    """Time methods in turns and keep every call in a table.
+    """Time jobs in turns and keep every call in a table.
 
     A run that was interrupted goes on where it was; its rows lie beside the table until it is complete. A
-    complete run of the same methods, instances and host is not repeated unless `force`.
+    complete run of the same jobs, instances and host is not repeated unless `force`.
 
     Args:
+        case: of the instances.
+        instances: what is timed.
+        jobs: what is timed on them.
         path: of the table, which holds one run.
         warm_up: answered first in each turn, untimed; none of the timed instances.
         results: where schedules are kept that those computed here are compared with.
-        rounds: how often every method answers every instance; None: chosen by its speed (see `rounds_of`).
+        rounds: how often every job answers every instance; None: chosen by its speed (see `rounds_of`).
+        force: time again what the table holds.
+        problems_version: of the problem files.
 
     Returns:
         All rows of the run, in the order in which they were made.
 
     Raises:
-        InputError: no instance, no method, an unknown method, regime or settings, a missing model or policy,
-            or a table of a run of other methods.
+        InputError: no instance, no job, an unknown method, regime or options, a missing model or policy,
+            or a table of a run of other jobs.
     """
     if not instances or not jobs:
         raise InputError("instances", "", "at least one instance and one method are needed")
     if warm_up.id in {instance.id for instance in instances}:
         raise InputError(f"instance {warm_up.id}", "", "cannot be timed, since it warms up")
     case.check_regimes([job.regime for job in jobs])
-    facts = {job: _facts(case, job) | {"problems_version": problems_version} for job in jobs}
+    facts = {job: _facts(case, job, problems_version) for job in jobs}
     run = _run_id(case, instances, facts, rounds)
     there = read_timing(path)
     if not force and there and {row.run for row in there} == {run}:
         return there
-    others = {_name(row) for row in there} - {_name_of(job) for job in jobs}
-    if others:
-        method, _, regime = sorted(others)[0]
+    if others := {row.job for row in there} - {_name(fact) for fact in facts.values()}:
+        regime, method, *_ = sorted(others)[0]
         raise InputError(
             path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
         )
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
     kept = [] if force else [row for row in read_timing(partial) if row.run == run]
-    with contextlib.closing(_Turns(case, run, facts, warm_up, results)) as turns:
-        rows = _go(turns, instances, kept, rounds, partial)
-    TIMING.write(path, rows)
+    rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
+    try:
+        for round_ in itertools.count(1):
+            present = [job for job in jobs if round_ <= _last_round(rows.values(), facts[job], rounds)]
+            if not present:
+                break
+            shift = (round_ - 1) % len(present)
+            order = present[shift:] + present[:shift]
+            for job in tqdm(order, unit="turn", disable=None, desc=f"bench, round {round_}"):
+                if (round_, *_name(facts[job]), instances[-1].id) not in rows:
+                    calls = _ask(pools[job], case, job, warm_up, instances)
+                    for instance, call in zip([warm_up, *instances], calls, strict=True):
+                        own = facts[job] | {"run": run, "round": WARM_UP if instance is warm_up else round_}
+                        row = _row(case, job, own, instance, call, results)
+                        rows.setdefault(row.key, row)  # the warm-up of the first turn stands
+                    TIMING.write(partial, rows.values())
+                if round_ >= _last_round(rows.values(), facts[job], rounds):
+                    pools[job].close()  # on large grids a process holds gigabytes
+    finally:
+        for pool in pools.values():
+            pool.close()
+    TIMING.write(path, rows.values())
     partial.unlink(missing_ok=True)
-    return rows
+    return list(rows.values())
 
 
 def rounds_of(rows: Iterable[TimingRow]) -> int:
-    """How many rounds a method takes part in, from its calls of the first round; 1 if one of them failed."""
+    """How many rounds a job takes part in, from its calls of the first round; 1 if one of them failed."""
     seconds = [ENOUGH_S if row.call_s is None or row.error else row.call_s for row in rows]
     return next((count for count in ROUNDS if count * sum(seconds) >= ENOUGH_S), ROUNDS[-1])
 
 
-class _Turns:
-    """The processes of a run, and what its rows have in common."""
-
-    def __init__(
-        self,
-        case: Case,
-        run: str,
-        facts: Mapping[Job, Mapping[str, str]],
-        warm_up: Instance,
-        results: Results | None,
-    ) -> None:
-        self.case, self.run, self.facts, self.warm_up, self.results = case, run, facts, warm_up, results
-        self._pools = {job: Workers(1) for job in facts}
-
-    def take(self, job: Job, round_: int, instances: Sequence[Instance]) -> list[TimingRow]:
-        """One turn of one method: a row for its warm-up and for each instance."""
-        first, *calls = self._ask(job, instances)
-        rows = [self._row(job, round_, *pair) for pair in zip(instances, calls, strict=True)]
-        return [self._row(job, WARM_UP, self.warm_up, first), *rows]
-
-    def finish(self, job: Job) -> None:
-        """End the process of a method that has no further turn: on large grids it holds gigabytes."""
-        self._pools[job].close()
-
-    def close(self) -> None:
-        """End all processes."""
-        for job in self._pools:
-            self.finish(job)
-
-    def _ask(self, job: Job, instances: Sequence[Instance]) -> list[Call]:
-        """Warm-up and answers; where the process died, instance by instance, to find which one kills it."""
-        asked = (self.case, *job, self.warm_up, tuple(instances))
-        ((_, answer),) = self._pools[job].imap([(timed_turn, asked)], [None])
-        if isinstance(answer, list):
-            return answer
-        lost = Call(failed(answer), None, os.getloadavg()[0])
-        if len(instances) == 1:
-            return [lost, lost]
-        single = [self._ask(job, [instance]) for instance in instances]
-        return [single[0][0], *(call for _, call in single)]
-
-    def _row(self, job: Job, round_: int, instance: Instance, call: Call) -> TimingRow:
-        solution = call.solution
-        facts: dict[str, Any] = {name: getattr(solution, name) for name in PARTS} | dict(self.facts[job])
-        return TimingRow(
-            run=self.run,
-            round=round_,
-            regime=job.regime,
-            method=job.method,
-            settings=job.settings.slug,
-            instance=instance.id,
-            status=str(solution.status),
-            call_s=call.seconds,
-            schedule_difference_pu=self._difference(job, instance, solution.schedule),
-            load_average=call.load_average,
-            peak_memory_mib=call.peak_memory_mib,
-            error="" if solution.schedule is not None else solution.error or solution.status.sentence,
-            solver_version=solution.solver_version,
-            date=now(),
-            **facts,
-        )
-
-    def _difference(self, job: Job, instance: Instance, schedule: Schedule | None) -> float | None:
-        key = Key(instance.id, job.regime, job.method, job.settings.slug)
-        if schedule is None or self.results is None or not self.results.schedule_path(key).is_file():
-            return None
-        return largest_difference(schedule, self.results.schedule(key, self.case, instance))
+def _last_round(rows: Iterable[TimingRow], facts: Facts, rounds: int | None) -> int:
+    first = [row for row in rows if row.round == 1 and row.job == _name(facts)]
+    return rounds or (rounds_of(first) if first else 1)
 
 
-def _go(
-    turns: _Turns,
-    instances: Sequence[Instance],
-    kept: Sequence[TimingRow],
-    rounds: int | None,
-    partial: Path,
-) -> list[TimingRow]:
-    """Run what is not kept yet, and save after every turn."""
-    rows = {row.key: row for row in kept}
-    present = list(turns.facts)
-    for round_ in itertools.count(1):
-        shift = (round_ - 1) % len(present)
-        further = []
-        order = present[shift:] + present[:shift]
-        for job in tqdm(order, unit="turn", disable=None, desc=f"bench, round {round_}"):
-            if (round_, job.regime, job.method, job.settings.slug, instances[-1].id) not in rows:
-                for row in turns.take(job, round_, instances):
-                    rows.setdefault(row.key, row)  # the warm-up of the first turn stands
-                TIMING.write(partial, rows.values())
-            first = (row for row in rows.values() if row.round == 1 and _name(row) == _name_of(job))
-            if round_ < (rounds or rounds_of(first)):
-                further.append(job)
-            else:
-                turns.finish(job)
-        present = [job for job in turns.facts if job in further]
-        if not present:
-            break
-    return list(rows.values())
+def _name(facts: Facts) -> tuple[str, str, str, str]:
+    """What rows of a job are known by (see `TimingRow.job`)."""
+    return facts["regime"], facts["method"], facts["settings"], model_name(facts["model"])
+
+
+def _facts(case: Case, job: Job, problems_version: str) -> dict[str, Any]:
+    """What all rows of a job say."""
+    method = get_method(job.method)
+    settings = method.canonical(job.settings)
+    used = method.artifacts(case, job.regime, settings)
+    return {
+        "case": case.id,
+        "method": method.name,
+        "regime": job.regime,
+        "settings": settings.options,
+        "model": named(used, "model"),
+        "policy": named(used, "policy"),
+        "problems_version": problems_version,
+        "version": version(),
+        "commit": commit(),
+        "method_version": method.version,
+        "host": host(),
+    }
+
+
+def _run_id(case: Case, instances: Sequence[Instance], facts: Mapping[Job, Facts], rounds: int | None) -> str:
+    """Twelve hex digits that change with all that a run's times depend on, but the day and the commit."""
+    parts = [PROCEDURE, case.fingerprint, *(i.fingerprint for i in instances), str(rounds)]
+    for job, fact in facts.items():
+        parts += [
+            str(job.settings.time_limit_s),
+            str(sorted((k, v) for k, v in fact.items() if k != "commit")),
+        ]
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
+
+
+def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequence[Instance]) -> list[Call]:
+    """Warm-up and answers; where the process died, instance by instance, to find which one kills it."""
+    ((_, answer),) = pool.imap([(timed_turn, (case, *job, warm_up, tuple(instances)))], [None])
+    if isinstance(answer, list):
+        return answer
+    if len(instances) == 1:
+        return [Call(failed(answer), None, os.getloadavg()[0])] * 2
+    single = [_ask(pool, case, job, warm_up, [instance]) for instance in instances]
+    return [single[0][0], *(call for _, call in single)]
+
+
+def _row(
+    case: Case, job: Job, facts: Facts, instance: Instance, call: Call, results: Results | None
+) -> TimingRow:
+    solution, difference = call.solution, None
+    if solution.schedule is not None and results is not None:
+        made_with = (facts[name] for name in ("regime", "method", "settings", "model", "policy"))
+        row = results.rows.get(Key(case.id, instance.id, *made_with, job.settings.time_limit_s))
+        if row and results.has_schedule(row):
+            difference = largest_difference(solution.schedule, results.schedule(row, case, instance))
+    return TimingRow(
+        **facts,
+        **{name: getattr(solution, name) for name in PARTS},
+        instance=instance.id,
+        status=str(solution.status),
+        call_s=call.seconds,
+        schedule_difference_pu=difference,
+        load_average=call.load_average,
+        peak_memory_mib=call.peak_memory_mib,
+        error="" if solution.schedule is not None else solution.error or solution.status.sentence,
+        solver_version=solution.solver_version,
+        date=now(),
+    )
 
 
 def timed_turn(
@@ -292,35 +291,34 @@ def largest_difference(a: Schedule, b: Schedule) -> float:
 
 
 def runs_of(
-    rows: Mapping[Key, Row], settings: Settings, methods: Mapping[str, Method] | None = None
+    rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method] | None = None
 ) -> list[Job]:
-    """What a results table holds, to be timed, in the methods' order.
+    """What a results table holds, to be timed, in the methods' order, without options of operation.
 
-    Rows of studies, of other methods and of models given as a file are left out. A method all of whose rows
-    in a regime were made with a time limit has it, here as there: without it a call might take hours.
+    Rows of other methods and of models given as a file are left out. A job all of whose rows were made with
+    a time limit has it, here as there: without it a call might take hours.
 
     Args:
-        settings: all but the name, the model and the time limit, which come from the rows.
+        rows: of the table.
+        settings: all but the options, the model and the time limit, which come from the rows.
         methods: those to time, by the name that their rows carry; None: all that are registered.
     """
     methods = registered() if methods is None else methods
-    found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for key, row in rows.items():
-        limits = found.setdefault((key.method, key.settings), {}).setdefault(key.regime, [])
-        limits.append(math.inf if row.time_limit_s is None else row.time_limit_s)
+    limits: dict[tuple[str, str, str, str], list[float | None]] = {}
+    for row in rows:
+        model = model_name(row.model)
+        if row.method in methods and model in ("", *MODELS):
+            own = dataclasses.replace(settings, options=row.settings, model=model)
+            options = methods[row.method].canonical(own, timed=True).options
+            limits.setdefault((row.method, options, model, row.regime), []).append(row.time_limit_s)
+    order = list(methods)
     jobs = []
-    for method in methods:
-        for slug in sorted(slug for name, slug in found if name == method and not in_own_table(slug)):
-            known = methods[method].settings
-            choices = [
-                dataclasses.replace(settings, name=name, model=model) for name in known for model in MODELS
-            ]
-            match = next((choice for choice in choices if choice.slug == slug), None)
-            if match is None:
-                continue
-            for regime, limits in sorted(found[method, slug].items()):
-                limit = max(limits) if math.isfinite(max(limits)) else None
-                jobs.append(Job(method, regime, dataclasses.replace(match, time_limit_s=limit)))
+    for key in sorted(limits, key=lambda key: (order.index(key[0]), *key[1:])):
+        method, options, model, regime = key
+        given = [limit for limit in limits[key] if limit is not None]
+        limit = max(given) if len(given) == len(limits[key]) else None
+        own = dataclasses.replace(settings, options=options, model=model, time_limit_s=limit)
+        jobs.append(Job(method, regime, own))
     return jobs
 
 
@@ -329,30 +327,3 @@ def choose_sample(instances: Sequence[Instance], count: int = SAMPLE) -> list[In
     if len(instances) <= count:
         return list(instances)
     return [instances[i] for i in np.linspace(0, len(instances) - 1, count).round().astype(int)]
-
-
-def _name(row: TimingRow) -> tuple[str, str, str]:
-    return row.method, row.settings, row.regime
-
-
-def _name_of(job: Job) -> tuple[str, str, str]:
-    return job.method, job.settings.slug, job.regime
-
-
-def _facts(case: Case, job: Job) -> dict[str, str]:
-    """What the rows of one method and regime have in common."""
-    method = get_method(job.method)
-    used = method.artifacts(case, job.regime, job.settings)
-    shaped_by = {kind: named(used, kind) for kind in ("model", "policy")}
-    made_by = {"code": code_of_method(method, job.settings.name, used), "version": version(), "host": host()}
-    return shaped_by | made_by | {"case": case.id}
-
-
-def _run_id(
-    case: Case, instances: Sequence[Instance], facts: Mapping[Job, Mapping[str, str]], rounds: int | None
-) -> str:
-    """Twelve hex digits that change with all that a run's times depend on, but the day."""
-    parts = [PROCEDURE, case.fingerprint, *(i.fingerprint for i in instances), str(rounds)]
-    for job, fact in facts.items():
-        parts += [*_name_of(job), str(job.settings.time_limit_s), *map(str, sorted(fact.items()))]
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]

@@ -8,7 +8,10 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import subprocess
 from pathlib import Path
+
+from ded_bench.problem.case import REPOSITORY
 
 PACKAGES = ("pyomo", "casadi", "highspy", "torch", "numba", "numpy", "scipy", "pandas")
 
@@ -26,6 +29,15 @@ def version() -> str:
     return importlib.metadata.version("ded-bench")
 
 
+@functools.cache
+def commit() -> str:
+    """Short name of the checkout's commit, with `+` if the package was changed since; empty if installed."""
+    if not (REPOSITORY / ".git").exists():
+        return ""
+    name, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "ded_bench")
+    return f"{name}+" if name and changed else name
+
+
 def now() -> str:
     """The time, ISO 8601 in UTC."""
     return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -36,6 +48,14 @@ def environment() -> dict[str, str]:
     facts = {"ded-bench": version(), "python": platform.python_version()}
     facts |= {name: _version(name) for name in PACKAGES}
     return facts | {"host": host(), "memory": _memory()}
+
+
+def _git(*arguments: str) -> str:
+    command = ("git", "-C", str(REPOSITORY), *arguments)
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""  # no git here
 
 
 def _version(package: str) -> str:

@@ -1,85 +1,28 @@
-"""Run instance × regime × method × settings: resume, workers here or on a cluster, one row each."""
+"""Run tasks: resume, workers here or on a cluster, one row each."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.artifact import named
+from ded_bench.methods.solution import Solution
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.cluster import open_workers
-from ded_bench.run.code import code_of_method, named
-from ded_bench.run.environment import host, now, version
+from ded_bench.run.environment import commit, host, now, version
+from ded_bench.run.pool import Workers
 from ded_bench.run.scoring import save_scores
-from ded_bench.run.shipping import pack
-from ded_bench.run.tasks import Task, failed, solve_task
+from ded_bench.run.tasks import Task, failed, pack, solve_task
 
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
 #: what comes before the first solve of a process, imports and the building of the model: some seconds.
 GRACE_S = 60.0
-
-
-def make_tasks(
-    case: Case,
-    instances: Sequence[tuple[Instance, str]],
-    methods: Sequence[str],
-    regimes: Sequence[str],
-    settings: Settings,
-) -> list[Task]:
-    """List every row of a run; methods and regimes outermost, so that a worker's model is reused.
-
-    Raises:
-        InputError: unknown method, regime or settings, or a model or policy that is missing.
-    """
-    case.check_regimes(regimes)
-    tasks = []
-    for method in map(get_method, methods):
-        for regime in regimes:
-            artifacts = method.artifacts(case, regime, settings)
-            code = code_of_method(method, settings.name, artifacts)
-            for instance, split in instances:
-                fingerprint = fingerprint_of(case, instance, regime, method.name, settings, artifacts)
-                task = Task(instance, split, regime, method.name, settings, fingerprint, artifacts, code)
-                tasks.append(task)
-    return tasks
-
-
-def fingerprint_of(
-    case: Case,
-    instance: Instance,
-    regime: str,
-    method: str,
-    settings: Settings,
-    artifacts: Sequence[Artifact],
-) -> str:
-    """Twelve hex digits that change with whatever decides on an answer, except for our own code."""
-    parts = [case.fingerprint, instance.fingerprint, regime, method, settings.slug]
-    parts += [artifact.fingerprint for artifact in artifacts]
-    parts += [f"time limit {settings.time_limit_s:g} s"] if settings.time_limit_s is not None else []
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-
-
-def fallbacks(tasks: Sequence[Task], folder: Path) -> list[str]:
-    """What methods take from elsewhere than this results folder without having been told to: a line each."""
-    lines = []
-    for task in tasks:
-        given = {task.settings.policy, Path(task.settings.model)}
-        for artifact in task.artifacts:
-            if artifact.path and artifact.path not in given and not artifact.path.is_relative_to(folder):
-                what = f"{artifact.kind} {artifact.name}@{artifact.fingerprint}"
-                lines.append(f"{task.method} {task.regime}: {what} from {artifact.path}")
-    return list(dict.fromkeys(lines))
 
 
 def run(
@@ -98,7 +41,12 @@ def run(
     after it.
 
     Args:
+        case: of all tasks.
+        tasks: see `make_tasks`.
+        results: where rows and schedules are saved.
         workers: processes on this machine.
+        problems_version: of the problem files.
+        on_row: called with each new row.
         scheduler: address of a Dask scheduler, whose workers are used instead.
 
     Returns:
@@ -109,36 +57,48 @@ def run(
         WorkersLostError: it answers no more, or its workers cannot run this package.
     """
     todo, unscored = unfinished(tasks, results)
-    with open_workers(workers, scheduler) as pool, contextlib.ExitStack() as stack:
-        if todo or unscored:
-            stack.callback(results.compact)  # also after an interruption
-        calls = [(solve_task, (case, task)) for task in (_packed(todo) if scheduler else todo)]
-        limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
-        with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
-            for task, answer in pool.imap(calls, todo, limits):
-                lost = failed(answer), "" if scheduler else host()
-                solution, where = answer if isinstance(answer, tuple) else lost
-                if solution.schedule is not None:
-                    solution.schedule.write(results.schedule_path(task.key), case.generators)
-                    unscored.append(task)
-                else:  # one of an earlier model or policy must not pass for this row's
-                    results.schedule_path(task.key).unlink(missing_ok=True)
-                row = unscored_row(task, solution, pool.count, problems_version, where)
-                results.add([row])
-                if solution.schedule is None:
-                    on_row(row)
-                bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
-                bar.update()
-        save_scores(case, unscored, results, pool, on_row)
+    waiting = [results.rows[task.key] for task in unscored]
+    with open_workers(workers, scheduler) as pool, results.packed():
+        for row in _solve(case, todo, results, pool, problems_version, is_cluster=scheduler is not None):
+            if results.has_schedule(row):
+                waiting.append(row)
+            else:
+                on_row(row)
+        results.pack()
+        save_scores(case, waiting, {t.instance.id: t.instance for t in tasks}, results, pool, on_row)
     return [results.rows[task.key] for task in tasks]
 
 
 def unfinished(tasks: Sequence[Task], results: Results) -> tuple[list[Task], list[Task]]:
     """Tasks that are to be solved and scored, and those that are solved and only to be scored."""
-    missing = [task for task in tasks if not results.has(task.key, task.fingerprint)]
-    solved = [results.solved(task.key, task.fingerprint) for task in missing]
-    todo = [task for task, done in zip(missing, solved, strict=True) if not done]
-    return todo, [task for task, done in zip(missing, solved, strict=True) if done]
+    todo, unscored = [], []
+    for task in tasks:
+        made = task.key, task.fingerprint, task.version
+        if not results.finished(*made):
+            (unscored if results.solved(*made) else todo).append(task)
+    return todo, unscored
+
+
+def _solve(
+    case: Case,
+    tasks: Sequence[Task],
+    results: Results,
+    pool: Workers,
+    problems_version: str,
+    is_cluster: bool,
+) -> Iterator[Row]:
+    """Solve tasks, and save each answer before its row is yielded."""
+    calls = [(solve_task, (case, task)) for task in (_packed(tasks) if is_cluster else tasks)]
+    limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in tasks)]
+    with tqdm(total=len(tasks), unit="row", disable=None, desc="solve") as bar:
+        for task, answer in pool.imap(calls, tasks, limits):
+            lost = failed(answer), "" if is_cluster else host()
+            solution, where = answer if isinstance(answer, tuple) else lost
+            row = unscored_row(task, solution, pool.count, problems_version, where)
+            results.keep(row, solution.schedule, case)
+            bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
+            bar.update()
+            yield row
 
 
 def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
@@ -150,35 +110,37 @@ def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
 
 def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
     """The row of a task with what the solver claims; `where` is the host that solved it."""
-    seed = task.instance.seed
+    seed, claimed = task.instance.seed, solution.solver_objective
     return Row(
-        instance=task.instance.id,
         split=task.split,
-        regime=task.regime,
-        method=task.method,
-        settings=task.settings.slug,
         status=str(solution.status),
         iterations=solution.iterations,
         build_s=solution.build_s,
         setup_s=solution.setup_s,
         solve_s=solution.solve_s,
-        solver_objective=_storable(solution.solver_objective),
+        solver_objective=claimed if claimed is not None and abs(claimed) <= LARGEST else None,
         error=solution.error,
         workers=workers,
         problems_version=problems_version,
         version=version(),
+        commit=commit(),
+        method_version=task.version,
         solver_version=solution.solver_version,
         host=where,
         date=now(),
-        case=task.instance.case,
         seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
         fingerprint=task.fingerprint,
-        time_limit_s=task.settings.time_limit_s,
-        model=named(task.artifacts, "model"),
-        policy=named(task.artifacts, "policy"),
-        code=task.code,
+        **task.key._asdict(),
     )
 
 
-def _storable(value: float | None) -> float | None:
-    return value if value is not None and abs(value) <= LARGEST else None
+def fallbacks(tasks: Sequence[Task], folder: Path) -> list[str]:
+    """What methods take from elsewhere than this results folder without having been told to: a line each."""
+    lines = []
+    for task in tasks:
+        given = {task.settings.policy, Path(task.settings.model)}
+        for artifact in task.artifacts:
+            if artifact.path and artifact.path not in given and not artifact.path.is_relative_to(folder):
+                what = f"{artifact.kind} {named([artifact], artifact.kind)}"
+                lines.append(f"{task.method} {task.regime}: {what} from {artifact.path}")
+    return list(dict.fromkeys(lines))

@@ -1,33 +1,39 @@
-"""Scores of kept schedules: rows are scored, or those of a results folder scored again and compared."""
+"""Scores of kept schedules: rows are scored, scored again and compared, or judged on another plant."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.solution import Settings
-from ded_bench.plants import score as score_module
-from ded_bench.plants.score import Score, score
+from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import SCORING_FAILED, Results, Row
-from ded_bench.run.code import code_of
+from ded_bench.results.rows import SCORING_FAILED, VALIDATED, Key, Results, Row, ValidatedRow
 from ded_bench.run.pool import Workers
-from ded_bench.run.tasks import Scorer, Task, reason_of, score_tasks
+from ded_bench.run.tasks import Question, reason_of, score_all
 
-#: Schedules scored side by side in one task; more gains little, fewer costs overhead.
-SCORE_BATCH = 50
+#: Schedules scored in one call of a worker, which costs some milliseconds.
+BATCH = 50
 #: What a kept schedule, scored again, may differ by from its row.
 OBJECTIVE_RELATIVE, VIOLATION_HZ, VIOLATION_PU = 1e-9, 1e-9, 1e-9
-_POWER_LIMITS = ("ramp_violation", "bound_violation", "initial_violation")
+_TOLERANCES = {
+    "freq_violation_hz": VIOLATION_HZ,
+    **dict.fromkeys(("ramp_violation", "bound_violation", "initial_violation"), VIOLATION_PU),
+}
+_SCORE = tuple(field.name for field in dataclasses.fields(Score))
+
+#: What a kept schedule is worth, or why that cannot be told.
+Verdict = Score | Exception
 
 
 @dataclass(frozen=True)
@@ -49,99 +55,82 @@ class Check:
     unknown: int
 
 
-def score_schedules(
-    case: Case, tasks: Sequence[Task], results: Results, pool: Workers, scorer: Scorer = score
-) -> Iterator[tuple[list[Task], list[object]]]:
-    """Score the kept schedules of tasks, batch by batch; a schedule that cannot be read has an InputError."""
-    batches = list(_batches(tasks))
-    with tqdm(total=len(tasks), unit="row", disable=None, desc="score") as bar:
-        wrong: dict[int, InputError] = {}
+def verdicts(
+    case: Case,
+    rows: Sequence[Row],
+    instances: Mapping[str, Instance],
+    results: Results,
+    pool: Workers,
+    plant: str = "",
+) -> Iterator[list[tuple[Row, Verdict]]]:
+    """Score the kept schedules of rows, batch by batch, on the plant of each row unless another is named.
 
-        def read(batch: Sequence[Task]) -> tuple[list[Task], list[Schedule]]:
-            sound = []
-            for task in batch:
-                try:
-                    sound.append((task, results.schedule(task.key, case, task.instance)))
-                except InputError as error:
-                    wrong[id(task)] = error
-            return [task for task, _ in sound], [schedule for _, schedule in sound]
+    A schedule that cannot be read has an InputError, one that its plant cannot follow a SimulationError.
+    """
 
-        calls = ((score_tasks, (case, *read(batch), scorer)) for batch in batches)  # read as they are needed
+    def question(row: Row) -> Question:
+        instance = instances[row.instance]
+        try:
+            schedule: Schedule | InputError = results.schedule(row, case, instance)
+        except InputError as error:
+            schedule = error
+        return instance, schedule, row.regime, plant or row.plant
+
+    batches = [rows[start : start + BATCH] for start in range(0, len(rows), BATCH)]
+    calls = ((score_all, (case, list(map(question, batch)))) for batch in batches)  # read as they are needed
+    with tqdm(total=len(rows), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
-            verdicts = iter(answer) if isinstance(answer, list) else None
-            yield (
-                batch,
-                [wrong.get(id(task)) or (answer if verdicts is None else next(verdicts)) for task in batch],
-            )
+            found = answer if isinstance(answer, list) else [answer] * len(batch)
+            yield list(zip(batch, found, strict=True))
             bar.update(len(batch))
 
 
 def scored_row(row: Row, verdict: object) -> Row:
     """A row with the scorer's verdict filled in, or with the reason why there is none."""
-    return dataclasses.replace(without_score(row), **score_cells(verdict, code_of(score_module.__name__)))
+    empty = dict.fromkeys((*_SCORE, "feasible", "feasible_strict"))
+    error = "" if row.error.startswith(SCORING_FAILED) else row.error
+    return dataclasses.replace(row, **empty | {"error": error} | score_cells(verdict))
 
 
-def score_cells(verdict: object, code: str) -> dict[str, Any]:
-    """What a verdict says as the cells of a row, or the error that says why there is none.
-
-    Args:
-        verdict: a Score, or anything else for a schedule that could not be scored.
-        code: of the scorer.
-    """
+def score_cells(verdict: object) -> dict[str, Any]:
+    """What a verdict says as the cells of a row, or the error that says why there is none."""
     if not isinstance(verdict, Score):
         return {"error": f"{SCORING_FAILED}{reason_of(verdict)}"}
     numbers = dataclasses.asdict(verdict)
     if not all(abs(value) <= LARGEST for value in numbers.values()):
         return {"error": f"{SCORING_FAILED}cost or violations are above {LARGEST:g}"}
-    feasible = {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
-    return numbers | feasible | {"score_code": code}
-
-
-def without_score(row: Row) -> Row:
-    """A row as it was before it was scored."""
-    names = (field.name for field in dataclasses.fields(Score))
-    empty = dict.fromkeys((*names, "feasible", "feasible_strict"))
-    error = "" if row.error.startswith(SCORING_FAILED) else row.error
-    return dataclasses.replace(row, error=error, score_code="", **empty)  # type: ignore[arg-type]
+    return numbers | {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
 
 
 def save_scores(
     case: Case,
-    tasks: Sequence[Task],
+    rows: Sequence[Row],
+    instances: Mapping[str, Instance],
     results: Results,
     pool: Workers,
     on_row: Callable[[Row], None] = lambda row: None,
-) -> None:
-    """Score the kept schedules of tasks and fill in their rows.
+) -> list[Row]:
+    """Score the kept schedules of rows and fill them in; returns the scored rows.
 
     Raises:
         InputError: a kept schedule is damaged, which is the user's to remove.
     """
-    for batch, verdicts in score_schedules(case, tasks, results, pool):
-        for verdict in verdicts:
+    done: list[Row] = []
+    for batch in verdicts(case, rows, instances, results, pool):
+        for _, verdict in batch:
             if isinstance(verdict, InputError):
                 raise verdict
-        rows = [scored_row(results.rows[t.key], v) for t, v in zip(batch, verdicts, strict=True)]
-        results.add(rows)
-        for row in rows:
+        scored = [scored_row(row, verdict) for row, verdict in batch]
+        results.add(scored)
+        for row in scored:
             on_row(row)
+        done += scored
+    return done
 
 
-def score_unscored(
-    case: Case, instances: Mapping[str, Instance], results: Results, pool: Workers
-) -> tuple[Row, ...]:
-    """Score the kept schedules that have no score yet, as after an interruption; returns their rows.
-
-    Args:
-        instances: by id; rows of others stay as they are.
-
-    Raises:
-        InputError: a kept schedule is damaged.
-    """
-    waiting = [row for row in results.rows.values() if not row.scored and row.instance in instances]
-    waiting = [row for row in waiting if results.schedule_path(row.key).is_file()]
-    save_scores(case, tasks_of(waiting, instances), results, pool)
-    return tuple(results.rows[row.key] for row in waiting)
+def unscored(results: Results) -> list[Row]:
+    """Rows whose schedule is kept but has no score, as after an interruption."""
+    return [row for row in results.rows.values() if not row.scored and results.has_schedule(row)]
 
 
 def rescore(
@@ -156,51 +145,61 @@ def rescore(
     """Score the kept schedules of a results folder again, and compare with its rows.
 
     Args:
+        case: of the rows.
         instances: by id; rows of others are counted.
+        results: the folder's.
+        workers: processes.
         update: write the new scores into the rows.
+        on_difference: called with each sentence.
 
     Raises:
         InputError: none of the rows' schedules is kept.
     """
     kept = results.kept(instances)
-    tasks = tasks_of(kept if update else [row for row in kept if row.scored], instances)
     rows, differences = [], []
     with Workers(workers) as pool:
-        for batch, verdicts in score_schedules(case, tasks, results, pool):
-            pairs = [
-                (row, scored_row(row, verdict))
-                for row, verdict in zip((results.rows[task.key] for task in batch), verdicts, strict=True)
-            ]
-            for old, new in pairs:
-                for sentence in _differences(old, new) if old.scored else ():
-                    differences.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
-                    on_difference(differences[-1])
-            rows += [new for _, new in pairs]
-            if update:
-                results.add(new for _, new in pairs)
+        asked = kept if update else [row for row in kept if row.scored]
+        for old, verdict in itertools.chain.from_iterable(verdicts(case, asked, instances, results, pool)):
+            rows.append(scored_row(old, verdict))
+            for sentence in _differences(old, rows[-1]) if old.scored else ():
+                differences.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
+                on_difference(differences[-1])
     if update:
+        results.add(rows)
         results.compact()
     unknown = sum(row.instance not in instances for row in results.rows.values())
     return Check(
         rows,
         differences,
         without_schedule=len(results.rows) - unknown - len(kept),
-        unscored=sum(not row.scored for row in kept) if not update else 0,
+        unscored=0 if update else len(kept) - len(asked),
         unknown=unknown,
     )
 
 
-def tasks_of(rows: Iterable[Row], instances: Mapping[str, Instance]) -> list[Task]:
-    """Rows whose schedules are kept, as tasks to be scored."""
-    return [
-        Task(instances[row.instance], row.split, row.regime, row.method, Settings(row.settings), "")
-        for row in rows
-    ]
+def validate(
+    case: Case, instances: Mapping[str, Instance], results: Results, plant: str, workers: int = 1
+) -> list[ValidatedRow]:
+    """Score the kept schedules of a results folder on another plant, and save that in `validated.csv`.
+
+    Raises:
+        InputError: none of the rows' schedules is kept.
+    """
+    table: KeyedTable[tuple[Key, str], ValidatedRow] = KeyedTable(results.paths.validated, VALIDATED)
+    rows = []
+    with Workers(workers) as pool:
+        batches = verdicts(case, results.kept(instances), instances, results, pool, plant)
+        for row, verdict in itertools.chain.from_iterable(batches):
+            cells = {"plant": plant, "fingerprint": row.fingerprint} | score_cells(verdict)
+            rows.append(ValidatedRow(**row.key._asdict(), **cells))
+    table.add(rows)
+    table.compact()
+    return rows
 
 
 def _differences(old: Row, new: Row) -> Iterator[str]:
     """What a row says and its schedule, scored again, does not."""
-    if (old.objective is None) != (new.objective is None) or old.objective is None or new.objective is None:
+    if old.objective is None or new.objective is None:
         if old.objective is not None:
             yield new.error
         elif new.objective is not None:
@@ -208,25 +207,14 @@ def _differences(old: Row, new: Row) -> Iterator[str]:
         return
     if not math.isclose(old.objective, new.objective, rel_tol=OBJECTIVE_RELATIVE):
         yield f"objective {old.objective!r} in the row, {new.objective!r} scored again"
-    tolerances = {"freq_violation_hz": VIOLATION_HZ, **dict.fromkeys(_POWER_LIMITS, VIOLATION_PU)}
-    missing = [name for name in tolerances if getattr(old, name) is None]
+    missing = [name for name in _TOLERANCES if getattr(old, name) is None]
     yield from (f"{name} is missing in the row" for name in missing)
     if missing:
         return
-    for name, tolerance in tolerances.items():
+    for name, tolerance in _TOLERANCES.items():
         was, is_now = getattr(old, name), getattr(new, name)
         if abs(was - is_now) > tolerance:
             yield f"{name} {was!r} in the row, {is_now!r} scored again"
-    own = Score(**{field.name: getattr(old, field.name) for field in dataclasses.fields(Score)})
+    own = Score(**{name: getattr(old, name) for name in _SCORE})
     if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):
         yield "feasible or feasible_strict do not follow from the row's own violations"
-
-
-def _batches(tasks: Iterable[Task]) -> Iterator[list[Task]]:
-    """Tasks to be simulated side by side: of one grid, and of one method, whose schedules bend alike."""
-    groups: dict[tuple[int, float, str], list[Task]] = {}
-    for task in tasks:
-        groups.setdefault((task.instance.steps, task.instance.dt_s, task.method), []).append(task)
-    for group in groups.values():
-        for start in range(0, len(group), SCORE_BATCH):
-            yield group[start : start + SCORE_BATCH]

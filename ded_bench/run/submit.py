@@ -22,7 +22,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.environment import host
 from ded_bench.run.runner import run, unscored_row
-from ded_bench.run.tasks import Task
+from ded_bench.run.tasks import Task, fingerprint_of, key_of
 from ded_bench.solvers.status import Status
 
 SUFFIXES = (".csv", ".csv.gz")
@@ -64,25 +64,24 @@ def submit(
         first, _, regime = wanted[0]
         such = f"{first.id}.csv or {regime}/{first.id}.csv"
         raise InputError(folder, "", f"has none of the schedules asked for (such as {such})")
-    tasks, fresh, to_score = [], [], []
+    keys, sound = [], []
     for instance, split, regime in wanted:
-        task, schedule, error = _read(chosen.case, folder, name, instance, split, regime)
-        tasks.append(task)
-        path = results.schedule_path(task.key)
-        if schedule is None:
-            path.unlink(missing_ok=True)  # an earlier submission's
-            fresh.append(_row(task, Status.FAILED, error, workers, chosen.version))
-            on_row(fresh[-1])
-            continue
-        to_score.append(task)
-        if not results.solved(task.key, task.fingerprint):
-            schedule.write(path, chosen.case.generators)
-            fresh.append(_row(task, Status.FEASIBLE, "", workers, chosen.version))
-    results.add(fresh)
-    run(chosen.case, to_score, results, workers, chosen.version, on_row)  # solved already: only scored
+        schedule, content, error = _read(chosen.case, folder, instance, regime)
+        key = key_of(instance, regime, name, Settings(), ())
+        fingerprint = fingerprint_of(chosen.case, instance, key, content)
+        task = Task(instance, split, regime, name, Settings(), fingerprint)
+        keys.append(key)
+        if not results.solved(key, fingerprint):
+            status = Status.FAILED if schedule is None else Status.FEASIBLE
+            row = unscored_row(task, Solution(status, error=error[:300]), workers, chosen.version, host())
+            results.keep(row, schedule, chosen.case)
+            if schedule is None:
+                on_row(row)
+        sound += [task] if schedule is not None else []
+    run(chosen.case, sound, results, workers, chosen.version, on_row)  # solved already: only scored
     places = [folder, *(folder / regime for regime in regimes)]
     found = {path for place in places for suffix in SUFFIXES for path in place.glob(f"*{suffix}")}
-    return Submission([results.rows[task.key] for task in tasks], sorted(found - used))
+    return Submission([results.rows[key] for key in keys], sorted(found - used))
 
 
 def _check_name(name: str) -> None:
@@ -98,25 +97,15 @@ def _candidates(folder: Path, regime: str, instance: str) -> list[Path]:
     return [path for path in places if path.is_file()]
 
 
-def _read(
-    case: Case, folder: Path, name: str, instance: Instance, split: str, regime: str
-) -> tuple[Task, Schedule | None, str]:
-    """A task with the fingerprint of its file's content, and the schedule or what is wrong with it."""
+def _read(case: Case, folder: Path, instance: Instance, regime: str) -> tuple[Schedule | None, str, str]:
+    """A schedule and the hash of its file, or what is wrong with it."""
     found = _candidates(folder, regime, instance.id)
-    content, schedule, error = b"", None, ""
     try:
         if not found:
             raise InputError(folder, f"{instance.id}.csv", "no such schedule in the folder")
         if len(found) > 1 and found[0].parent == found[1].parent:
             raise InputError(found[0], "", f"is one of two, beside {found[1].name}")
         schedule = Schedule.read(found[0], case, instance.horizon_s)
-        content = found[0].read_bytes()
+        return schedule, hashlib.sha256(found[0].read_bytes()).hexdigest(), ""
     except InputError as wrong:
-        error = str(wrong)
-    parts = (case.fingerprint, instance.fingerprint, regime, name, hashlib.sha256(content).hexdigest())
-    fingerprint = hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-    return Task(instance, split, regime, name, Settings(), fingerprint), schedule, error
-
-
-def _row(task: Task, status: Status, error: str, workers: int, problems_version: str) -> Row:
-    return unscored_row(task, Solution(status, error=error[:300]), workers, problems_version, host())
+        return None, "", str(wrong)

@@ -1,31 +1,44 @@
-"""What worker processes do: solve one task, score a few; a failure is an answer, too."""
+"""Tasks: one row to be made each, and what worker processes do for it; a failure is an answer, too.
+
+A worker that does not have the results folder gets models and policies with the task, a few hundred kB.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import functools
+import hashlib
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from ded_bench.methods.artifact import Artifact
+from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import Artifact, named
 from ded_bench.methods.plugin import accept
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.plants.score import Score, score
-from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key
 from ded_bench.run.environment import host
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError
-from ded_bench.run.shipping import Files, unpacked
 from ded_bench.solvers.status import Status
+
+#: Contents of files by their path below a results folder, or below `_GIVEN`.
+Files = tuple[tuple[str, bytes], ...]
+#: Folder of files that the settings name by their paths.
+_GIVEN = "given"
 
 
 @dataclass(frozen=True)
 class Task:
-    """One row to be made."""
+    """One row to be made. `settings` are canonical, `version` is the method's."""
 
     instance: Instance
     split: str
@@ -34,13 +47,60 @@ class Task:
     settings: Settings
     fingerprint: str
     artifacts: tuple[Artifact, ...] = ()
-    code: str = ""
+    version: int = 0
     files: Files = ()  # for a worker without the results folder
 
     @property
     def key(self) -> Key:
         """The row's place in the results table."""
-        return Key(self.instance.id, self.regime, self.method, self.settings.slug)
+        return key_of(self.instance, self.regime, self.method, self.settings, self.artifacts)
+
+
+def make_tasks(
+    case: Case,
+    instances: Sequence[tuple[Instance, str]],
+    methods: Sequence[str],
+    regimes: Sequence[str],
+    settings: Settings,
+) -> list[Task]:
+    """List every row of a run; methods and regimes outermost, so that a worker's model is reused.
+
+    Raises:
+        InputError: unknown method, regime or options, or a model or policy that is missing.
+    """
+    case.check_regimes(regimes)
+    tasks = []
+    for method in map(get_method, methods):
+        own = method.canonical(settings)
+        for regime in regimes:
+            artifacts = method.artifacts(case, regime, own)
+            for instance, split in instances:
+                key = key_of(instance, regime, method.name, own, artifacts)
+                fingerprint = fingerprint_of(case, instance, key, named(artifacts, "code"))
+                made = fingerprint, artifacts, method.version
+                tasks.append(Task(instance, split, regime, method.name, own, *made))
+    return tasks
+
+
+def key_of(
+    instance: Instance, regime: str, method: str, settings: Settings, artifacts: Iterable[Artifact]
+) -> Key:
+    """The key of a row that a method makes with some models and policies."""
+    made_with = named(artifacts, "model"), named(artifacts, "policy")
+    name = instance.case, instance.id, regime, method, settings.options
+    return Key(*name, *made_with, settings.time_limit_s)
+
+
+def fingerprint_of(case: Case, instance: Instance, key: Key, content: str = "") -> str:
+    """Twelve hex digits that change with whatever decides on an answer, except for our own code.
+
+    Args:
+        case, instance: what is solved.
+        key: the row's.
+        content: fingerprint of what else it is made of, as a schedule that was submitted.
+    """
+    parts = [case.fingerprint, instance.fingerprint, *map(str, key[2:]), content]
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
 def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
@@ -57,19 +117,26 @@ def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
         return failed(error), host()
 
 
-#: How a schedule is judged: `scorer(case, instance=…, schedule=…, regime=…)`, a function that can be pickled.
-Scorer = Callable[..., Score]
+@functools.lru_cache(maxsize=4)
+def _prepared(case: Case, method: str, regime: str, settings: Settings, files: Files) -> Solver:
+    with unpacked(settings, files) if files else contextlib.nullcontext(settings) as own:
+        return get_method(method).prepare(case, regime, own)
 
 
-def score_tasks(
-    case: Case, tasks: Sequence[Task], schedules: Sequence[Schedule], scorer: Scorer = score
-) -> list[Score | SimulationError]:
-    """Score tasks one by one; the error stands for those that lose synchronism."""
-    verdicts: list[Score | SimulationError] = []
-    for task, schedule in zip(tasks, schedules, strict=True):
+#: What the scorer is asked: how an instance's schedule does in a regime on a plant. The error stands for a
+#: schedule that could not be read.
+Question = tuple[Instance, Schedule | InputError, str, str]
+
+
+def score_all(case: Case, questions: Sequence[Question]) -> list[Score | Exception]:
+    """Score schedules one by one; the error stands for one that its plant cannot follow."""
+    verdicts: list[Score | Exception] = []
+    for instance, schedule, regime, plant in questions:
         try:
-            verdicts.append(scorer(case, instance=task.instance, schedule=schedule, regime=task.regime))
-        except SimulationError as error:
+            if isinstance(schedule, InputError):
+                raise schedule
+            verdicts.append(score(case, instance, schedule, regime, plant_of(case, plant)))
+        except (InputError, SimulationError) as error:
             verdicts.append(error)
     return verdicts
 
@@ -80,17 +147,41 @@ def failed(error: object) -> Solution:
     return Solution(status, error=reason_of(error))
 
 
-@functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings, files: Files) -> Solver:
-    if not files:
-        return get_method(method).prepare(case, regime, settings)
-    with unpacked(settings, files) as own:
-        return get_method(method).prepare(case, regime, own)
-
-
 def reason_of(error: object) -> str:
     """One line that a person understands and any file can hold."""
     first = (str(error).strip().splitlines() or ["no message"])[0]
     if isinstance(error, BaseException) and not isinstance(error, NoAnswerError | WorkerDiedError):
         first = f"{type(error).__name__}: {first}"
     return first.encode("utf-8", "replace").decode()[:300]
+
+
+def pack(settings: Settings, artifacts: Iterable[Artifact]) -> Files:
+    """Read every file that an answer depends on."""
+    return tuple((_place(a.kind, a.path, settings), a.path.read_bytes()) for a in artifacts if a.path)
+
+
+@contextlib.contextmanager
+def unpacked(settings: Settings, files: Files) -> Iterator[Settings]:
+    """Settings that find the packed files, which lie in a temporary folder until the end of the block."""
+    with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
+        folder = Path(name)
+        for place, content in files:
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            (folder / place).write_bytes(content)
+        policy, model = settings.policy and folder / _given("policy", settings.policy), settings.model
+        if model and (given := folder / _given("model", model)).is_file():
+            model = str(given)
+        yield dataclasses.replace(settings, search=(folder,), policy=policy, model=model)
+
+
+def _place(kind: str, path: Path, settings: Settings) -> str:
+    """Where methods look for a file: by its path in the settings, else below a folder to search."""
+    if path not in (settings.policy, Path(settings.model)):
+        for folder in settings.search:
+            if path.is_relative_to(folder):
+                return path.relative_to(folder).as_posix()
+    return _given(kind, path)
+
+
+def _given(kind: str, path: str | Path) -> str:
+    return f"{_GIVEN}/{kind}/{Path(path).name}"

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
-from ded_bench.problem.case import REPOSITORY, Case
+from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
+
+__all__ = ["default_results", "search_folders"]
 
 #: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")
@@ -36,16 +39,6 @@ class AlongTrajectory:
 
 #: A lifted model has one K for all instances and times; the other kind is made for each instance.
 Surrogate = Koopman | AlongTrajectory
-
-
-def default_results(case: Case) -> Path:
-    """Where results of a case lie unless told otherwise, below the working directory."""
-    return Path("results") / case.id
-
-
-def search_folders(case: Case, *first: Path) -> tuple[Path, ...]:
-    """Where trained models and policies are looked for: `first`, default results, reference run."""
-    return (*first, default_results(case), REPOSITORY / "results" / f"{case.id}-reference")
 
 
 def model_file(results: Path, kind: str) -> Path:

@@ -16,7 +16,7 @@ from ded_bench.methods.knots import knot_points
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.results.rows import Key, Results
+from ded_bench.results.rows import Results
 from ded_bench.surrogates.find import AlongTrajectory, Surrogate
 from ded_bench.surrogates.identification_data import Trajectories, trajectories
 from ded_bench.surrogates.identify import held_out, predict
@@ -111,10 +111,12 @@ def all_rollouts(
     )
     for method in optimal:
         for regime in case.regimes:
-            keys = {i.id: Key(i.id, regime, method, DEFAULT) for i in instances}
-            there = [i for i in instances if results.schedule_path(keys[i.id]).is_file()]
+            wanted = case.id, regime, method, DEFAULT
+            rows = [r for r in results.rows.values() if (r.case, r.regime, r.method, r.settings) == wanted]
+            kept = {row.instance: row for row in rows if results.has_schedule(row)}
+            there = [instance for instance in instances if instance.id in kept]
             if there:
-                schedules = [results.schedule(keys[i.id], case, i) for i in there]
+                schedules = [results.schedule(kept[i.id], case, i) for i in there]
                 kind = f"{title(method)}, {regime}"
                 data = trajectories(case, there, schedules, [kind] * len(there))
                 tables.append(rollout_table(case, surrogates, data))

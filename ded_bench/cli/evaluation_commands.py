@@ -113,7 +113,7 @@ def _bench(a: argparse.Namespace) -> int:
     from ded_bench.results.timing import timing_summary
     from ded_bench.run.bench import bench, choose_sample, runs_of
 
-    jobs = runs_of(results.rows, Settings(search=search_folders(case, results.folder)), methods)
+    jobs = runs_of(results.rows.values(), Settings(search=search_folders(case, results.folder)), methods)
     rows = bench(
         case,
         choose_sample([instance for instance, _ in chosen.instances], a.instances),
@@ -128,7 +128,8 @@ def _bench(a: argparse.Namespace) -> int:
     for row in timing_summary(rows).to_dict("records"):
         timed = row["solve_s"] == row["solve_s"]
         said = f"{row['solve_s']:.6f} s, {row['repeats']} rounds" if timed else row["error"]
-        print(f"{row['method']:<16} {row['settings']:<12} {row['regime']:<4} {said}", flush=True)
+        name = f"{row['method']:<16} {row['settings']:<12} {row['model']:<12} {row['regime']:<4}"
+        print(f"{name} {said}", flush=True)
     return 1 if any(row.status == Status.FAILED for row in rows) else 0
 
 
@@ -140,22 +141,16 @@ def _certify(a: argparse.Namespace) -> int:
     case.check_regimes(regimes)
     folder = a.results or default_results(case)
     settings = Settings(a.set, a.model, a.policy, search=search_folders(case, folder))
-    for regime in regimes:
-        get_method(a.method).artifacts(case, regime, settings)  # says what is missing
-    say(f"{a.method} and ded-ko-knots on {counted(a.count, 'fresh instance')}, {' and '.join(regimes)}")
-    from ded_bench.analysis.certificate import Criteria, certify, rows_file, save_certificate
+    from ded_bench.analysis.certificate import Candidate, Criteria, certify, save_certificate
 
-    for regime in regimes:
+    candidates = [Candidate(get_method(a.method).name, regime, settings) for regime in regimes]
+    for candidate in candidates:
+        candidate.facts(case)  # says what is missing
+    say(f"{a.method} and ded-ko-knots on {counted(a.count, 'fresh instance')}, {' and '.join(regimes)}")
+    criteria = Criteria(gap_percent=a.gap, tolerance_hz=a.tolerance, delta=a.delta)
+    for candidate in candidates:
         certificate = certify(
-            case,
-            a.method,
-            regime,
-            settings,
-            rows_file(folder, a.method, regime, settings),
-            Criteria(gap_percent=a.gap, tolerance_hz=a.tolerance, delta=a.delta),
-            count=a.count,
-            seed=a.seed,
-            workers=a.workers,
+            case, candidate, folder, criteria, count=a.count, seed=a.seed, workers=a.workers
         )
         save_certificate(folder, certificate)
         print(certificate.sentence)
@@ -176,16 +171,16 @@ def _compare(a: argparse.Namespace) -> int:
 
 def _score_waiting(place: str, results: Results, workers: int) -> None:
     """Score what an interrupted run has solved but not scored, and say so; else it would count as failed."""
-    from ded_bench.run.scoring import score_unscored
+    from ded_bench.run.scoring import save_scores, unscored
 
-    waiting = [row for row in results.rows.values() if not row.scored]
-    splits = {row.split for row in waiting if results.schedule_path(row.key).is_file()}
-    for split in sorted({"validation" if split == "validation" else "all" for split in splits}):
-        chosen = select_split(place, split)
-        instances = {instance.id: instance for instance, _ in chosen.instances}
-        with Workers(workers) as pool:
-            rows = score_unscored(chosen.case, instances, results, pool)
-        if rows:
+    for split in ("all", "validation"):
+        waiting = [row for row in unscored(results) if (row.split == "validation") == (split == "validation")]
+        if waiting:
+            chosen = select_split(place, split)
+            instances = {instance.id: instance for instance, _ in chosen.instances}
+            with Workers(workers) as pool:
+                known = [row for row in waiting if row.instance in instances]
+                rows = save_scores(chosen.case, known, instances, results, pool)
             say(f"{counted(len(rows), 'row')} solved but not scored: scored now")
 
 

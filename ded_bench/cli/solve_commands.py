@@ -1,4 +1,4 @@
-"""Commands that make and judge schedules: solve, score."""
+"""Commands that make schedules, judge them and solve rows again: solve, score, reproduce."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,15 +23,14 @@ from ded_bench.cli.arguments import (
 from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
-from ded_bench.problem.ac_case import FILE, TRUTHS, AcCase
+from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.plausibility import check_own_name, check_plausible
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.find import default_results
 
 if TYPE_CHECKING:
     from ded_bench.results.rows import Results, Row
@@ -42,6 +40,13 @@ def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     _add_solve(commands)
     _add_score(commands)
+    p = command(commands, "reproduce", "solve a sample of rows again and compare")
+    p.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose rows, models, policies")
+    p.add_argument("--sample", type=positive, default=5, metavar="N", help="rows per method and settings")
+    p.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in the results")
+    p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
+    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
+    p.set_defaults(run=_reproduce, instance=None)
 
 
 def _add_solve(commands: Any) -> None:
@@ -63,13 +68,13 @@ def _add_solve(commands: Any) -> None:
 
 
 def _add_score(commands: Any) -> None:
-    p = command(commands, "score", "simulate schedule CSVs on the true system and judge them")
+    p = command(commands, "score", "simulate schedules on a plant and judge them")
     given = p.add_mutually_exclusive_group(required=True)
     given.add_argument("--schedule", type=Path, metavar="CSV", help="one, for one --instance")
     given.add_argument("--schedules", type=Path, metavar="DIR", help="[REGIME/]INSTANCE.csv[.gz] become rows")
     given.add_argument("--results", type=Path, metavar="DIR", help="compare its rows and kept schedules")
     p.add_argument("--update", action="store_true", help="write the new scores into the rows of --results")
-    p.add_argument("--truth", choices=TRUTHS, default="paper", help="network; ac with --results: ac.csv")
+    p.add_argument("--plant", choices=PLANTS, help="default: that of the rows; another: validated.csv")
     p.add_argument("--name", help="what the rows of --schedules call your method")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
     chosen = p.add_mutually_exclusive_group()
@@ -85,7 +90,8 @@ def _add_score(commands: Any) -> None:
 
 def _solve(a: argparse.Namespace) -> int:
     from ded_bench.results.rows import Results
-    from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
+    from ded_bench.run.runner import fallbacks, run, unfinished
+    from ded_bench.run.tasks import make_tasks
 
     chosen = _chosen(a)
     case = chosen.case
@@ -127,9 +133,9 @@ def _solve(a: argparse.Namespace) -> int:
 def _score(a: argparse.Namespace) -> int:
     if a.update and not a.results:
         raise InputError("--update", "", "is only for --results")
-    if a.truth != "paper" and (a.schedules or a.update):
+    if a.plant and (a.schedules or a.update):
         option = "--schedules" if a.schedules else "--update"
-        raise InputError("--truth", a.truth, f"is not for {option}, whose rows are of the paper's network")
+        raise InputError("--plant", a.plant, f"is not for {option}, whose rows are of the case's own plant")
     if a.results:
         return _score_results(a)
     if not a.regime:
@@ -145,15 +151,11 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
+    from ded_bench.plants.plant import DEFAULT_PLANT, SimulationError, plant_of
     from ded_bench.plants.score import score
-    from ded_bench.plants.plant import SimulationError
-    from ded_bench.truth.ac_simulate import score_ac
 
     try:
-        if a.truth == "ac":
-            verdict = score_ac(case, _ac_data(a, case), instance, schedule, regime)
-        else:
-            verdict = score(case, instance, schedule, regime)
+        verdict = score(case, instance, schedule, regime, plant_of(case, a.plant or DEFAULT_PLANT))
     except SimulationError as error:
         print(f"ded-bench: {a.schedule}: {error}", file=sys.stderr)
         return 1
@@ -183,8 +185,8 @@ def _score_results(a: argparse.Namespace) -> int:
     def tell(sentence: str) -> None:
         print(sentence, file=stream, flush=True)
 
-    if a.truth == "ac":
-        return _score_results_on_ac(a, case, instances, results, tell)
+    if a.plant:
+        return _validate(a, case, instances, results)
     from ded_bench.run.scoring import rescore
 
     check = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)
@@ -202,34 +204,43 @@ def _score_results(a: argparse.Namespace) -> int:
     return 0 if a.update or not check.differences else 1
 
 
-def _score_results_on_ac(
-    a: argparse.Namespace,
-    case: Case,
-    instances: dict[str, Instance],
-    results: Results,
-    tell: Callable[[str], None],
-) -> int:
-    """The schedules kept in a results folder, on the AC network."""
-    from ded_bench.run.ac_scoring import score_on_ac
+def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance], results: Results) -> int:
+    """The schedules kept in a results folder, on the plant of `--plant`."""
+    from ded_bench.plants.plant import plant_of
+    from ded_bench.run.scoring import validate
 
-    table, rows = score_on_ac(case, _ac_data(a, case), instances, results, a.workers)
+    plant_of(case, a.plant)  # says what the case lacks
+    rows = validate(case, instances, results, a.plant, a.workers)
     if a.json:
         for row in rows:
             print(json.dumps(dataclasses.asdict(row)), flush=True)
     bad = [row for row in rows if row.objective is None]
-    before = [row for row in rows if results.rows[row.key].feasible]
-    after = sum(bool(row.feasible) for row in before)
-    tell(f"{counted(len(rows), 'row')} in {table}, {len(bad)} without a score")
-    tell(f"{after} of the {len(before)} rows that are feasible on the paper's network are so on AC")
+    own = [row for row in rows if results.rows[row.key[0]].feasible]
+    stream = sys.stderr if a.json else sys.stdout
+    print(
+        f"{counted(len(rows), 'row')} in {results.paths.validated}, {len(bad)} without a score; "
+        f"{sum(bool(row.feasible) for row in own)} of {len(own)} feasible rows are so on {a.plant}",
+        file=stream,
+    )
     return 1 if bad else 0
 
 
-def _ac_data(a: argparse.Namespace, case: Case) -> AcCase:
-    """AC data of the folder of `--case`, else beside the instances, else of the shipped case."""
-    around = [path.resolve().parent.parent for path in a.instance or ()]
-    if not a.case and around and (around[0] / FILE).is_file():
-        return AcCase.load(around[0])
-    return AcCase.load(problem_folder(a.case or case.id, case))
+def _reproduce(a: argparse.Namespace) -> int:
+    """Rows of a results folder, solved again."""
+    from ded_bench.results.rows import Results
+
+    results = Results(a.results)
+    if not results.rows:
+        raise InputError(results.path, "", "is missing or has no rows")
+    case, instances = _instances_of(a, results)
+    say(f"solving up to {a.sample} rows of each method, settings, model and regime in {a.results} again")
+    from ded_bench.analysis.reproduce import reproduce, table_of
+
+    lines = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
+    print(table_of(lines))
+    differ = sum(len(line.differences) for line in lines)
+    print(f"{counted(sum(line.rows for line in lines), 'row')} solved again, {differ} differ")
+    return 1 if differ else 0
 
 
 def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[str, Instance]]:
@@ -291,8 +302,8 @@ def _chosen(a: argparse.Namespace) -> Selection:
 
 
 def _print_row(results: Results, row: Row) -> None:
-    """One JSON object: the row, and where its schedule lies."""
-    path = results.schedule_path(row.key)
-    scheduled = path.is_file() and row.status != Status.FAILED
-    fields = dataclasses.asdict(row) | {"schedule": str(path) if scheduled else None}
-    print(json.dumps(fields), flush=True)
+    """One JSON object: the row, the archive of its schedule and the schedule's name there."""
+    scheduled = row.status != Status.FAILED and results.has_schedule(row)
+    place = str(results.archive(row).path) if scheduled else None
+    fields = {"schedule": place, "schedule_member": row.member if scheduled else None}
+    print(json.dumps(dataclasses.asdict(row) | fields), flush=True)

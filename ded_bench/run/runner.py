@@ -71,7 +71,8 @@ def run(
 
 def unfinished(tasks: Sequence[Task], results: Results) -> tuple[list[Task], list[Task]]:
     """Tasks that are to be solved and scored, and those that are solved and only to be scored."""
-    todo, unscored = [], []
+    todo: list[Task] = []
+    unscored: list[Task] = []
     for task in tasks:
         made = task.key, task.fingerprint, task.version
         if not results.finished(*made):

@@ -1,0 +1,195 @@
+"""Rows solved again: a sample of a results folder with today's code and the folder's models and policies.
+
+It answers whether the rows are those of the code that stands beside them. Objectives and violations are
+re-simulated. Rows that failed or ended by a time limit depend on the machine: they are named, not compared.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tqdm import tqdm
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.registry import registered
+from ded_bench.methods.solution import Settings
+from ded_bench.plants.score import Score
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.results.reference_run import search_folders
+from ded_bench.results.rows import Results, Row
+from ded_bench.results.timing import model_name
+from ded_bench.run.pool import Workers
+from ded_bench.run.tasks import Task, make_tasks, reason_of, score_all, solve_task
+from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import MODELS, TRAINED
+
+#: Largest change that is none: of the objective relative, of the frequency violation in Hz.
+OBJECTIVE_RELATIVE, VIOLATION_HZ = 1e-6, 1e-6
+#: Seed of the sample, with the name of its line.
+SEED = 0
+
+
+@dataclass
+class Line:
+    """What came of the sample of one method, settings, surrogate and regime.
+
+    Attributes:
+        rows: how many were solved again.
+        skipped: what was not, and why: a sentence each.
+        differences: a sentence for each row that differs.
+        objective: largest relative difference of objectives.
+        hz: largest difference of frequency violations.
+    """
+
+    method: str
+    settings: str
+    model: str
+    regime: str
+    rows: int = 0
+    skipped: list[str] = field(default_factory=list)
+    differences: list[str] = field(default_factory=list)
+    objective: float = 0.0
+    hz: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """As its sentences call it."""
+        return " ".join(filter(None, (self.method, self.settings, self.model, self.regime)))
+
+
+def reproduce(
+    case: Case,
+    instances: Mapping[str, Instance],
+    results: Results,
+    methods: Sequence[str] = (),
+    sample: int = 5,
+    workers: int = 1,
+    on_sentence: Callable[[str], None] = lambda sentence: None,
+) -> list[Line]:
+    """Solve a sample of rows again and compare; the folder stays as it is.
+
+    Args:
+        case: of the rows.
+        instances: by id; rows of others are skipped.
+        results: whose rows are solved again; models and policies of the same folder come first.
+        methods: only rows of these; none: of all.
+        sample: rows of each line, drawn with a fixed seed.
+        workers: processes.
+        on_sentence: called with everything that differs or is skipped.
+
+    Raises:
+        InputError: there is no row of these methods.
+    """
+    parts: dict[tuple[str, str, str, str], list[Row]] = {}
+    for row in results.rows.values():
+        if row.case == case.id and (not methods or row.method in methods):
+            name = row.method, row.settings, model_name(row.model), row.regime
+            parts.setdefault(name, []).append(row)
+    if not parts:
+        raise InputError(results.path, "method", f"has no rows of {', '.join(methods) or case.id}")
+    lines = [Line(*name) for name in sorted(parts)]
+    tasks: list[tuple[Line, Row, Task]] = []
+    for line in lines:
+        chosen = _sample(line, parts[line.method, line.settings, line.model, line.regime], instances, sample)
+        tasks += [
+            (line, row, task) for row in chosen if (task := _task(case, line, row, instances, results.folder))
+        ]
+        for sentence in line.skipped:
+            on_sentence(f"{line.name}: {sentence}")
+    calls = [(solve_again, (case, task, row.plant)) for _, row, task in tasks]
+    with Workers(workers) as pool, tqdm(total=len(tasks), unit="row", disable=None, desc="reproduce") as bar:
+        for (line, row, _), answer in pool.imap(calls, tasks):
+            for sentence in _compared(line, row, answer):
+                on_sentence(f"{line.name}: {sentence}")
+            bar.update()
+    return lines
+
+
+def solve_again(case: Case, task: Task, plant: str) -> Score | str | None:
+    """Solve and score one task in this process; else why there is no score, or None for a time limit."""
+    solution, _ = solve_task(case, task)
+    if solution.status == Status.TIME_LIMIT:
+        return None
+    if solution.schedule is None:
+        return solution.error or solution.status.sentence
+    (verdict,) = score_all(case, [(task.instance, solution.schedule, task.regime, plant)])
+    return verdict if isinstance(verdict, Score) else reason_of(verdict)
+
+
+def _sample(line: Line, rows: Sequence[Row], instances: Mapping[str, Instance], count: int) -> list[Row]:
+    """Rows to be solved again; what cannot be is noted."""
+    unlike = [r for r in rows if r.objective is None or r.status in (Status.TIME_LIMIT, Status.FAILED)]
+    if unlike:
+        named = ", ".join(row.instance for row in unlike[:5]) + (", …" if len(unlike) > 5 else "")
+        line.skipped.append(f"{len(unlike)} of {len(rows)} rows failed or ended by a limit ({named})")
+    known = sorted((r for r in rows if r not in unlike and r.instance in instances), key=lambda r: r.key[1:7])
+    if not known and len(unlike) < len(rows):
+        line.skipped.append("its instances are unknown here")
+    return random.Random(f"{SEED} {line.name}").sample(known, min(count, len(known)))
+
+
+def _task(case: Case, line: Line, row: Row, instances: Mapping[str, Instance], folder: Path) -> Task | None:
+    """The task that makes a row; None, and noted why, if the folder has not what made it."""
+    if line.method not in registered():
+        line.skipped.append(f"{row.instance}: no method has this name")
+        return None
+    if line.model not in ("", *MODELS):
+        line.skipped.append(f"{row.instance}: made with a model of its own ({row.model})")
+        return None
+    search = search_folders(case, folder)
+    settings = Settings(line.settings, line.model, time_limit_s=row.time_limit_s, search=search)
+    try:
+        (task,) = make_tasks(
+            case, [(instances[row.instance], row.split)], [line.method], [line.regime], settings
+        )
+    except InputError as error:
+        line.skipped.append(f"{row.instance}: {error}")
+        return None
+    if task.key.policy != row.policy or (line.model in TRAINED and task.key.model != row.model):
+        line.skipped.append(f"{row.instance}: its {row.policy or row.model} is not the one in {folder}")
+        return None
+    return task
+
+
+def _compared(line: Line, row: Row, answer: object) -> Iterator[str]:
+    """Note one answer; yields a sentence if it is not that of the row."""
+    if answer is None:
+        line.skipped.append(f"{row.instance}: ended by its limit this time")
+        yield line.skipped[-1]
+        return
+    line.rows += 1
+    if not isinstance(answer, Score) or row.objective is None or row.freq_violation_hz is None:
+        line.differences.append(f"{row.instance}: no score this time ({answer})")
+        line.objective = float("inf")
+        yield line.differences[-1]
+        return
+    relative = abs(answer.objective / row.objective - 1) if row.objective else abs(answer.objective)
+    hz = abs(answer.freq_violation_hz - row.freq_violation_hz)
+    line.objective, line.hz = max(line.objective, relative), max(line.hz, hz)
+    if relative > OBJECTIVE_RELATIVE or hz > VIOLATION_HZ:
+        line.differences.append(
+            f"{row.instance}: objective {row.objective!r}, now {answer.objective!r}; "
+            f"freq_violation_hz {row.freq_violation_hz!r}, now {answer.freq_violation_hz!r}"
+        )
+        yield line.differences[-1]
+
+
+def table_of(lines: Sequence[Line]) -> str:
+    """One line each: rows, how many differ, the largest differences."""
+    heads = ("method", "settings", "model", "regime", "rows", "differ", "objective", "Hz")
+    cells = []
+    for line in lines:
+        numbers = str(line.rows), str(len(line.differences)), f"{line.objective:.1e}", f"{line.hz:.1e}"
+        cells.append((line.method, line.settings, line.model or "-", line.regime, *numbers))
+    widths = [max(len(row[i]) for row in (heads, *cells)) for i in range(len(heads))]
+    return "\n".join(
+        "  ".join(
+            text.ljust(w) if i < 4 else text.rjust(w)
+            for i, (text, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in (heads, *cells)
+    )

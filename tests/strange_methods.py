@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ded_bench.methods.options import NoOptions
 from ded_bench.methods.registry import METHODS, Method
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.problem.case import Case
@@ -18,7 +19,8 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.run import tasks
 from ded_bench.solvers.status import Status
 
-SETTINGS = {"default": {}}
+Options = NoOptions
+VERSION = 3
 STRANGE = Method("ded", "tests.strange_methods", "strange")
 
 

@@ -28,7 +28,8 @@ ROW = Row(
 def test_default_settings_only_and_no_instances_that_served_choices() -> None:
     other = dataclasses.replace(ROW, method="ed", objective=3.0)
     left_out = [
-        dataclasses.replace(ROW, settings="accelerated"),
+        dataclasses.replace(ROW, settings="accelerated=on"),
+        dataclasses.replace(ROW, method="ded-ko", model="koopman@f00"),
         dataclasses.replace(ROW, split="validation"),
         dataclasses.replace(ROW, instance="a-0002", objective=None, error="failed"),
     ]

@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.results.rows import ROWS, SCORING_FAILED, Key, Results, Row
+from ded_bench.problem.case import Case
+from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import ROWS, SCORING_FAILED, Results, Row
 
 ROW = Row(
     instance="a-1",
@@ -34,25 +37,41 @@ def test_rows_survive_the_file_to_the_last_digit(tmp_path: Path) -> None:
     assert list(frame.columns) == list(ROWS.names)
 
 
-def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(tmp_path: Path) -> None:
+def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(threebus: Case, tmp_path: Path) -> None:
     """Its schedule need not be kept, unless it is still to be scored, or scoring it has failed."""
     results = Results(tmp_path)
-    plain = dataclasses.replace(ROW, error="")
+    plain = dataclasses.replace(ROW, error="", method_version=2)
     scored, told = dataclasses.replace(plain, objective=1.0), dataclasses.replace(plain, error="why")
     failed = dataclasses.replace(plain, error=f"{SCORING_FAILED}why")
+    schedule = Schedule(np.array([0.0, 1.0]), np.array([[0.5], [0.5]]))
     cases = (scored, True, True), (plain, False, False), (told, False, False), (failed, False, True)
     for row, alone, with_schedule in cases:
-        results.add([row])
-        assert results.has(row.key, "f") is alone
+        results.keep(row, None, threebus)  # the schedule of the one before goes
+        assert results.finished(row.key, "f") is alone
         assert not results.solved(row.key, "f")
-        path = results.schedule_path(row.key)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        assert results.has(row.key, "f") is with_schedule
+        results.keep(row, schedule, threebus)
+        assert results.finished(row.key, "f", 2) is with_schedule
         assert results.solved(row.key, "f")
-        assert not results.has(row.key, "another fingerprint")
-        path.unlink()
-    assert not results.has(Key("a-2", "NO", "ded", "default"), "f")
+        assert not results.finished(row.key, "another fingerprint")
+        assert not results.finished(row.key, "f", 3)  # made by an older version of the method
+    assert not results.finished(row.key._replace(model="koopman@f00"), "f")
+
+
+def test_schedules_are_packed_once_their_rows_are_there(threebus: Case, tmp_path: Path) -> None:
+    """Those of several models side by side; the schedule of a row that is replaced goes."""
+    results = Results(tmp_path)
+    schedule = Schedule(np.array([0.0, 1.0]), np.array([[0.5], [0.5]]))
+    rows = [ROW, dataclasses.replace(ROW, model="koopman@f00", fingerprint="g")]
+    with pytest.raises(KeyboardInterrupt), results.packed():
+        for row in rows:
+            results.keep(row, schedule, threebus)
+        raise KeyboardInterrupt
+    place = tmp_path / "schedules" / "ded" / "default"
+    assert [path.name for path in place.iterdir()] == ["NO.npz"]
+    with results.packed():
+        results.keep(dataclasses.replace(ROW, fingerprint="h"), schedule, threebus)
+    with np.load(place / "NO.npz", allow_pickle=False) as archive:
+        assert set(archive) == {"columns", "a-1-g", "a-1-h"}
 
 
 GOOD = ROWS.format([ROW])

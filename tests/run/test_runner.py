@@ -13,15 +13,16 @@ from ded_bench.files.errors import InputError
 from ded_bench.surrogates.linear import linear_model
 from ded_bench.surrogates.find import model_file
 from ded_bench.methods.registry import METHODS
-from ded_bench.methods.solution import Settings
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.run import runner
-from ded_bench.run.code import code_of
+from ded_bench.run.environment import commit
 from ded_bench.run.pool import ATTEMPTS
 from ded_bench.results.rows import ROWS, Results
-from ded_bench.run.runner import fallbacks, make_tasks, run, unfinished
-from ded_bench.run.tasks import Task
+from ded_bench.run.runner import fallbacks, run, unfinished, unscored_row
+from ded_bench.run.tasks import Task, make_tasks
 from ded_bench.plants.score import score
+from ded_bench.solvers.status import Status
 from tests.strange_methods import STRANGE, solve_strange
 
 
@@ -55,9 +56,8 @@ def test_rows_are_scored_like_the_scorer_does(strange, make, threebus: Case, tmp
     assert [row.key for row in rows] == [task.key for task in tasks]
     results = Results(tmp_path / "out")
     for task, row in zip(tasks, rows, strict=True):
-        verdict = score(
-            threebus, task.instance, results.schedule(task.key, threebus, task.instance), task.regime
-        )
+        schedule = results.schedule(row, threebus, task.instance)
+        verdict = score(threebus, task.instance, schedule, task.regime)
         assert row.objective == pytest.approx(verdict.objective, rel=1e-12)
         assert row.feasible is True
         assert row.status == "Feasible"
@@ -76,7 +76,7 @@ def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_pat
 
 
 def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp_path: Path) -> None:
-    """A limited answer is not taken for an unlimited one; model, policy and code are named."""
+    """A limited answer is another row than an unlimited one; model, policy, commit and version are named."""
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     linear_model(threebus).save(model_file(elsewhere, "koopman"))
     settings = Settings(search=(folder, elsewhere))
@@ -88,14 +88,13 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     results = Results(folder)
     free = run(threebus, tasks(settings), results)
     (limited,) = run(threebus, tasks(dataclasses.replace(settings, time_limit_s=100.0))[:1], results)
-    assert limited.key == free[0].key
+    assert limited.key == free[0].key._replace(time_limit_s=100.0)
     assert limited.fingerprint != free[0].fingerprint
-    assert (free[0].time_limit_s, limited.time_limit_s) == (None, 100.0)
-    assert unfinished(tasks(settings), results) == (tasks(settings)[:1], [])  # the limited one does not count
+    assert unfinished(tasks(settings), results) == ([], [])
+    assert len(results.rows) == 3
     assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
-    assert limited.policy == ""
-    assert limited.code == code_of("ded_bench.methods.ded_ko_knots")
-    assert limited.score_code == code_of("ded_bench.plants.score")
+    assert (limited.policy, limited.plant) == ("", "lossless")
+    assert (limited.commit, limited.method_version) == (commit(), METHODS["ded-ko-knots"].version)
     path = model_file(elsewhere, "koopman")
     assert fallbacks(tasks(settings), folder) == [
         f"ded-ko-knots {regime}: model {limited.model} from {path}" for regime in ("NO", "TO")
@@ -104,13 +103,17 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     assert fallbacks(tasks(dataclasses.replace(settings, model=str(path))), folder) == []
 
 
-def test_other_code_makes_no_row_invalid(strange, make, threebus: Case, tmp_path: Path) -> None:
+def test_a_row_of_an_older_version_is_made_anew(strange, make, threebus: Case, tmp_path: Path) -> None:
+    """Other code without a new version makes no row invalid."""
     results = Results(tmp_path / "out")
     rows = run(threebus, make("calm-1"), results)
-    results.add([dataclasses.replace(row, code="0" * 12, score_code="1" * 12) for row in rows])
+    results.add([dataclasses.replace(row, commit="0000000", version="0.0.1") for row in rows])
     run(threebus, make("calm-1"), results)
-    assert {row.code for row in results.rows.values()} == {"0" * 12}
     assert calls(strange) == {"calm-1": 2}
+    results.add([dataclasses.replace(row, method_version=row.method_version - 1) for row in rows])
+    again = run(threebus, make("calm-1"), results)
+    assert calls(strange) == {"calm-1": 4}
+    assert {row.method_version for row in again} == {row.method_version for row in rows}
 
 
 def test_a_run_leaves_one_line_per_row_even_if_interrupted(
@@ -207,16 +210,18 @@ def test_without_a_time_limit_nothing_is_killed(
     assert row.status == "Feasible"
 
 
-def test_a_failure_takes_the_schedule_of_an_older_model_away(
+def test_a_failure_takes_an_earlier_schedule_away(
     strange, make, threebus: Case, constant, tmp_path: Path
 ) -> None:
-    """Else the schedule would be taken for the failed row's own."""
+    """Else it would be taken for the failed row's own."""
     results = Results(tmp_path / "out")
     (task,) = make("raise", regimes=["NO"])
     power = task.instance.p_initial(threebus)
-    constant(task.instance, power).write(results.schedule_path(task.key), threebus.generators)
-    run(threebus, [task], results)
-    assert not results.schedule_path(task.key).exists()
+    earlier = unscored_row(task, Solution(Status.FEASIBLE), 1, "", "here")
+    earlier = dataclasses.replace(earlier, method_version=0)
+    results.keep(earlier, constant(task.instance, power), threebus)
+    (row,) = run(threebus, [task], results)
+    assert not results.has_schedule(row)
     assert not Results(results.folder).solved(task.key, task.fingerprint)
 
 
@@ -226,5 +231,5 @@ def test_wrong_choices_name_the_known_ones(threebus: Case, quiet_instance) -> No
         make_tasks(threebus, instances, ["magic"], ["NO"], Settings())
     with pytest.raises(InputError, match="unknown regime"):
         make_tasks(threebus, instances, ["ded"], ["XX"], Settings())
-    with pytest.raises(InputError, match=r"magic: unknown to method ded \(known: default"):
-        make_tasks(threebus, instances, ["ded"], ["NO"], Settings(name="magic"))
+    with pytest.raises(InputError, match=r"magic: no such option"):
+        make_tasks(threebus, instances, ["ded"], ["NO"], Settings("magic=1"))

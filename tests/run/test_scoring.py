@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.code import code_of
 from ded_bench.run.pool import Workers
-from ded_bench.results.rows import Results, Row
-from ded_bench.run.scoring import rescore, score_unscored, scored_row
+from ded_bench.results.rows import VALIDATED, Results, Row
+from ded_bench.run.scoring import rescore, save_scores, scored_row, unscored, validate
 from ded_bench.plants.score import score
 
 
@@ -33,9 +31,8 @@ def results(threebus: Case, instances: dict[str, Instance], tmp_path: Path) -> R
         power = instance.p_initial(threebus)
         schedule = Schedule(np.array([0.0, 0.2]), np.array([power, power + 0.001 * i]))
         row = Row(name, "test", "TO", "ded", "default", "Optimal", case="threebus", fingerprint="f")
-        results.add([scored_row(row, score(threebus, instance, schedule, "TO"))])
-        if name != "d":
-            schedule.write(results.schedule_path(row.key), threebus.generators)
+        row = scored_row(row, score(threebus, instance, schedule, "TO"))
+        results.keep(row, schedule if name != "d" else None, threebus)
     return results
 
 
@@ -86,9 +83,10 @@ def test_rounding_is_no_difference(threebus: Case, instances, results) -> None:
 
 
 def test_a_schedule_that_is_damaged_or_another_is_a_difference(threebus: Case, instances, results) -> None:
-    results.schedule_path(row_of(results, "a").key).write_bytes(b"no schedule")
-    path = results.schedule_path(row_of(results, "c").key)
-    path.write_bytes(gzip.compress(b"t,P_plant\n0,0.6\n0.2,0.7\n"))
+    a, c = row_of(results, "a"), row_of(results, "c")
+    (results.archive(a).path.with_suffix("") / f"{a.member}.npy").write_bytes(b"no schedule")
+    other = Schedule(np.array([0.0, 0.2]), np.array([[0.6], [0.7]]))
+    results.archive(c).write(c.member, other, threebus)
     check = rescore(threebus, instances, results)
     assert len([line for line in check.differences if " TO a: scoring failed" in line]) == 1
     assert {line.split(": ")[0] for line in check.differences} == {"ded default TO a", "ded default TO c"}
@@ -97,14 +95,13 @@ def test_a_schedule_that_is_damaged_or_another_is_a_difference(threebus: Case, i
 def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Results) -> None:
     rescore(threebus, instances, results, update=True)
     right = dict(results.rows)
-    old = dataclasses.replace(row_of(results, "b"), objective=1.0, score_code="0" * 12)
-    unscored = dataclasses.replace(row_of(results, "c"), objective=None, feasible=None, score_code="")
-    results.add([old, unscored])
+    old = dataclasses.replace(row_of(results, "b"), objective=1.0)
+    empty = dataclasses.replace(row_of(results, "c"), objective=None, feasible=None)
+    results.add([old, empty])
     assert rescore(threebus, instances, results).unscored == 1
     check = rescore(threebus, instances, results, update=True)
     assert [line.split(":")[0] for line in check.differences] == ["ded default TO b"]
     assert Results(results.folder).rows == right
-    assert row_of(results, "b").score_code == code_of("ded_bench.plants.score")
     assert len(results.path.read_text().splitlines()) == 5
 
 
@@ -116,12 +113,23 @@ def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> Non
 def test_what_an_interruption_left_is_scored_later(threebus: Case, instances, results) -> None:
     """Also where the solver has something to say; rows without a schedule stay as they are."""
     before = row_of(results, "a"), row_of(results, "d")
-    empty = dict(objective=None, feasible=None, feasible_strict=None, score_code="", error="stopped early")
+    empty = dict(objective=None, feasible=None, feasible_strict=None, error="stopped early")
     results.add([dataclasses.replace(row, status="Feasible", **empty) for row in before])
     with Workers() as pool:
-        rows = score_unscored(threebus, instances, results, pool)
-        assert score_unscored(threebus, instances, results, pool) == ()
+        rows = save_scores(threebus, unscored(results), instances, results, pool)
+    assert unscored(results) == []
     assert [row.instance for row in rows] == ["a"]
     assert rows[0].objective == before[0].objective
     assert rows[0].error == "stopped early"
     assert row_of(results, "d").objective is None
+
+
+def test_other_plants_have_a_table_of_their_own(threebus: Case, instances, results) -> None:
+    """One line per row and plant, as often as one asks; the rows stay as they are."""
+    before = results.path.read_bytes()
+    for _ in range(2):
+        rows = validate(threebus, instances, results, "lossless")
+        assert [row.key for row in rows] == [(row_of(results, name).key, "lossless") for name in "abc"]
+        assert [row.objective for row in rows] == [row_of(results, name).objective for name in "abc"]
+        assert VALIDATED.read(results.paths.validated) == rows
+    assert results.path.read_bytes() == before

@@ -1,8 +1,8 @@
 """What would it be worth to know ramps better? `ded-ko-knots` on 9bus with other announcements.
 
-    python examples/better_announcements.py --notice 0,1.5,3
+    python studies/better_announcements.py --notice 0,1.5,3
     ded-bench scenarios --seed 4242 --out drawn
-    python examples/better_announcements.py --wait 0,0.5,1,2 --scenario drawn/*.json
+    python studies/better_announcements.py --wait 0,0.5,1,2 --scenario drawn/*.json
 
 With a notice, start and rate of every ramp are known as they are some seconds before it begins, announced
 or not. With a wait, no plan expects a ramp that has not begun sooner than some seconds from now, so that one
@@ -56,7 +56,7 @@ class Announcements:
 
 def operate(case: Case, scenario: Scenario, options: loop.LoopOptions) -> Judgement:
     """Judge what the controller makes of a scenario."""
-    settings = Settings("receding", search=search_folders(case))
+    settings = Settings("receding=on,margin=0.0625", search=search_folders(case))
     outcome = loop.run_loop(case, scenario, Planner(case, REGIME, METHOD, settings), options)
     return judge_operation(case, scenario, outcome.trajectory, REGIME)
 

@@ -27,5 +27,5 @@ class NoFirstPlan:
 
 def prepare(case, regime, settings):
     """`ded-ko-knots` with knots that keep their places."""
-    chosen = Settings("receding", search=search_folders(case))
+    chosen = Settings("receding=on,margin=0.0625", search=search_folders(case))
     return NoFirstPlan(case, get_method("ded-ko-knots").prepare(case, regime, chosen))

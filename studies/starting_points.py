@@ -8,8 +8,9 @@ import sys
 
 import numpy as np
 import pandas as pd
+import pyomo.environ as pyo
 
-from ded_bench import Case, Instance, Schedule, Settings, load_instances, simulate, solve
+from ded_bench import Case, Instance, Schedule, Settings, Trajectory, load_instances, simulate, solve
 from ded_bench.methods import ded, ed
 from ded_bench.solvers.compile import compile_model
 
@@ -21,6 +22,22 @@ def random_schedule(case: Case, instance: Instance) -> Schedule:
         case.p_min, case.p_max, size=(round(instance.horizon_s / 5.0), len(case.generators))
     )
     return ed.follow_set_points(case, instance, targets, 5.0)
+
+
+def set_start(model: pyo.ConcreteModel, case: Case, path: Trajectory) -> None:
+    """Make the model's initial point what a schedule does on the grid; fixed values stay."""
+    theta = path.columns
+    for k, t in enumerate(model.t):
+        values = [(model.angle[b, t], theta[f"theta_{b}"][k]) for b in model.algebraic]
+        values.append((model.p_slack_up[t], max(path.p_slack[k], 0.0)))
+        values.append((model.p_slack_down[t], max(-path.p_slack[k], 0.0)))
+        if k:
+            for j, g in enumerate(case.generators):
+                values.append((model.theta[g, t], theta[f"theta_{g}"][k]))
+                values.append((model.omega[g, t], path.omega[k, j]))
+                values.append((model.p_gen[g, t], path.p_gen[k, j]))
+        for variable, value in values:
+            variable.set_value(float(value), skip_validation=True)
 
 
 def main(count: int) -> None:
@@ -41,8 +58,7 @@ def main(count: int) -> None:
             for name, schedule in starts.items():
                 ded.set_instance(model, case, instance, regime)
                 if schedule is not None:
-                    path = simulate(instance, schedule, case)
-                    ded.set_start(model, case, path.theta, path.omega, path.p_gen, path.p_slack)
+                    set_start(model, case, simulate(instance, schedule, case))
                 outcome = compiled.solve(None)
                 rows.append((regime, name, instance.id, outcome.objective, outcome.iterations))
     table = pd.DataFrame(rows, columns=["regime", "start", "instance", "objective", "iterations"])

@@ -5,9 +5,9 @@ more if nobody follows, and faster than the bound even if all generators do, fro
 has them. Each goes from 20 s before the ramp to 12 s after it, and starts at rest under the static dispatch.
 
     ded-bench scenarios --case two-area --seed 77 --count 60 --out drawn
-    python unannounced_ramps.py drawn stretches
-    ded-bench online --case two-area --regime TO --scenario stretches/*.json --method ded-ko-knots \
-      --settings real-time,reserve --model trajectory --period 0.1 --latency 0.05
+    python studies/unannounced_ramps.py drawn stretches
+    ded-bench online --case two-area --regime TO --scenario stretches/*.json \
+      --method ded-rti --set reserve=on --period 0.1 --latency 0.05
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The committed reference runs: kept schedules score as their rows say, and rows are found again by solving."""
+"""The committed reference runs: kept schedules score as rows say, and rows are found again by solving."""
 
 from __future__ import annotations
 

@@ -151,11 +151,11 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
-    from ded_bench.plants.plant import DEFAULT_PLANT, SimulationError, plant_of
+    from ded_bench.plants.plant import SimulationError, plant_of
     from ded_bench.plants.score import score
 
     try:
-        verdict = score(case, instance, schedule, regime, plant_of(case, a.plant or DEFAULT_PLANT))
+        verdict = score(case, instance, schedule, regime, plant_of(case, a.plant))
     except SimulationError as error:
         print(f"ded-bench: {a.schedule}: {error}", file=sys.stderr)
         return 1

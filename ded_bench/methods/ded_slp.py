@@ -1,6 +1,6 @@
 """DED by linear programs along simulated trajectories, on the case's knots.
 
-A schedule is simulated on the true DAE; the linear program around its trajectory (see `knot_program`)
+A schedule is simulated on the case's plant; the linear program around its trajectory (see `knot_program`)
 gives the next schedule; and so on until a simulated schedule meets the frequency bound strictly and
 costs what its program said. So what is claimed is what the scorer finds: no discretisation error, no
 surrogate. It takes one to three programs, since the linear models differ only by the second order
@@ -10,19 +10,19 @@ of what one schedule changes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from ded_bench.methods import ed
-from ded_bench.methods.knot_program import KnotProgram, Limit, solve_with_rows_added
-from ded_bench.methods.knots import is_reachable, knot_points
+from ded_bench.methods.first_schedules import first_schedules
+from ded_bench.methods.knot_program import KnotProgram, Limit
+from ded_bench.methods.knots import case_knots, is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.slp_accuracy import ACCEPTED, COST_TOLERANCE, MARGIN, OPEN, REFINEMENT
+from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.plant import SimulationError, plant_of
+from ded_bench.methods.step_rules import FullSteps, StepRule, TrustRegion
+from ded_bench.plants.plant import plant_of
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
@@ -33,45 +33,33 @@ from ded_bench.solvers.status import Status
 
 #: Raised when answers change.
 VERSION = 1
-#: Trajectories, and halvings of a step that the system cannot follow.
-MAX_ROUNDS, MAX_HALVINGS = 15, 6
+#: Programs keep this much below the bound, and may leave half of it open between the points that have
+#: rows: the rest absorbs the model's error of the last program. A schedule is accepted if its simulation
+#: exceeds the bound by at most half of what strict feasibility allows (1e-6 Hz). Costs are 1e-6 higher.
+MARGIN = 2 * np.pi * 1e-6
+OPEN = ACCEPTED = 2 * np.pi * 5e-7
+#: Around a trajectory that exceeds the bound, rows are added until this part of its excess is left: the
+#: model's error is no smaller, and another trajectory is cheaper than another program. Around the first one
+#: a single program is solved, unless it comes from an earlier solution.
+REFINEMENT = 0.01
+#: Agreement of a simulated schedule's cost with its program's, as a fraction.
+COST_TOLERANCE = 1e-6
+#: Step rules by option.
+FULL, REGION = "full", "trust-region"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Where schedules bend."""
+    """Where schedules bend, and how far a program may go."""
 
     knot_s: float | None = option(None, "distance of knots, s; none: the case's knots", lowest=1e-3)
+    steps: str = option(FULL, "full, or within a radius that shrinks", choices=(FULL, REGION))
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """Return a solver of single instances, which may start from an earlier solution."""
     case.check_regimes([regime])
-    options = read_options(Options, settings.options)
-    return SlpSolver(case, regime, settings.time_limit_s, options.knot_s)
-
-
-class Sequence(Protocol):
-    """One instance's sequence of trajectories and programs."""
-
-    iterations: int  # of all programs
-    claimed: float  # cost that the last program predicts
-    version: str  # of the solver
-    message: str
-
-    def run(self, start: Schedule, is_near: bool) -> tuple[Status, Schedule | None]:
-        """Go on until a simulated schedule confirms its program.
-
-        Args:
-            start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
-            is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
-        """
-        ...
-
-
-#: Makes a sequence of: case, instance, bound (rad/s), grid points of the knots, deadline (on the clock of
-#: `time.perf_counter`), and whether an infeasible instance has a schedule, too.
-Start = Callable[[Case, Instance, float, Indices, float, bool], Sequence]
+    return SlpSolver(case, regime, read_options(Options, settings.options), settings.time_limit_s)
 
 
 @dataclass(frozen=True)
@@ -80,9 +68,8 @@ class SlpSolver:
 
     case: Case
     regime: str
+    options: Options = Options()
     time_limit_s: float | None = None
-    knot_interval_s: float | None = None  # None: the case's knots
-    sequence: Start | None = None  # None: on the lossless network
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve from the static dispatch of every second."""
@@ -95,127 +82,120 @@ class SlpSolver:
             instance: what to solve.
             last: its schedule, if it has one, is where to start; its time is the instance's.
         """
-        return self._solution(instance, last, soft=True)
+        return self._solution(instance, last.schedule if last is not None else None, soft=True)
 
-    def _solution(self, instance: Instance, last: Solution | None, soft: bool) -> Solution:
+    def _solution(self, instance: Instance, near: Schedule | None, soft: bool) -> Solution:
         started = time.perf_counter()
-        limit = np.inf if self.time_limit_s is None else self.time_limit_s
-        near = last.schedule if last is not None else None
-        start = ed.dispatch(self.case, instance, 1.0) if near is None else near
+        deadline = started + (np.inf if self.time_limit_s is None else self.time_limit_s)
         points = self._knots(instance)
         bound = self.case.omega_bound(self.regime)
-        make = self.sequence or _Sequence
-        sequence = make(self.case, instance, bound, points, started + limit, soft)
-        status, schedule = sequence.run(start, is_near=near is not None)
+        parts = _OnPlant(self.case, instance, bound, points, deadline, soft, near is not None)
+        if is_reachable(self.case, instance, points):
+            start = ed.dispatch(self.case, instance, 1.0) if near is None else near
+            end = parts.run(start, self.options.steps)
+        else:
+            end = End(Status.INFEASIBLE, None, None, 0, "")
+        status, schedule = parts.verdict(end)
+        claimed = end.answer.prediction if end.answer is not None else None
+        is_given = schedule is not None and status != Status.INFEASIBLE
         return Solution(
             status=status,
             schedule=schedule,
-            iterations=sequence.iterations,
+            iterations=end.iterations,
             build_s=0.0,
             setup_s=0.0,
             solve_s=time.perf_counter() - started,
-            solver_objective=sequence.claimed if status == Status.OPTIMAL else None,
-            solver_version=sequence.version,
-            error=_reason(status, schedule, sequence.message),
+            solver_objective=claimed.objective if claimed and status == Status.OPTIMAL else None,
+            solver_version=end.answer.version if end.answer is not None else "",
+            error="" if is_given else end.message if status == Status.FAILED else status.sentence,
         )
 
     def _knots(self, instance: Instance) -> Indices:
         """Grid points of the knots."""
-        times = self.case.knot_times(instance.horizon_s)
-        if self.knot_interval_s is not None:
-            times = np.linspace(0.0, instance.horizon_s, round(instance.horizon_s / self.knot_interval_s) + 1)
-        return knot_points(times, instance.dt_s)
+        if self.options.knot_s is None:
+            return case_knots(self.case, instance)
+        count = round(instance.horizon_s / self.options.knot_s) + 1
+        return knot_points(np.linspace(0.0, instance.horizon_s, count), instance.dt_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A schedule and what it leads to."""
+
+    at: Array  # powers at the knots, (n_knots, n_gen), pu
+    trajectory: Trajectory
+    cost: float
+    excess: float  # of |ω| over the bound, rad/s
+
+    @property
+    def over(self) -> float:
+        """Excess beyond what is accepted, rad/s; none is zero."""
+        return max(self.excess - ACCEPTED, 0.0)
 
 
 @dataclass
-class _Sequence:
-    """One instance's sequence of trajectories and programs."""
+class _OnPlant:
+    """The parts of one instance's sequence."""
 
     case: Case
     instance: Instance
     bound: float  # rad/s
     points: Indices
     deadline: float  # on the clock of `time.perf_counter`
-    soft: bool = False  # an infeasible instance has a schedule, too: that of least excess
+    soft: bool  # an infeasible instance has a schedule, too: that of least excess
+    is_near: bool  # the first schedule is thought to be near the optimum: its limits get rows at once
     limits: set[Limit] = field(default_factory=set)
-    iterations: int = 0
-    claimed: float = np.inf  # cost that the last program predicts
-    version: str = ""
-    message: str = ""
-    _cheapest: float = np.inf
-    _best: Schedule | None = None  # cheapest strictly feasible schedule simulated
+    best: Simulated | None = None  # the cheapest strictly feasible one
 
-    def run(self, start: Schedule, is_near: bool) -> tuple[Status, Schedule | None]:
-        """Go on until a simulated schedule confirms its program.
+    def run(self, start: Schedule, steps: str) -> End[Simulated, Attempt]:
+        """Go on until a simulated schedule confirms its program; P_0 replaces the start's first power."""
+        wanted = start.at(self.instance.grid[self.points])
+        wanted[0] = self.instance.p_initial(self.case)
+        rule: StepRule = FullSteps() if steps == FULL else TrustRegion(self.bound, self._over)
 
-        Args:
-            start: the first schedule to simulate; its power at t = 0 is replaced by P_0.
-            is_near: it is thought to be near the optimum: the limits that it comes near get rows at once.
-        """
-        if not is_reachable(self.case, self.instance, self.points):
-            return Status.INFEASIBLE, None
-        p_gen = start.at(self.instance.grid[self.points])
-        p_gen[0] = self.instance.p_initial(self.case)
-        p_before, infeasible = p_gen, 0
-        for number in range(MAX_ROUNDS):
-            if time.perf_counter() > self.deadline:
-                return Status.TIME_LIMIT, self._best
-            try:
-                p_gen, trajectory = self._follow(p_before, p_gen)
-            except SimulationError as error:
-                self.message = str(error)
-                break
-            schedule = Schedule(t=trajectory.t[self.points], p=p_gen)
-            excess = float(np.abs(trajectory.omega[1:]).max()) - self.bound
-            if excess <= ACCEPTED and self._confirmed(trajectory, schedule):
-                return Status.OPTIMAL, schedule
-            model = plant_of(self.case).linearise_along(trajectory, self.points)
-            program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
-            if is_near:
-                self.limits |= program.near(trajectory.omega)
-            enough = np.inf if number == 0 and not is_near else max(OPEN, REFINEMENT * excess)
-            attempt = solve_with_rows_added(
-                program, self.limits, OPEN, enough, self.deadline, by_interval=self.soft
-            )
-            self.iterations += attempt.iterations
-            self.version, self.message, prediction = attempt.version, attempt.message, attempt.prediction
-            if prediction is None:
-                return attempt.status, self._best
-            infeasible = infeasible + 1 if attempt.status == Status.INFEASIBLE else 0
-            if infeasible == 2:
-                nearest = Schedule(t=schedule.t, p=prediction.p_gen)
-                return Status.INFEASIBLE, nearest if self.soft else None
-            p_before, p_gen, self.claimed = p_gen, prediction.p_gen, prediction.objective
-        else:
-            self.message = f"no convergence in {MAX_ROUNDS} trajectories"
-        return (Status.FAILED if self._best is None else Status.FEASIBLE), self._best
+        def solve(around: Simulated, number: int) -> Attempt:
+            return self._solve(around, number, rule.radius)
 
-    def _follow(self, p_before: Array, p_gen: Array) -> tuple[Array, Trajectory]:
-        """Simulate, closer to the powers before if the system cannot follow.
+        first = first_schedules(self.case, self.instance, wanted, self.points)
+        return sequence(Parts(self._follow, solve, rule, self._is_confirmed), first, self.deadline)
 
-        Raises:
-            SimulationError: not even then.
-        """
-        for _ in range(MAX_HALVINGS):
-            try:
-                schedule = Schedule(t=self.instance.grid[self.points], p=p_gen)
-                return p_gen, simulate(self.case, self.instance, schedule)
-            except SimulationError:
-                p_gen = (p_before + p_gen) / 2
-        raise SimulationError("the system cannot follow any schedule on the way to the program's")
+    def verdict(self, end: End[Simulated, Attempt]) -> tuple[Status, Schedule | None]:
+        """What to claim at the end: the confirmed schedule, the best one, or that of least excess."""
+        if end.status == Status.OPTIMAL and end.followed is not None:
+            return end.status, self._schedule(end.followed.at)
+        if end.status == Status.INFEASIBLE:
+            nearest = end.answer.wanted if self.soft and end.answer is not None else None
+            return end.status, None if nearest is None else self._schedule(nearest)
+        best = None if self.best is None else self._schedule(self.best.at)
+        return (Status.FEASIBLE if best and end.status == Status.FAILED else end.status), best
 
-    def _confirmed(self, trajectory: Trajectory, schedule: Schedule) -> bool:
-        """Whether a schedule that meets the bound costs what its program said; keeps the best one."""
-        instance = self.instance
-        generation = float((trajectory.p_gen @ instance.cost_gen(self.case)).sum())
-        cost = generation + instance.cost_slack(self.case) * float(np.abs(trajectory.p_slack).sum())
-        if cost < self._cheapest:
-            self._cheapest, self._best = cost, schedule
-        return abs(cost - self.claimed) <= COST_TOLERANCE * abs(cost)
+    def _schedule(self, p_gen: Array) -> Schedule:
+        return Schedule(t=self.instance.grid[self.points], p=p_gen)
 
+    def _follow(self, p_gen: Array) -> Simulated:
+        trajectory = simulate(self.case, self.instance, self._schedule(p_gen))
+        cost = trajectory.cost(self.instance.cost_gen(self.case), self.instance.cost_slack(self.case))
+        found = Simulated(p_gen, trajectory, cost, self._excess(trajectory.omega))
+        if found.excess <= ACCEPTED and (self.best is None or cost < self.best.cost):
+            self.best = found
+        return found
 
-def _reason(status: Status, schedule: Schedule | None, message: str) -> str:
-    """Why there is no schedule that meets every limit; nothing if there is one."""
-    if status == Status.FAILED:
-        return message
-    return status.sentence if schedule is None or status == Status.INFEASIBLE else ""
+    def _solve(self, around: Simulated, number: int, radius: float) -> Attempt:
+        model = plant_of(self.case).linearise_along(around.trajectory, self.points)
+        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model, radius)
+        if self.is_near:
+            self.limits |= program.near(around.trajectory.omega)
+        enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
+        return solve_with_rows_added(program, self.limits, Rows(OPEN, enough, self.soft), self.deadline)
+
+    def _is_confirmed(self, found: Simulated, attempt: Attempt) -> bool:
+        """Whether a schedule meets the bound and costs what its program said."""
+        claimed = attempt.prediction.objective if attempt.prediction is not None else np.inf
+        return found.excess <= ACCEPTED and abs(found.cost - claimed) <= COST_TOLERANCE * abs(found.cost)
+
+    def _excess(self, omega: Array) -> float:
+        """After t_0: x_0 is given, wherever it lies."""
+        return float(np.abs(omega[1:]).max()) - self.bound
+
+    def _over(self, omega: Array) -> float:
+        return max(self._excess(omega) - ACCEPTED, 0.0)

@@ -15,11 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from ded_bench.methods.slp import Parts, sequence
+from ded_bench.methods.step_rules import FullSteps
 from ded_bench.plants.lossless.network import Network, PowerFlowError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.outcome import Outcome
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
@@ -34,8 +37,21 @@ MAX_PROGRAMS = 10
 class Injections:
     """f at generators and slack along a trajectory, with derivatives for the generators' angles."""
 
+    at: Array  # the generators' angles, (n, n_gen), rad
     f: Array  # (n, n_gen + 1), pu; the slack last
     slope: Array  # (n, n_gen + 1, n_gen), pu/rad
+
+    def predicted(self, theta: Array) -> Array:
+        """f at other angles, linearly."""
+        return np.asarray(self.f + np.einsum("nij,nj->ni", self.slope, theta - self.at))
+
+
+@dataclass(frozen=True, eq=False)
+class EulerAnswer(FormAnswer):
+    """The answer of the program around a trajectory."""
+
+    along: Injections
+    wanted: Array  # the generators' angles, (n, n_gen), rad
 
 
 def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injections:
@@ -58,7 +74,7 @@ def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injec
     rows = np.append(gen, network.slack)
     moved = np.linalg.solve(full[:, alg[:, None], alg], full[:, alg[:, None], gen])
     slope = full[:, rows[:, None], gen] - full[:, rows[:, None], alg] @ moved
-    return Injections(network.injections(theta)[:, rows], slope)
+    return Injections(theta_gen, network.injections(theta)[:, rows], slope)
 
 
 class EulerPrograms:
@@ -113,44 +129,45 @@ class EulerPrograms:
             does not converge, which says nothing about the instance.
         """
         started = time.perf_counter()
-        case, network = self._case, self._network
-        load = instance.p_load(case)
+        network, load = self._network, instance.p_load(self._case)
         initial = network.initial_angles(instance)[network.generators]
-        theta, iterations, message = np.tile(initial, (len(load), 1)), 0, "no convergence"
-        status, schedule, objective = Status.FAILED, None, None
-        version = ""
-        try:
-            along = injections_along(network, theta, load)
-            for _ in range(MAX_PROGRAMS):
-                if time_limit_s is not None and time.perf_counter() - started > time_limit_s:
-                    status, message = Status.TIME_LIMIT, "the time limit passed between two programs"
-                    break
-                found = solve_form(self._program(instance, theta, along))
-                iterations, version, message = iterations + found.iterations, found.version, found.message
-                if found.status != Status.OPTIMAL:
-                    break
-                moved = np.vstack([initial, found.x[self._theta]])
-                predicted = along.f + np.einsum("nij,nj->ni", along.slope, moved - theta)
-                theta, along = moved, injections_along(network, moved, load)
-                if np.abs(along.f - predicted).max() < TOLERANCE:
-                    power = np.vstack([instance.p_initial(case), found.x[self._p_gen]])
-                    status, schedule = Status.OPTIMAL, Schedule(t=instance.grid, p=power)
-                    cost = power @ instance.cost_gen(case) + instance.cost_slack(case) * np.abs(
-                        along.f[:, -1]
-                    )
-                    objective = float(cost.sum())
-                    break
-                message = "no convergence"
-        except PowerFlowError as error:
-            message = str(error)
+
+        def follow(theta: Array) -> Injections:
+            try:
+                return injections_along(network, theta, load)
+            except PowerFlowError as error:
+                raise SimulationError(str(error)) from None
+
+        def solve(along: Injections, _: int) -> EulerAnswer:
+            found = solve_form(self._program(instance, along))
+            theta = np.vstack([initial, found.x[self._theta]])
+            said = found.status, found.x, found.iterations, found.version, found.message
+            return EulerAnswer(*said, along, theta)
+
+        def is_met(now: Injections, answer: EulerAnswer) -> bool:
+            return bool(np.abs(now.f - answer.along.predicted(now.at)).max() < TOLERANCE)
+
+        rule = FullSteps(most_programs=MAX_PROGRAMS, tries=1)
+        deadline = started + (np.inf if time_limit_s is None else time_limit_s)
+        still = np.tile(initial, (len(load), 1))
+        end = sequence(Parts(follow, solve, rule, is_met), [still], deadline)
+        schedule, objective = None, None
+        if end.status == Status.OPTIMAL and end.answer and end.followed:
+            power = np.vstack([instance.p_initial(self._case), end.answer.x[self._p_gen]])
+            schedule = Schedule(t=instance.grid, p=power)
+            p_slack = np.abs(end.followed.f[:, -1])
+            cost = power @ instance.cost_gen(self._case) + instance.cost_slack(self._case) * p_slack
+            objective = float(cost.sum())
+        version = end.answer.version if end.answer else ""
         elapsed = time.perf_counter() - started
-        has_values = schedule is not None
-        outcome = Outcome(status, has_values, iterations, 0.0, elapsed, objective, version, message)
+        outcome = Outcome(
+            end.status, schedule is not None, end.iterations, 0.0, elapsed, objective, version, end.message
+        )
         return outcome, schedule
 
-    def _program(self, instance: Instance, theta: Array, along: Injections) -> FreeForm:
-        """The linear program around a trajectory of angles, shape (n, n_gen)."""
-        case, dt, n_gen = self._case, self._dt, len(self._case.generators)
+    def _program(self, instance: Instance, along: Injections) -> FreeForm:
+        """The linear program around a trajectory of angles."""
+        case, dt, n_gen, theta = self._case, self._dt, len(self._case.generators), along.at
         values = np.concatenate([self._constant, (along.slope[1:] * self._sign[:, None]).ravel()])
         equal = sp.csc_matrix((values, (self._rows, self._columns)), shape=self._shape)
         offset = np.einsum("nij,nj->ni", along.slope[1:], theta[1:]) - along.f[1:]

@@ -1,6 +1,7 @@
 """The linear program over schedules linear between knots, on a linear model along a trajectory.
 
-`ded-slp` solves it along one trajectory after another, `ded-ko` and `ded-ko-knots` once on a surrogate.
+`ded-slp` solves it along one trajectory after another, `ded-ko`, `ded-ko-knots` and `ded-rti` once on a
+surrogate.
 
 Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over
 every piece p of a few grid points, so that every row is local to one interval between knots:
@@ -9,24 +10,25 @@ every piece p of a few grid points, so that every row is local to one interval b
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
     limits on P, on its ramps, and on ω at the knots and at chosen points between them
 
-Few of the limits between knots bind: they get rows as solutions ask for them (`solve_with_rows_added`).
+Where the plant delivers other powers than its set-points, what is delivered is paid. Few of the limits
+between knots bind: they get rows as solutions ask for them (`slp.solve_with_rows_added`).
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits
+from ded_bench.methods.reserve import Reserve
 from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.highs import solve_form as solve_by_highs
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, moved_columns
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 
@@ -36,13 +38,15 @@ ROUND_OFF = 1e-13
 #: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
 SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
 LONG = 20
-#: What widening the limits of |ω| by 1 rad/s costs in a relaxed program, in sums of all columns' costs. Where
-#: PIQP stalls within a radius the next is tried. Chosen on validation draws (39bus on AC).
-WIDENING_PRICES = 100.0, 10.0, 1.0
+#: What widening the limits of |ω| by 1 rad/s costs, in sums of all columns' costs: where they are widened as
+#: little as possible, and where a program prices every excess from the start: an exact penalty above nearly
+#: all multipliers of the limits.
+LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
+#: Of programs with priced excess: relative duality gap, and residuals, that are small enough; regularisation.
+#: All chosen on validation draws.
+GAP, RESIDUAL, REGULARISATION = 1e-3, 1e-5, 1e-9
 #: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
 NEAR, PARTS = 0.9, 8
-#: Programs on one linear model.
-MAX_PROGRAMS = 15
 
 #: (generator, grid point) of a limit of |ω| between knots.
 Limit = tuple[int, int]
@@ -63,19 +67,28 @@ class Prediction:
 class KnotProgram:
     """The program around one trajectory. P_0 and x_0 are given: the first knot has no columns.
 
-    Columns of an interval, one after another: s of its pieces, then u and x at its end.
+    Columns of an interval, one after another: s of its pieces, then u and x at its end. Where limits of |ω|
+    may be exceeded, how much follows, then what a reserve needs.
 
     Args:
         case: the grid.
         instance: costs and P_0.
         bound: limit of |ω|, rad/s.
         model: a linear model along a trajectory that starts at P_0.
+        radius: how far powers may differ from the trajectory's, pu.
+        reserve: that programs with priced excess keep, if any.
     """
 
-    def __init__(self, case: Case, instance: Instance, bound: float, model: TimeVarying) -> None:
-        self.model, self.bound = model, bound
-        #: How far powers may differ from the trajectory's, pu.
-        self.radius = np.inf
+    def __init__(
+        self,
+        case: Case,
+        instance: Instance,
+        bound: float,
+        model: TimeVarying,
+        radius: float = np.inf,
+        reserve: Reserve | None = None,
+    ) -> None:
+        self.model, self.bound, self._radius, self._reserve = model, bound, radius, reserve
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         self.pieces = piece_starts(model.points)
@@ -87,13 +100,13 @@ class KnotProgram:
         self._s = np.arange(len(self.pieces)) + at_end * owner
         power = (own + at_end * np.arange(self._n))[:, None]
         self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
-        self._speed = self._x[:, model.speed]
         self._n_columns = len(self.pieces) + at_end * self._n
         self._durations = model.lengths * instance.dt_s
         self._price = instance.cost_slack(case)
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._cost = self._columns_cost()
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
+        self._at_knots = self._knot_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with |ω| limited at all knots and at the points chosen.
@@ -102,15 +115,23 @@ class KnotProgram:
             limits: (generator, grid point) of the limits between knots, shape (n_limits, 2).
             time_limit_s: see `piqp.solve_form`.
         """
-        return self._answer(self._form(limits), time_limit_s)
+        form, model = self._unlimited(), self.model
+        rows, low, high = self._frequency_rows(limits), *self._room(limits[:, 1], limits[:, 0])
+        least, most = (room.reshape(self._n, -1) for room in self._room(model.points[1:]))
+        if isinstance(model.speed, slice):
+            speed = self._x[:, model.speed]
+            form.lower[speed], form.upper[speed] = least, most
+        else:
+            rows = sp.vstack([self._at_knots, rows])
+            low, high = np.append(least, low), np.append(most, high)
+        return self._answer(form.with_rows(rows, low, high), time_limit_s)
 
     def solve_relaxed(
         self, limits: Indices, time_limit_s: float, by_interval: bool = False
     ) -> tuple[FormAnswer, float]:
         """Solve with the limits of |ω| widened as little as possible; what PIQP does not solve HiGHS does.
 
-        The cost counts, but so little that the widening is the least one but for round-off. Within a radius
-        the cost may count more, and HiGHS is not asked: a smaller radius may follow.
+        The cost counts, but so little that the widening is the least one but for round-off.
 
         Args, but for those of `solve`:
             by_interval: every interval has a widening of its own, and their sum is the least; else all
@@ -119,23 +140,37 @@ class KnotProgram:
         Returns:
             The answer, and the largest widening in rad/s.
         """
-        started, is_free, iterations = time.perf_counter(), self.radius == np.inf, 0
-        for price in WIDENING_PRICES[:1] if is_free else WIDENING_PRICES:
-            form, order = self._relaxed_form(limits, by_interval, price)
-            answer = self._answer(form, time_limit_s - (time.perf_counter() - started))
-            iterations += answer.iterations
-            answer = replace(answer, iterations=iterations)
-            if answer.status != Status.FAILED:
-                break
-        if answer.status == Status.FAILED and is_free:
+        started = time.perf_counter()
+        form, place, widening = self._relaxed(limits, by_interval, LEAST_PRICE)
+        answer = self._answer(form, time_limit_s)
+        if answer.status == Status.FAILED:
             other = solve_by_highs(form, max(time_limit_s - (time.perf_counter() - started), 0.0))
             version = f"{answer.version}, {other.version}"
             answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
         if answer.status != Status.OPTIMAL:
             return answer, np.inf
-        x = np.empty(len(order))
-        x[order] = answer.x
-        return replace(answer, x=x[: self._n_columns]), float(x[self._n_columns :].max())
+        return replace(answer, x=answer.x[place]), float(answer.x[widening].max())
+
+    def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
+        """Solve with a priced excess of |ω| in every interval, and with the reserve; less exactly.
+
+        Args:
+            limits, time_limit_s: see `solve`.
+
+        Returns:
+            As `solve`; the objective is not that of the plan alone.
+        """
+        deadline = time.perf_counter() + time_limit_s
+        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
+        if self._reserve is not None:
+            form, moved = self._with_reserve(self._reserve, form, place, excess)
+            place = moved[place]
+        answer = solve_form(form, time_limit_s, True, REGULARISATION, GAP, RESIDUAL)
+        if answer.status == Status.FAILED:
+            answer = self._answer(form, deadline - time.perf_counter())
+        if answer.status == Status.FAILED:
+            answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
+        return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
 
     def near(self, omega: Array) -> set[Limit]:
         """Points between knots at which |ω| comes near the bound.
@@ -160,73 +195,6 @@ class KnotProgram:
         """Largest excess of |ω| over the bound after t_0: x_0 is given, wherever it lies; rad/s."""
         return float(np.abs(omega[1:]).max()) - self.bound
 
-    def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        deadline, iterations = time.perf_counter() + time_limit_s, 0
-        n_stages = len(self.model.lengths)
-        is_short = n_stages == len(self.model.omega) - 1 and self._n_columns < LONG * n_stages
-        for staged, regularisation in SPARSE if is_short else DENSE:
-            answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
-            iterations += answer.iterations
-            stalled = answer.status == Status.FAILED and "INFEASIBLE" not in answer.message
-            if not stalled or time.perf_counter() > deadline:
-                break
-        return replace(answer, iterations=iterations)
-
-    def _relaxed_form(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices]:
-        """The program with columns for widenings, and where its columns stand among the program's own."""
-        form = self._form(limits)
-        n, speed = self._n_columns, self._speed.ravel()
-        one = np.ones(speed.size)
-        at_knots = sp.csc_matrix((one, (np.arange(speed.size), speed)), (speed.size, n))
-        kept = form.between.shape[0] - len(limits)
-        omega = sp.csc_matrix(sp.vstack([at_knots, form.between[kept:]]))
-        low, high = (
-            np.append(a[speed], b[kept:]) for a, b in ((form.lower, form.low), (form.upper, form.high))
-        )
-        between = np.searchsorted(self.model.points, limits[:, 1]) - 1
-        owner = np.append(np.repeat(np.arange(self._n), self._n_gen), between)
-        # A widening stands after the column of this number, in its own stage.
-        stage = self._x[:, -1] if by_interval else np.array([n])
-        place = np.arange(len(owner)), owner if by_interval else np.zeros_like(owner)
-        widening = sp.csc_matrix((np.ones(len(owner)), place), (len(owner), len(stage)))
-        below, none = np.full(len(low), -np.inf), np.zeros(len(stage))
-        lower, upper = np.append(form.lower, none), np.append(form.upper, none + np.inf)
-        lower[speed], upper[speed] = -np.inf, np.inf
-        rows: Any = [[form.between[:kept], None], [omega, -widening], [-omega, -widening]]
-        equal = sp.hstack([form.equal, sp.csc_matrix((form.equal.shape[0], len(stage)))])
-        order = np.argsort(np.append(np.arange(n), stage + 0.5))
-        relaxed = FreeForm(
-            cost=np.append(form.cost, none + price * max(form.cost.sum(), 1.0))[order],
-            equal=sp.csc_matrix(equal)[:, order],
-            right=form.right,
-            between=sp.csc_matrix(sp.bmat(rows))[:, order],
-            low=np.concatenate([form.low[:kept], below, below]),
-            high=np.concatenate([form.high[:kept], high, -low]),
-            lower=lower[order],
-            upper=upper[order],
-        )
-        return relaxed, order
-
-    def _form(self, limits: Indices) -> FreeForm:
-        model = self.model
-        ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
-        slack = np.add.reduceat(model.p_slack, self.pieces)
-        omega = model.omega[limits[:, 1], limits[:, 0]]
-        lower, upper = self._column_limits()
-        rows = [self._ramp_rows(), self._slack, self._frequency_rows(limits)]
-        return FreeForm(
-            cost=self._cost,
-            equal=self._dynamics,
-            right=np.zeros(self._x.size),
-            between=sp.csc_matrix(sp.vstack(rows)),
-            low=np.concatenate(
-                [(-self._case.ramp - ramp).ravel(), np.full(2 * len(slack), -np.inf), -self.bound - omega]
-            ),
-            high=np.concatenate([(self._case.ramp - ramp).ravel(), -slack, slack, self.bound - omega]),
-            lower=lower,
-            upper=upper,
-        )
-
     def predict(self, columns: Array) -> Prediction:
         """All grid points at a solution, shape (n_columns,)."""
         model = self.model
@@ -236,11 +204,81 @@ class KnotProgram:
         if model.delivered is None:
             generation = float((self._generation * p_gen).sum())
         else:
-            priced = [self._cost[part] @ columns[part] for part in (self._u.ravel(), self._x.ravel())]
-            generation = float(
-                (model.delivered.p_gen @ self._instance.cost_gen(self._case)).sum() + sum(priced)
-            )
+            paid = np.append(self._u, self._x)
+            along = model.delivered.p_gen @ self._instance.cost_gen(self._case)
+            generation = float(along.sum() + self._cost[paid] @ columns[paid])
         return Prediction(p_gen, omega, p_slack, generation + self._price * float(np.abs(p_slack).sum()))
+
+    def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
+        """PIQP's, by the next factorisation where one stalls."""
+        deadline, iterations = time.perf_counter() + time_limit_s, 0
+        is_short = self._n == len(self.model.omega) - 1 and self._n_columns < LONG * self._n
+        for staged, regularisation in SPARSE if is_short else DENSE:
+            answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
+            iterations += answer.iterations
+            stalled = answer.status == Status.FAILED and "INFEASIBLE" not in answer.message
+            if not stalled or time.perf_counter() > deadline:
+                break
+        return replace(answer, iterations=iterations)
+
+    def _unlimited(self) -> FreeForm:
+        """The program without limits of |ω|."""
+        case, model = self._case, self.model
+        ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
+        slack = np.add.reduceat(model.p_slack, self.pieces)
+        p_min, p_max = power_limits(case, self._instance, model.lengths)
+        lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
+        lower[self._s] = 0.0
+        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self._radius)
+        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self._radius)
+        return FreeForm(
+            cost=self._cost,
+            equal=self._dynamics,
+            right=np.zeros(self._x.size),
+            between=sp.csc_matrix(sp.vstack([self._ramp_rows(), self._slack])),
+            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack), -np.inf)]),
+            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack]),
+            lower=lower,
+            upper=upper,
+        )
+
+    def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
+        """The program with columns for widenings; where its own columns stand then, and these."""
+        form = self._unlimited()
+        own = np.append(np.repeat(np.arange(self._n), self._n_gen), self._interval_of(limits[:, 1]))
+        after = self._x[:, -1] if by_interval else np.array([self._n_columns - 1])
+        none = np.zeros(len(after))
+        form, place, new = form.with_columns(
+            after, none + price * max(self._cost.sum(), 1.0), none, none + np.inf
+        )
+        of_limit = new[own] if by_interval else np.full(len(own), new[0])
+        omega = sp.csc_matrix(sp.vstack([self._at_knots, self._frequency_rows(limits)]))
+        omega = moved_columns(omega, place, len(form.cost))
+        one = np.ones(len(own)), (np.arange(len(own)), of_limit)
+        widening = sp.csc_matrix(one, omega.shape)
+        ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])
+        low, high = (np.append(*pair) for pair in zip(*ends, strict=True))
+        below = np.full(len(own), -np.inf)
+        rows = sp.vstack([omega - widening, -omega - widening])
+        return form.with_rows(rows, np.append(below, below), np.append(high, -low)), place, new
+
+    def _with_reserve(
+        self, reserve: Reserve, form: FreeForm, place: Indices, excess: Indices
+    ) -> tuple[FreeForm, Indices]:
+        """A program with room to follow ramps at the next knots, and where its columns stand then."""
+        near = slice(0, int(np.searchsorted(self.model.points[1:], reserve.ahead_s / self._instance.dt_s)))
+        mean = float(np.mean(list(self._instance.cost.values())))
+        shortage = reserve.price * mean * knot_weights(self.model.lengths)[1:] / reserve.limit
+        power, p_gen = place[self._u][near], self.model.p_gen[1:][near]
+        return reserve.required(form, power, p_gen, excess[near], shortage[near])
+
+    def _room(self, points: Indices, generators: Indices | None = None) -> tuple[Array, Array]:
+        """How far δω may go down and up: at points of all generators, or at pairs of both; rad/s."""
+        omega = self.model.omega[points] if generators is None else self.model.omega[points, generators]
+        return (-self.bound - omega).ravel(), (self.bound - omega).ravel()
+
+    def _interval_of(self, points: Indices) -> Indices:
+        return np.searchsorted(self.model.points, points) - 1
 
     def _columns_cost(self) -> Array:
         """Cost of all columns: of what generators deliver, and of |P_s|."""
@@ -254,18 +292,6 @@ class KnotProgram:
         cost[self._u[:-1]] += rows.start[1:]
         cost[self._x[:-1]] = rows.x[1:]
         return cost
-
-    def _column_limits(self) -> tuple[Array, Array]:
-        """Limits of all columns: of s, P and, at the knots, ω."""
-        case, model = self._case, self.model
-        p_min, p_max = power_limits(case, self._instance, model.lengths)
-        omega = model.omega[model.points[1:]]
-        lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
-        lower[self._s] = 0.0
-        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self.radius)
-        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self.radius)
-        lower[self._speed], upper[self._speed] = -self.bound - omega, self.bound - omega
-        return lower, upper
 
     def _dynamics_rows(self) -> sp.csc_matrix:
         across = self.model.across
@@ -295,6 +321,14 @@ class KnotProgram:
         blocks += [(p[:, None], self._s[:, None], -one) for p in (place, place + n)]
         return self._matrix(2 * n, blocks)
 
+    def _knot_rows(self) -> sp.csc_matrix:
+        """δω of all generators at all knots but the first; a knot belongs to the interval after it."""
+        row, speed = np.arange(self._u.size).reshape(self._n, -1), self.model.speed
+        if isinstance(speed, slice):
+            one = np.broadcast_to(np.eye(self._n_gen), (self._n, self._n_gen, self._n_gen))
+            return self._matrix(row.size, [(row, self._x[:, speed], one)])
+        return self._matrix(row.size, [(row, self._x, np.concatenate([speed[1:], speed[-1:]]))])
+
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
         rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])
         return self._matrix(len(limits), self._local(rows, np.arange(len(limits))))
@@ -316,58 +350,3 @@ class KnotProgram:
         kept = np.abs(values) > ROUND_OFF
         place = np.concatenate(rows)[kept], np.concatenate(columns)[kept]
         return sp.csc_matrix((values[kept], place), (n_rows, self._n_columns))
-
-
-@dataclass(frozen=True, eq=False)
-class Attempt:
-    """What solving a program with rows added came to.
-
-    Without a prediction the status says why. `Infeasible` comes with the schedule of least excess.
-    """
-
-    status: Status
-    prediction: Prediction | None
-    iterations: int
-    version: str
-    message: str
-
-
-def solve_with_rows_added(
-    program: KnotProgram,
-    limits: set[Limit],
-    tolerance: float,
-    enough: float,
-    deadline: float,
-    by_interval: bool = False,
-) -> Attempt:
-    """Solve, look at all grid points, limit |ω| where it comes near the bound, and again.
-
-    Args:
-        program: what to solve.
-        limits: limits between knots to begin with; those found to be needed are added to it.
-        tolerance: excess of |ω| that needs no row, or makes nothing infeasible, rad/s.
-        enough: excess of |ω| with which to stop, rad/s; no less than the tolerance.
-        deadline: on the clock of `time.perf_counter`.
-        by_interval: what least excess means, see `solve_relaxed`; then rows are added for it, too.
-    """
-    iterations, infeasible = 0, False
-    for _ in range(MAX_PROGRAMS):
-        rows, widening = np.array(sorted(limits), dtype=int).reshape(-1, 2), 0.0
-        if not infeasible:
-            answer = program.solve(rows, deadline - time.perf_counter())
-            iterations += answer.iterations
-        if infeasible or answer.status == Status.FAILED:  # there is no solution, or PIQP finds none
-            left = deadline - time.perf_counter()
-            answer, widening = program.solve_relaxed(rows, left, by_interval)
-            iterations += answer.iterations
-        if answer.status != Status.OPTIMAL:
-            return Attempt(answer.status, None, iterations, answer.version, answer.message)
-        prediction = program.predict(answer.x)
-        excess, added = program.excess(prediction.omega), program.near(prediction.omega) - limits
-        limits |= added if excess > tolerance else set()
-        infeasible = infeasible or widening > tolerance
-        is_done = not by_interval if infeasible else excess <= enough
-        if is_done or not added:
-            break
-    status = Status.INFEASIBLE if infeasible else Status.OPTIMAL
-    return Attempt(status, prediction, iterations, answer.version, answer.message)

@@ -7,8 +7,8 @@ load's, stay within their limits, and leave every machine a steady speed within 
 
     |K (δ - T λ)| <= limit + e,    p_min <= P + τ δ <= p_max,    |δ| <= ramp,    e >= 0
 
-with K the compliance S⁻¹ and T the loads' shares (`Network.linearise`) at the nominal point, λ the load's
-ramp and τ its duration. The shortage e has a price.
+with K the compliance S⁻¹ and T the loads' shares (`Network.linearise`) at the nominal point of the lossless
+network, λ the load's ramp and τ its duration. The shortage e has a price.
 """
 
 from __future__ import annotations
@@ -23,6 +23,14 @@ from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
 
+#: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to
+#: twice its steady speed. This and the price were chosen on scenarios drawn for it (docs/online.md).
+LIMIT = 0.5
+#: What a shortage as large as that costs, in pu of generation at the mean cost of all machines.
+PRICE = 1.0
+#: Knots so far ahead keep reserve, s: plans are made anew long before.
+AHEAD_S = 20.0
+
 
 @dataclass(frozen=True, eq=False)
 class Reserve:
@@ -33,6 +41,8 @@ class Reserve:
     compliance: Array  # K, (n_gen, n_gen), rad/pu
     limit: float  # rad/s
     duration_s: float  # τ
+    price: float = PRICE
+    ahead_s: float = AHEAD_S
 
     @staticmethod
     def of(case: Case, limit: float) -> Reserve:
@@ -63,45 +73,37 @@ class Reserve:
             price: of a shortage of 1 rad/s at each knot, (n_knots,).
 
         Returns:
-            The program, and of each of its columns the number in `form`; new ones have the numbers after.
+            The program, and where the columns of `form` stand in it.
         """
-        (n_knots, n_gen), n_ramps, n_old = power.shape, len(self.speeds), len(form.cost)
-        count = n_knots * n_ramps
-        new = n_old + np.arange(count * (n_gen + 1)).reshape(count, n_gen + 1)
-        response, shortage, total = new[:, :-1], new[:, -1:], n_old + new.size
+        (n_knots, n_gen), n_ramps = power.shape, len(self.speeds)
+        count, ramp = n_knots * n_ramps, self.case.ramp
+        cost = np.zeros((count, n_gen + 1))
+        cost[:, -1] = np.repeat(price, n_ramps)
+        form, place, new = form.with_columns(
+            np.repeat(after, n_ramps * (n_gen + 1)),
+            cost.ravel(),
+            np.tile(np.append(-ramp, 0.0), count),
+            np.tile(np.append(ramp, np.inf), count),
+        )
+        response, shortage = np.split(new.reshape(count, n_gen + 1), [n_gen], axis=1)
 
         def rows(columns: Indices, values: Array) -> sp.csc_matrix:
             """One row for each response and generator; columns and values are (count, n_gen, any)."""
-            place = np.broadcast_to(np.arange(count * n_gen).reshape(count, n_gen, 1), columns.shape)
+            row = np.broadcast_to(np.arange(count * n_gen).reshape(count, n_gen, 1), columns.shape)
             entries = np.broadcast_to(values, columns.shape).ravel()
-            return sp.csc_matrix((entries, (place.ravel(), columns.ravel())), (count * n_gen, total))
+            return sp.csc_matrix((entries, (row.ravel(), columns.ravel())), (count * n_gen, len(form.cost)))
 
         every = (count, n_gen, n_gen)
         speed = rows(np.broadcast_to(response[:, None, :], every), self.compliance)
         short = rows(np.broadcast_to(shortage[:, :, None], (count, n_gen, 1)), np.ones(1))
-        at_knot = np.repeat(power, n_ramps, axis=0)
+        at_knot = np.repeat(place[power], n_ramps, axis=0)
         room = rows(np.stack([at_knot, response], axis=2), np.array([1.0, self.duration_s]))
         alone = np.tile(self.speeds, (n_knots, 1)).ravel()
         planned = np.repeat(p_gen, n_ramps, axis=0)
         free = np.full(alone.shape, np.inf)
-        ramp, zero = self.case.ramp, np.zeros(new.size)
-        cost = np.append(form.cost, zero)
-        cost[shortage[:, 0]] = np.repeat(price, n_ramps)
-        lower = np.append(form.lower, np.tile(np.append(-ramp, 0.0), count))
-        upper = np.append(form.upper, np.tile(np.append(ramp, np.inf), count))
-        place = np.append(np.arange(n_old), np.repeat(after, n_ramps * (n_gen + 1)) + 0.5)
-        order = np.argsort(place, kind="stable")
-        equal, kept = (
-            sp.hstack([part, sp.csc_matrix((part.shape[0], new.size))]) for part in (form.equal, form.between)
+        wider = form.with_rows(
+            sp.vstack([speed - short, speed + short, room]),
+            np.concatenate([-free, -self.limit - alone, (self.case.p_min - planned).ravel()]),
+            np.concatenate([self.limit - alone, free, (self.case.p_max - planned).ravel()]),
         )
-        between = sp.csc_matrix(sp.vstack([kept, speed - short, speed + short, room]))
-        return FreeForm(
-            cost=cost[order],
-            equal=sp.csc_matrix(equal)[:, order],
-            right=form.right,
-            between=between[:, order],
-            low=np.concatenate([form.low, -free, -self.limit - alone, (self.case.p_min - planned).ravel()]),
-            high=np.concatenate([form.high, self.limit - alone, free, (self.case.p_max - planned).ravel()]),
-            lower=lower[order],
-            upper=upper[order],
-        ), order
+        return wider, place

@@ -1,4 +1,4 @@
-"""One instance's linear program on a surrogate, for any knots: what `ded-ko` and `ded-ko-knots` share.
+"""One instance's linear program on a surrogate: what `ded-ko`, `ded-ko-knots` and `ded-rti` share.
 
 What it claims is what the surrogate says: no answer is simulated.
 """
@@ -6,16 +6,17 @@ What it claims is what the surrogate says: no answer is simulated.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods import ed
-from ded_bench.methods.first_schedules import first_schedules
-from ded_bench.methods.knot_program import KnotProgram, solve_with_rows_added
+from ded_bench.methods.first_schedules import corrected, first_schedules, slow_dispatch
+from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import is_reachable
+from ded_bench.methods.reserve import Reserve
+from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
-from ded_bench.plants.plant import SimulationError
+from ded_bench.methods.step_rules import FullSteps
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -26,11 +27,24 @@ from ded_bench.surrogates.instance_model import model_along
 
 #: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7
-#: The surrogate's model is taken along the static dispatch, followed at this part of the ramp limits: as fast
-#: as they allow, frequency swings tens of times farther than a tight bound lets it, and the linear model's
-#: error grows with the square of the distance (two-area, TO, validation draws: 0.48 mHz at 1, 0.06 at 0.3,
-#: 0.03 at 0.2 and 0.1, 0.05 at 0.05).
-PACE = 0.2
+#: With priced excess: excess that is left open, as a part of the bound.
+SOFT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A plan to correct, by a program whose excess of |ω| has a price."""
+
+    last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
+    reserve: Reserve | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Along:
+    """A surrogate's model along powers at the knots."""
+
+    at: Array
+    model: TimeVarying
 
 
 def solve_on_surrogate(
@@ -41,97 +55,66 @@ def solve_on_surrogate(
     points: Indices,
     time_limit_s: float | None = None,
     soft: bool = False,
+    plan: Plan | None = None,
 ) -> Solution:
     """Solve one instance on a surrogate: the best schedule that is linear between knots.
 
-    The surrogate's model is taken along the static dispatch of every second, followed slowly, or along what
-    the network can carry instead; rows of the frequency bound are added to one program until all grid
-    points keep it.
+    The surrogate's model is taken along the static dispatch of every second, followed slowly, or along a plan
+    in force, or along what the plant can carry instead; rows of the frequency bound are added to one program
+    until all grid points keep it.
 
     Args:
         case: the grid.
-        surrogate: what stands for the swing equations.
+        surrogate: what stands for the plant.
         instance: what to solve.
         regime: gives the bound of |ω|.
         points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
         time_limit_s: s.
         soft: `Infeasible` comes with the schedule of least frequency excess, summed over knot intervals.
+        plan: correct a plan instead; `Infeasible` comes with the schedule that the price makes cheapest.
     """
-
-    def along(p_gen: Array) -> TimeVarying:
-        return model_along(case, surrogate, instance, p_gen, points)
-
-    return solve_along(case, instance, regime, points, along, time_limit_s, soft)
-
-
-def solve_along(
-    case: Case,
-    instance: Instance,
-    regime: str,
-    points: Indices,
-    along: Callable[[Array], TimeVarying],
-    time_limit_s: float | None = None,
-    soft: bool = False,
-) -> Solution:
-    """`solve_on_surrogate` on any linear model.
-
-    Args:
-        case: the grid.
-        instance: what to solve.
-        regime: gives the bound of |ω|.
-        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
-        along: makes the model of this instance along powers at the knots, shape (n_knots, n_gen), pu;
-            SimulationError if the system cannot follow them.
-        time_limit_s: s.
-        soft: see `solve_on_surrogate`.
-    """
-    started = time.perf_counter()
+    started = built = time.perf_counter()
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
-    if not is_reachable(case, instance, points):
-        return _without(Status.INFEASIBLE, Status.INFEASIBLE.sentence, started)
-    dispatched, model = reference(case, instance, points), None
-    for p_gen in first_schedules(case, instance, dispatched, points):
-        try:
-            model = along(p_gen)
-            break
-        except SimulationError as error:
-            reason = str(error)
-    if model is None:
-        return _without(Status.FAILED, reason, started)
-    program = KnotProgram(case, instance, case.omega_bound(regime), model)
-    built = time.perf_counter()
-    attempt = solve_with_rows_added(
-        program, set(), OMEGA_TOLERANCE, OMEGA_TOLERANCE, deadline, by_interval=soft
-    )
-    schedule, objective, reason = None, None, ""
-    if attempt.prediction is not None and (soft or attempt.status == Status.OPTIMAL):
-        schedule = Schedule(instance.grid[points], attempt.prediction.p_gen)
-    if attempt.status == Status.OPTIMAL and attempt.prediction is not None:
-        objective = attempt.prediction.objective
+    bound = case.omega_bound(regime)
+    if plan is None:
+        rows = Rows(OMEGA_TOLERANCE, OMEGA_TOLERANCE, by_interval=soft)
     else:
-        reason = attempt.message if attempt.status == Status.FAILED else attempt.status.sentence
+        rows = Rows(SOFT_TOLERANCE * bound, SOFT_TOLERANCE * bound, soft=True)
+
+    def follow(p_gen: Array) -> _Along:
+        exact = plan is None
+        return _Along(p_gen, model_along(case, surrogate, instance, p_gen, points, exact))
+
+    def solve(along: _Along, _: int) -> Attempt:
+        nonlocal built
+        reserve = None if plan is None else plan.reserve
+        program = KnotProgram(case, instance, bound, along.model, reserve=reserve)
+        built = time.perf_counter()
+        is_near = plan is not None and plan.last is not None
+        limits = program.near(along.model.omega) if is_near else set()
+        return solve_with_rows_added(program, limits, rows, deadline)
+
+    if not is_reachable(case, instance, points):
+        status, reason, attempt = Status.INFEASIBLE, "", None
+    else:
+        if plan is None or plan.last is None:
+            wanted = slow_dispatch(case, instance, points)
+        else:
+            wanted = corrected(case, instance, plan.last, points)
+        first = first_schedules(case, instance, wanted, points)
+        end = sequence(Parts(follow, solve, FullSteps(), stop=None), first, np.inf)
+        status, reason, attempt = end.status, end.message, end.answer
+    prediction = attempt.prediction if attempt else None
+    is_optimal = status == Status.OPTIMAL
+    is_given = prediction is not None and (is_optimal or soft or plan is not None)
     return Solution(
-        status=attempt.status,
-        schedule=schedule,
-        iterations=attempt.iterations,
-        build_s=built - started,
+        status=status,
+        schedule=Schedule(instance.grid[points], prediction.p_gen) if prediction and is_given else None,
+        iterations=attempt.iterations if attempt else None,
+        build_s=(built if attempt else time.perf_counter()) - started,
         setup_s=0.0,
-        solve_s=time.perf_counter() - built,
-        solver_objective=objective,
-        solver_version=attempt.version,
-        error=reason,
+        solve_s=time.perf_counter() - built if attempt else 0.0,
+        solver_objective=prediction.objective if prediction and is_optimal else None,
+        solver_version=attempt.version if attempt else "",
+        error="" if is_optimal else reason if status == Status.FAILED else status.sentence,
     )
-
-
-def reference(case: Case, instance: Instance, points: Indices) -> Array:
-    """The static dispatch of every second, followed slowly: powers at the knots, (n_knots, n_gen), pu."""
-    p_gen = ed.dispatch(case, instance, 1.0).at(instance.grid[points])
-    reach = PACE * np.outer(np.diff(points) * instance.dt_s, case.ramp)
-    for j, most in enumerate(reach):
-        p_gen[j + 1] = p_gen[j] + np.clip(p_gen[j + 1] - p_gen[j], -most, most)
-    return p_gen
-
-
-def _without(status: Status, error: str, started: float) -> Solution:
-    """An answer found before there was a program."""
-    return Solution(status, build_s=time.perf_counter() - started, setup_s=0.0, solve_s=0.0, error=error)

@@ -102,18 +102,21 @@ class Plant(Protocol):
 
 #: Plants by name: `module:class`, called with the case.
 PLANTS: dict[str, str] = {"lossless": "ded_bench.plants.lossless.lossless_plant:LosslessPlant"}
-#: The plant of a case that names none.
-DEFAULT_PLANT = "lossless"
 
 
-@functools.lru_cache(maxsize=16)
-def plant_of(case: Case, name: str = DEFAULT_PLANT) -> Plant:
-    """The plant of a case, by its name in PLANTS.
+def plant_of(case: Case, name: str | None = None) -> Plant:
+    """The plant of a case, by its name in PLANTS; None: the case's own.
 
     Raises:
         InputError: there is no such plant, or the case lacks its data.
     """
+    name = name or case.plant_name
     check_plant(name)
+    return _made(case, name)
+
+
+@functools.lru_cache(maxsize=16)
+def _made(case: Case, name: str) -> Plant:
     module, _, kind = PLANTS[name].partition(":")
     plant: Plant = getattr(importlib.import_module(module), kind)(case)
     return plant

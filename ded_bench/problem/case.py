@@ -195,6 +195,11 @@ class Case(Fingerprinted, _Extended):
             raise InputError(name_or_path, "", f"no such case (shipped: {known})")
         return read_record(Case, path)
 
+    @property
+    def plant_name(self) -> str:
+        """Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`)."""
+        return "lossless"
+
     @functools.cached_property
     def slack(self) -> str:
         """Id of the slack bus."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.plant import Plant, plant_of
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.reference_run import default_results, search_folders
@@ -28,13 +29,13 @@ MODELS = (*TRAINED, "linear", TRAJECTORY)
 class AlongTrajectory:
     """The surrogate that is made anew for each instance: nothing of it is trained (see `instance_model`)."""
 
-    case: Case
+    plant: Plant
     kind: str = TRAJECTORY
 
     @property
     def fingerprint(self) -> str:
-        """Twelve hex digits that change with the case."""
-        return hashlib.sha256(f"{self.kind}|{self.case.fingerprint}".encode()).hexdigest()[:12]
+        """Twelve hex digits that change with the plant."""
+        return hashlib.sha256(f"{self.kind}|{self.plant.fingerprint}".encode()).hexdigest()[:12]
 
 
 #: A lifted model has one K for all instances and times; the other kind is made for each instance.
@@ -53,7 +54,7 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
         InputError: there is no such model yet (names the command that makes it), or its file is wrong.
     """
     if name == TRAJECTORY:
-        return AlongTrajectory(case)
+        return AlongTrajectory(plant_of(case))
     return find_model(case, name, search)
 
 

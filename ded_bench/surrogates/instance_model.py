@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import plant_of
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, repeated
 from ded_bench.problem.case import Array, Case
@@ -16,7 +15,7 @@ from ded_bench.surrogates.koopman import Koopman
 
 
 def model_along(
-    case: Case, surrogate: Surrogate, instance: Instance, p_gen: Array, points: Indices
+    case: Case, surrogate: Surrogate, instance: Instance, p_gen: Array, points: Indices, exact: bool = True
 ) -> TimeVarying:
     """The linear model of one instance by which a surrogate answers to schedules linear between knots.
 
@@ -28,6 +27,7 @@ def model_along(
         p_gen: powers at the knots, shape (n_knots, n_gen), pu; `ded-ko` and its like take the static
             dispatch of every second.
         points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+        exact: see `Plant.advance`.
 
     Raises:
         SimulationError: the system cannot follow these powers.
@@ -36,8 +36,8 @@ def model_along(
     if isinstance(surrogate, Koopman):
         surrogate.check_step(instance)
         return _lifted_along(case, surrogate, instance, p_gen, points)
-    schedule, plant = Schedule(t=instance.grid[points], p=p_gen), plant_of(case)
-    return plant.linearise_along(simulate(case, instance, schedule, plant), points)
+    schedule, plant = Schedule(t=instance.grid[points], p=p_gen), surrogate.plant
+    return plant.linearise_along(simulate(case, instance, schedule, plant, exact=exact), points)
 
 
 def _lifted_along(

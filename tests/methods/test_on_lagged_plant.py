@@ -1,0 +1,133 @@
+"""Methods that linearise, on a plant with other powers than its set-points and three states a machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knots import case_knots
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.slp import Rows, solve_with_rows_added
+from ded_bench.methods.solution import Settings
+from ded_bench.plants.plant import plant_of
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+from tests.lagged_plant import LAG_S, lagged, lagged_case
+from tests.methods.on_surrogates import short
+
+__all__ = ["lagged"]
+POINTS = np.array([0, 60, 121, 130, 205, 300])
+
+
+@pytest.fixture
+def slow(case: Case, lagged: None) -> Case:
+    return lagged_case(case)
+
+
+def test_the_case_names_its_plant(slow: Case, ninebus: Case) -> None:
+    plant = plant_of(slow)
+    assert plant.name == "lagged"
+    assert plant_of(slow, "lossless").name == plant_of(ninebus).name == "lossless"
+    assert plant.fingerprint != plant_of(slow, "lossless").fingerprint
+
+
+def test_delivered_powers_lag_behind_a_ramp(slow: Case, quiet_instance) -> None:
+    """A ramp of r is followed by r (t - T (1 - exp(-t / T)))."""
+    instance, rate = quiet_instance(slow, horizon_s=4.0), 0.01
+    ends = slow.p_nominal + rate * np.array([[0.0], [instance.horizon_s]])
+    run = simulate(slow, instance, Schedule(np.array([0.0, instance.horizon_s]), ends))
+    lagging = instance.grid - LAG_S * (1.0 - np.exp(-instance.grid / LAG_S))
+    expected = slow.p_nominal + rate * lagging[:, None] * np.ones(len(slow.generators))
+    np.testing.assert_allclose(run.p_gen, expected, atol=1e-12)
+
+
+def test_the_linearisation_has_the_derivatives_of_simulations(slow: Case) -> None:
+    """Central differences: of ω and P_s at all points, and of what is paid."""
+    instance = short(slow, 1)
+    plant, p_gen = plant_of(slow), slow_dispatch(slow, instance, POINTS)
+    along = simulate(slow, instance, Schedule(instance.grid[POINTS], p_gen))
+    model, prices = plant.linearise_along(along, POINTS), instance.cost_gen(slow)
+    change = np.random.default_rng(1).normal(size=p_gen.shape)
+    change[0] = 0.0
+    size = 1e-4
+    runs = [
+        simulate(slow, instance, Schedule(instance.grid[POINTS], p_gen + sign * size * change))
+        for sign in (1, -1)
+    ]
+
+    def slope(values: list[Array]) -> Array:
+        return (values[0] - values[1]) / (2 * size)
+
+    omega, p_slack = model.outputs(change)
+    wanted = slope([run.omega for run in runs])
+    # The linear model's stiffness is that of the middle of each interval.
+    np.testing.assert_allclose(omega - model.omega, wanted, atol=0.02 * np.abs(wanted).max())
+    wanted = slope([run.p_slack for run in runs])
+    np.testing.assert_allclose(p_slack - model.p_slack, wanted, atol=0.02 * np.abs(wanted).max())
+    paid, rows, x = (
+        slope([run.p_gen @ prices for run in runs]).sum(),
+        model.cost_rows(prices),
+        model.states(change),
+    )
+    told = (rows.x * x[:-1] + 0.0).sum() + (rows.start * change[:-1] + rows.end * change[1:]).sum()
+    assert told == pytest.approx(paid, rel=1e-8)
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_what_ded_slp_confirms_is_what_the_scorer_finds(slow: Case, regime: str) -> None:
+    """Strictly feasible on the lagged plant, at the cost of what is delivered, and not so on the other."""
+    instance = short(slow, 2)
+    solution = get_method("ded-slp").prepare(slow, regime, Settings())(instance)
+    assert solution.status == Status.OPTIMAL
+    found = score(slow, instance, solution.schedule, regime)
+    assert found.feasible_strict
+    assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)
+    other = score(slow, instance, solution.schedule, regime, plant_of(slow, "lossless"))
+    assert other.objective != pytest.approx(found.objective, rel=1e-6)
+
+
+def test_a_trust_region_finds_the_same_optimum(slow: Case) -> None:
+    instance = short(slow, 1)
+    full, region = (
+        get_method("ded-slp").prepare(slow, "TO", Settings(options))(instance)
+        for options in ("default", "steps=trust-region")
+    )
+    assert full.status == region.status == Status.OPTIMAL
+    assert region.solver_objective == pytest.approx(full.solver_objective, rel=2e-6)
+
+
+def test_real_time_iterations_keep_the_bound(slow: Case) -> None:
+    instance = short(slow, 0)
+    solution = get_method("ded-rti").prepare(slow, "TO", Settings())(instance)
+    assert solution.status == Status.FEASIBLE
+    found = score(slow, instance, solution.schedule, "TO")
+    assert found.freq_violation_hz < 0.05 * slow.regimes["TO"].omega_hz
+    assert solution.solver_objective == pytest.approx(found.objective, rel=1e-3)
+
+
+def test_speeds_may_be_given_as_matrices(case: Case) -> None:
+    """Limits at the knots are then rows: the same optimum as with bounds of columns."""
+    instance = sample_instance(case, 77, 1).model_copy(update={"horizon_s": 8.0})
+    points, plant, bound = case_knots(case, instance), plant_of(case), case.omega_bound("TO")
+    p_gen = slow_dispatch(case, instance, points)
+    model = plant.linearise_along(simulate(case, instance, Schedule(instance.grid[points], p_gen)), points)
+    n, n_gen = len(model.lengths), len(case.generators)
+    matrices = np.zeros((n, n_gen, model.slack.shape[1]))
+    matrices[:, :, model.speed] = np.eye(n_gen)
+    import dataclasses
+
+    by_rows = dataclasses.replace(model, speed=matrices)
+    for rows in (Rows(1e-6, 1e-6), Rows(1e-4, 1e-4, soft=True)):
+        found = [
+            solve_with_rows_added(KnotProgram(case, instance, bound, each), set(), rows, np.inf)
+            for each in (model, by_rows)
+        ]
+        assert [attempt.status for attempt in found] == 2 * [Status.OPTIMAL]
+        objectives = [attempt.prediction.objective for attempt in found]
+        assert objectives[1] == pytest.approx(objectives[0], rel=1e-3 if rows.soft else 1e-7)

@@ -10,9 +10,11 @@ import pandas as pd
 import pytest
 from scipy.stats import binom
 
+import tests.strange_methods
 from ded_bench.analysis import certificate
 from ded_bench.analysis.certificate import (
     ROWS,
+    Candidate,
     Criteria,
     certify,
     clopper_pearson,
@@ -20,16 +22,17 @@ from ded_bench.analysis.certificate import (
     hoeffding,
     judge,
     meets_limits,
+    read_certificates,
     read_rows,
+    save_certificate,
 )
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import METHODS, Method
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instance
-from ded_bench.plants.score import score
-
-SETTINGS = Settings()
+from ded_bench.problem.schedule import Schedule
 
 
 @pytest.mark.parametrize(("successes", "count"), [(1, 1), (7, 10), (995, 1000), (9950, 10_000)])
@@ -90,22 +93,29 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     certificate._prepared.cache_clear()
 
 
-def run(case: Case, file: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:
-    chosen = Criteria("ded", **criteria)
-    return certify(case, "ded-dpc-paper", regime, SETTINGS, file, chosen, count=4, seed=seed)
+def candidate(regime: str) -> Candidate:
+    return Candidate("ded-dpc-paper", regime, Settings(), reference="ded")
+
+
+def rows_of(case: Case, folder: Path, regime: str) -> list[certificate.CertificateRow]:
+    return read_rows(candidate(regime).rows_file(case, folder))
+
+
+def run(case: Case, folder: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:
+    return certify(case, candidate(regime), folder, Criteria(**criteria), count=4, seed=seed)
 
 
 def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case, tmp_path: Path) -> None:
     loose = max(threebus.regimes, key=threebus.omega_bound)
-    result = run(threebus, tmp_path / "rows.csv", loose)
-    rows = ROWS.frame(read_rows(tmp_path / "rows.csv"))
+    result = run(threebus, tmp_path, loose)
+    rows = ROWS.frame(rows_of(threebus, tmp_path, loose))
     assert rows["index"].tolist() == [0, 1, 2, 3]
     assert (rows["objective"] == rows["reference"]).all()  # the same schedules
     verdicts = []
     for i, objective in enumerate(rows["objective"]):
         instance = sample_instance(threebus, CERTIFICATE_SEED, i)
         power = instance.p_initial(threebus)
-        schedule = certificate.Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power]))
+        schedule = Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power]))
         verdicts.append(score(threebus, instance, schedule, loose))
         assert verdicts[-1].objective == pytest.approx(objective, rel=1e-9)
     assert result.meets_limits == result.successes == sum(v.feasible_strict for v in verdicts)
@@ -119,7 +129,7 @@ def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case,
 def test_an_interrupted_certificate_goes_on(
     calls, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, regime = tmp_path / "rows.csv", next(iter(threebus.regimes))
+    regime = next(iter(threebus.regimes))
     with monkeypatch.context() as patch:
 
         def stop(*call):
@@ -129,20 +139,28 @@ def test_an_interrupted_certificate_goes_on(
 
         patch.setattr(certificate, "judge", stop)
         with pytest.raises(KeyboardInterrupt):
-            run(threebus, file, regime)
-    assert len(read_rows(file)) == 2
-    first = run(threebus, file, regime)
+            run(threebus, tmp_path, regime)
+    assert len(rows_of(threebus, tmp_path, regime)) == 2
+    first = run(threebus, tmp_path, regime)
     assert set(calls().values()) == {2}  # once by each method: nothing was done twice
-    again = run(threebus, file, regime)
+    again = run(threebus, tmp_path, regime)
     assert again.model_copy(update={"date": first.date}) == first
     assert set(calls().values()) == {2}
-    run(threebus, file, regime, seed=1)  # other instances: rows of these do not count
+    run(threebus, tmp_path, regime, seed=1)  # other instances: rows of these do not count
     assert sum(calls().values()) == 16
     with monkeypatch.context() as patch:
-        patch.setattr(certificate, "code_of", lambda module: "another scorer")
-        again = run(threebus, file, regime, seed=1)
-    assert again.score_code == "another scorer"
-    assert sum(calls().values()) == 24  # rows of other code do not count either
+        patch.setattr(tests.strange_methods, "VERSION", 99)
+        run(threebus, tmp_path, regime, seed=1)
+    assert sum(calls().values()) == 24  # rows of another version do not count either
+
+
+def test_a_folder_keeps_one_of_each_model(calls, threebus: Case, tmp_path: Path) -> None:
+    first = run(threebus, tmp_path, next(iter(threebus.regimes)))
+    other = first.model_copy(update={"model": "trajectory@f00"})
+    newer = first.model_copy(update={"date": "2027-01-01T00:00:00Z"})
+    for one in (first, other, newer):
+        save_certificate(tmp_path, one)
+    assert read_certificates(tmp_path) == (other, newer)
 
 
 def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkeypatch) -> None:
@@ -155,16 +173,18 @@ def test_failures_are_no_successes(calls, threebus: Case, tmp_path: Path, monkey
             yield instance.model_copy(update={"id": f"{name}-{first}"})
 
     monkeypatch.setattr(certificate, "sample_instances", renamed)
-    result = run(threebus, tmp_path / "rows.csv", regime, tolerance_hz=1.0)
-    lost = [row.objective is None for row in read_rows(tmp_path / "rows.csv")]
+    result = run(threebus, tmp_path, regime, tolerance_hz=1.0)
+    lost = [row.objective is None for row in rows_of(threebus, tmp_path, regime)]
     assert lost == [True, True, False, False]
     assert result.successes == result.meets_limits == result.near_reference == 2
 
 
 def test_wrong_files_and_regimes_are_named(calls, threebus: Case, tmp_path: Path) -> None:
-    file = tmp_path / "rows.csv"
+    regime = next(iter(threebus.regimes))
+    file = candidate(regime).rows_file(threebus, tmp_path)
+    file.parent.mkdir()
     file.write_text("index,gap\n0,1.0\n")
-    with pytest.raises(InputError, match=r"rows\.csv"):
-        run(threebus, file, next(iter(threebus.regimes)))
+    with pytest.raises(InputError, match=r"TO\.csv|NO\.csv"):
+        run(threebus, tmp_path, regime)
     with pytest.raises(InputError, match="regime"):
-        run(threebus, tmp_path / "other.csv", "no such")
+        run(threebus, tmp_path, "no such")

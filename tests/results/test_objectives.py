@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.results import reference_run
 from ded_bench.problem.case import REPOSITORY, Case
+from ded_bench.results import reference_run
 from ded_bench.results.objectives import (
     OBJECTIVES,
     Objective,

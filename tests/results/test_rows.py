@@ -62,10 +62,15 @@ def test_schedules_are_packed_once_their_rows_are_there(threebus: Case, tmp_path
     results = Results(tmp_path)
     schedule = Schedule(np.array([0.0, 1.0]), np.array([[0.5], [0.5]]))
     rows = [ROW, dataclasses.replace(ROW, model="koopman@f00", fingerprint="g")]
-    with pytest.raises(KeyboardInterrupt), results.packed():
-        for row in rows:
-            results.keep(row, schedule, threebus)
-        raise KeyboardInterrupt
+
+    def interrupted() -> None:
+        with results.packed():
+            for row in rows:
+                results.keep(row, schedule, threebus)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     place = tmp_path / "schedules" / "ded" / "default"
     assert [path.name for path in place.iterdir()] == ["NO.npz"]
     with results.packed():

@@ -14,6 +14,19 @@ import pytest
 import torch
 
 from ded_bench.cli import main
+from ded_bench.files.errors import InputError
+from ded_bench.methods.artifact import Artifact
+from ded_bench.methods.options import option
+from ded_bench.methods.registry import METHODS, Method
+from ded_bench.methods.solution import Settings, Solution
+from ded_bench.plants import plant
+from ded_bench.problem.benchmark import validation_instances
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import Key, Results, Row
+from ded_bench.results.timing import TIMING, TimingRow, read_timing, timing_summary
 from ded_bench.run import bench as bench_module
 from ded_bench.run.bench import (
     ROUNDS,
@@ -26,24 +39,20 @@ from ded_bench.run.bench import (
     timed,
     timed_turn,
 )
-from ded_bench.results.timing import TIMING, TimingRow, read_timing, timing_summary
-from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.registry import METHODS, Method
-from ded_bench.methods.solution import Settings, Solution
-from ded_bench.problem.benchmark import validation_instances
-from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import sample_instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.run.pool import WorkerDiedError
-from ded_bench.results.rows import Key, Results, Row
 from ded_bench.solvers.status import Status
-from ded_bench.plants.lossless import servable
 
 ROW = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", build_s=0.5, solve_s=3.5, host="here")
 TO = Job("fake", "TO", Settings())
 BOTH = [Job("fake", "NO", Settings()), TO]
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """Options of the fake method."""
+
+    fast: bool = option(False, "quick and dirty")
+    reserve: float = option(0.0, "kept back in the closed loop", in_operation=True)
 
 
 class Inline:
@@ -67,7 +76,7 @@ class Inline:
 def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     """A registered method `fake` that answers with `module.times` in turn; its artifact can change."""
     module = types.ModuleType("fake_method")
-    module.SETTINGS = {"default": None, "other": None}
+    module.Options, module.VERSION = Choices, 4
     module.calls = []
     module.times = [0.5]
     module.artifact_name = "one"
@@ -90,7 +99,6 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
     monkeypatch.setattr(bench_module, "Workers", Inline)
-    monkeypatch.setattr(bench_module, "code_of_method", lambda method, settings, artifacts: "abc")
     bench_module._prepared.cache_clear()
     yield module
     bench_module._prepared.cache_clear()
@@ -133,7 +141,7 @@ def test_the_command_warms_up_on_what_the_power_flow_can_serve(tmp_path: Path, m
         drawn.extend(instances)
         return np.array([instance is not drawn[0] for instance in instances])
 
-    monkeypatch.setattr(servable, "servable", refuse_the_first)
+    monkeypatch.setattr(plant, "servable", refuse_the_first)
     monkeypatch.setattr(bench_module, "bench", lambda *_, warm_up, **__: warmed.append(warm_up) or [])
     row = Row("9bus-0001", "test", "TO", "ed", "default", "Feasible", objective=1.0, case="9bus")
     Results(tmp_path).add([row])
@@ -202,7 +210,7 @@ def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     assert np.isnan(row["setup_s"])  # the method does not tell: not available, not zero
     assert row["load_average"] >= 0
     assert 20 < row["peak_memory_mib"] < 10_000  # Python and NumPy alone take some
-    assert (row["policy"], row["model"], row["code"]) == ("fake@one", "", "abc")
+    assert (row["policy"], row["model"]) == ("fake@one", "")
     assert not len(timing_summary([]))
 
 
@@ -257,7 +265,8 @@ def test_what_is_timed_is_compared_with_what_is_kept(
 ) -> None:
     results = Results(tmp_path)
     kept = Schedule(np.array([0.0, instances[1].horizon_s]), np.array([[0.0], [0.25]]))
-    kept.write(results.schedule_path(Key(instances[1].id, "TO", "fake", "default")), threebus.generators)
+    key = Key(threebus.id, instances[1].id, "TO", "fake", "default", "", "fake@one")
+    results.keep(Row(split="none", status="Optimal", **key._asdict()), kept, threebus)
     rows = run([TO], results=results)
     assert [row.schedule_difference_pu for row in rows] == [None, None, 0.25, None]
     assert timing_summary(rows)["schedule_difference_pu"].to_list() == [0.25]
@@ -291,7 +300,7 @@ def test_a_run_of_some_methods_does_not_replace_one_of_more(fake, run, tmp_path:
     with pytest.raises(InputError, match="fake in NO"):
         run([TO])
     assert (tmp_path / "timing.csv").read_bytes() == before
-    run([*BOTH, Job("fake", "TO", Settings("other"))])  # more methods: all are timed anew
+    run([*BOTH, Job("fake", "TO", Settings("fast=on"))])  # more methods: all are timed anew
     assert len(timing_summary(read_timing(tmp_path / "timing.csv"))) == 3
 
 
@@ -311,7 +320,7 @@ def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "job", [("nope", "TO", "default"), ("fake", "XX", "default"), ("fake", "TO", "nope")]
+    "job", [("nope", "TO", "default"), ("fake", "XX", "default"), ("fake", "TO", "nope=1")]
 )
 def test_bad_input(fake, run, threebus, tmp_path, job) -> None:
     with pytest.raises(InputError):
@@ -372,19 +381,18 @@ def test_the_sample_is_spread_and_the_same_every_time(threebus: Case) -> None:
 def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
     """Settings and limits of the time come back from the rows; strangers and models from files do not."""
     rows = {
-        Key("a", "TO", "fake", "default"): 9.0,
-        Key("b", "TO", "fake", "default"): 20.0,
-        Key("b", "NO", "fake", "default"): None,
-        Key("c", "NO", "fake", "default"): 9.0,
-        Key("a", "TO", "fake", "other-linear"): None,
-        Key("a", "TO", "fake", "default-myfile"): None,
-        Key("a", "TO", "stranger", "default"): None,
+        Key("c", "a", "TO", "fake", "default", time_limit_s=9.0),
+        Key("c", "b", "TO", "fake", "default", time_limit_s=20.0),
+        Key("c", "b", "NO", "fake", "default"),
+        Key("c", "c", "NO", "fake", "default", time_limit_s=9.0),
+        Key("c", "a", "TO", "fake", "fast=on", "linear@f00"),
+        Key("c", "a", "TO", "fake", "fast=on,reserve=0.5", "linear@f00"),  # timed as without a reserve
+        Key("c", "a", "TO", "fake", "default", "myfile@f00"),
+        Key("c", "a", "TO", "stranger", "default"),
     }
-    made = {
-        key: Row(key.instance, "test", *key[1:], "Optimal", time_limit_s=limit) for key, limit in rows.items()
-    }
+    made = [Row(split="test", status="Optimal", **key._asdict()) for key in rows]
     assert runs_of(made, Settings(search=(tmp_path,))) == [
         Job("fake", "NO", Settings(search=(tmp_path,))),
         Job("fake", "TO", Settings(time_limit_s=20.0, search=(tmp_path,))),
-        Job("fake", "TO", Settings(name="other", model="linear", search=(tmp_path,))),
+        Job("fake", "TO", Settings("fast=on", "linear", search=(tmp_path,))),
     ]

@@ -10,19 +10,19 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.surrogates.linear import linear_model
-from ded_bench.surrogates.find import model_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
+from ded_bench.results.rows import ROWS, Results
 from ded_bench.run import runner
 from ded_bench.run.environment import commit
 from ded_bench.run.pool import ATTEMPTS
-from ded_bench.results.rows import ROWS, Results
 from ded_bench.run.runner import fallbacks, run, unfinished, unscored_row
 from ded_bench.run.tasks import Task, make_tasks
-from ded_bench.plants.score import score
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import model_file
+from ded_bench.surrogates.linear import linear_model
 from tests.strange_methods import STRANGE, solve_strange
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.pool import Workers
 from ded_bench.results.rows import VALIDATED, Results, Row
+from ded_bench.run.pool import Workers
 from ded_bench.run.scoring import rescore, save_scores, scored_row, unscored, validate
-from ded_bench.plants.score import score
 
 
 @pytest.fixture

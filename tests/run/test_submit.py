@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.score import score
 from ded_bench.problem.benchmark import Selection
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Results
 from ded_bench.run.submit import submit
-from ded_bench.plants.score import score
 
 
 @pytest.fixture

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.methods import ded_slp
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.run.online.hindsight import hindsight, whole_instance
-from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, follow, run_loop
-from ded_bench.run.online.planner import Plan, Planner
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario_sampling import sample_scenario
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.online.hindsight import hindsight, whole_instance
+from ded_bench.run.online.judgement import judge_operation
+from ded_bench.run.online.loop import LoopOptions, follow, run_loop
+from ded_bench.run.online.planner import Plan, Planner
 from ded_bench.solvers.status import Status
-from ded_bench.plants.lossless.servable import servable
-from ded_bench.plants.simulate import simulate
 from tests.conftest import CASE_FILES
 
 REGIME = "TO"

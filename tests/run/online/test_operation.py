@@ -8,16 +8,16 @@ import shutil
 
 import numpy as np
 import pytest
+from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.cli import main
-from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.methods.solution import Settings
-from ded_bench.run.online.loop import LoopOptions
-from ded_bench.results.online_results import OnlineResults, read_trajectory
-from ded_bench.run.online.operation import make_operations, operate
 from ded_bench.problem.scenario import load_scenarios
 from ded_bench.problem.scenario_sampling import scenario_files, write_scenarios
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.results.online_results import OnlineResults, read_trajectory
+from ded_bench.results.timing import TIMING, TimingRow
+from ded_bench.run.online.loop import LoopOptions
+from ded_bench.run.online.operation import make_operations, operate
 from tests.conftest import CASE_FILES
 
 #: What the clock and the day decide on.

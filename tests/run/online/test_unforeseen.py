@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ded_bench.plants.lossless.servable import servable
 
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Plan
-from ded_bench.run.online.record import Plant
-from ded_bench.run.online.unforeseen import unforeseen_hz
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioRamp
 from ded_bench.problem.scenario_sampling import sample_scenario
 from ded_bench.problem.schedule import Schedule
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.run.online.loop import LoopOptions, run_loop
+from ded_bench.run.online.planner import Plan
+from ded_bench.run.online.record import Plant
+from ded_bench.run.online.unforeseen import unforeseen_hz
 
 
 def surprising(case: Case, rate: float) -> Scenario:

@@ -25,7 +25,7 @@ from ded_bench.problem.state import State
 from ded_bench.problem.trajectory import Trajectory
 
 #: Time constant of the turbines, s.
-LAG_S = 2.0
+LAG_S = 0.3
 
 
 class LaggedCase(Case):

@@ -26,10 +26,9 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.reference_run import reference_run, search_folders
+from ded_bench.results.reference_run import default_results, reference_run, search_folders
 from ded_bench.run.pool import Workers
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.find import default_results
 
 if TYPE_CHECKING:
     from ded_bench.results.rows import Results

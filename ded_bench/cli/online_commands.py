@@ -25,8 +25,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.scenario import load_scenarios
 from ded_bench.problem.scenario_sampling import scenario_files, scenario_folder
-from ded_bench.results.reference_run import search_folders
-from ded_bench.surrogates.find import default_results
+from ded_bench.results.reference_run import default_results, search_folders
 
 if TYPE_CHECKING:
     from ded_bench.results.online_results import OnlineRow

@@ -27,8 +27,8 @@ from ded_bench.methods.registry import trainable
 from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.benchmark import problem_folder, select_split
 from ded_bench.problem.case import Case
-from ded_bench.results.reference_run import search_folders
-from ded_bench.surrogates.find import TRAINED, default_results
+from ded_bench.results.reference_run import default_results, search_folders
+from ded_bench.surrogates.find import TRAINED
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,8 +26,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
-from ded_bench.solvers.outcome import Compiled
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Compiled, Status
 
 #: Raised when answers change.
 VERSION = 1

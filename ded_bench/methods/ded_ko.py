@@ -26,8 +26,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix, reset
 from ded_bench.solvers.ipopt import LINEAR_OPTIONS
-from ded_bench.solvers.outcome import Compiled
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Compiled, Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 

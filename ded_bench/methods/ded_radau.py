@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.collocation import POINTS
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.radau_program import RadauProgram
+from ded_bench.methods.radau_program import POINTS, RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case

@@ -23,9 +23,8 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm
-from ded_bench.solvers.outcome import Outcome
 from ded_bench.solvers.piqp import solve_form
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Outcome, Status
 
 #: Mismatch of the nonlinear equations that ends the sequence, pu: IPOPT's tolerance for the same ones.
 TOLERANCE = 1e-8

@@ -12,8 +12,7 @@ from pathlib import Path
 from ded_bench.methods.options import DEFAULT
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.outcome import Outcome
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Outcome, Status
 
 #: What the program of one worker may take, bytes.
 MAX_BYTES = 4 * 2**30

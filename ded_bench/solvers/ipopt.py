@@ -22,8 +22,7 @@ from pyomo.repn.plugins.nl_writer import NLWriter
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array
 from ded_bench.solvers.linear_program import LinearProgram, assign, bounds, read_linear
-from ded_bench.solvers.outcome import Options, Outcome
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Options, Outcome, Status
 
 #: IPOPT's return values as CasADi spells them; everything else is a failure.
 _IPOPT_STATUS = {

@@ -1,20 +1,14 @@
-"""PIQP: a proximal interior-point method, here for linear programs, as Pyomo models or as arrays."""
+"""PIQP: a proximal interior-point method, here on linear programs given by their arrays."""
 
 from __future__ import annotations
 
-import dataclasses
-import importlib
 import time
-from types import ModuleType
 
 import numpy as np
-import pyomo.environ as pyo
+import piqp
 import scipy.sparse as sp
 
-from ded_bench.files.errors import InputError
-from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, read_linear
-from ded_bench.solvers.outcome import Options, Outcome
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.status import Status
 
 #: The programs of this suite take 15 to 60 iterations.
@@ -23,53 +17,6 @@ MAX_ITERATIONS = 150
 GAP = 1e-7
 #: What keeps factors of singular matrices finite: PIQP's own value.
 REGULARISATION = 1e-10
-
-
-class Piqp:
-    """PIQP on a linear Pyomo model; what it does not solve, IPOPT decides.
-
-    Raises:
-        InputError: the package `piqp` is not installed, or options are given: it takes none.
-    """
-
-    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
-        if options:
-            raise InputError("piqp", ", ".join(options), "takes no options")
-        started = time.perf_counter()
-        _piqp()
-        self._program = read_linear(model)
-        self._fallback: CasadiIpopt | None = None
-        self._setup_s = time.perf_counter() - started
-
-    def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """See `Compiled`."""
-        started = time.perf_counter()
-        numbers = self._program.numbers()
-        form = self._program.free_form(numbers)
-        setup = self._setup_s + time.perf_counter() - started
-        self._setup_s = 0.0  # paid once, by the first solve
-        started = time.perf_counter()
-        answer = solve_form(form, np.inf if time_limit_s is None else time_limit_s)
-        elapsed = time.perf_counter() - started
-        said = (answer.iterations, setup, elapsed)
-        if answer.status == Status.OPTIMAL:
-            values = np.array(numbers.lower)
-            values[numbers.free] = answer.x
-            assign(self._program.columns, values)
-            objective = self._program.objective(numbers, values)
-            return Outcome(Status.OPTIMAL, True, *said, objective, answer.version, answer.message)
-        if answer.status == Status.TIME_LIMIT:
-            return Outcome(Status.TIME_LIMIT, False, *said, None, answer.version, answer.message)
-        rest = None if time_limit_s is None else max(time_limit_s - elapsed, 1e-3)  # IPOPT wants some
-        self._fallback = self._fallback or CasadiIpopt(self._program, LINEAR_OPTIONS)
-        verdict = self._fallback.solve(rest)
-        return dataclasses.replace(
-            verdict,
-            setup_s=setup + verdict.setup_s,
-            solve_s=elapsed + verdict.solve_s,
-            version=f"{answer.version}, {verdict.version}",
-            message=f"{answer.message}, {verdict.message}",
-        )
 
 
 def solve_form(
@@ -97,12 +44,8 @@ def solve_form(
 
     Returns:
         `Optimal`, `TimeLimit` or `Failed`: what is infeasible and what is hard PIQP does not tell apart well.
-
-    Raises:
-        InputError: the package `piqp` is not installed.
     """
     started = time.perf_counter()
-    piqp = _piqp()
     solver = piqp.SparseSolver()
     if staged:
         solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
@@ -140,10 +83,3 @@ def solve_form(
     else:
         status = Status.FAILED
     return FormAnswer(status, x, iterations, f"piqp {piqp.__version__}", found.name)
-
-
-def _piqp() -> ModuleType:
-    try:
-        return importlib.import_module("piqp")
-    except ImportError:
-        raise InputError("piqp", "", "not installed; `pip install piqp` or use other settings") from None

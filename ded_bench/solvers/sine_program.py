@@ -17,8 +17,7 @@ import scipy.sparse as sp
 
 from ded_bench.problem.case import Array
 from ded_bench.solvers.ipopt import _IPOPT_STATUS, _IPOPT_VERSION, _silent_failure
-from ded_bench.solvers.outcome import Options, Outcome
-from ded_bench.solvers.status import Status
+from ded_bench.solvers.status import Options, Outcome, Status
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,25 +4,18 @@ A rollout is affine in its inputs, and these are linear between knots, so that
 
     (ω, P_s) = free response + Γ knots
 
-where the free response has ψ_0 and the loads but no generator power. Linear programs, losses and
-refinement all use this map, at all grid points or at every `stride`-th of them.
+where the free response has ψ_0 and the loads but no generator power. Losses and refinement
+use this map, at all grid points or at every `stride`-th of them.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.surrogates.koopman import Koopman, linear_recurrence
-
-#: Blocks of time in which Γ is applied. Within one, outputs depend on few numbers: the state at its start
-#: and the knots nearby.
-N_BLOCKS = 16
-#: Singular values of a block below this part of the largest are round-off.
-ROUND_OFF = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,50 +62,6 @@ class CondensedRollout:
     def n_gen(self) -> int:
         """Number of generators."""
         return len(self.gamma) - 1
-
-    def free_response(self, psi: Array, p_load: Array) -> Array:
-        """(ω, P_s) at the points without generator power; see `free_response`."""
-        return free_response(self.model, psi, p_load, self.stride)
-
-    def apply(self, p_knots: Array) -> Array:
-        """Γ @ knots.
-
-        Args:
-            p_knots: powers at the knots, (batch, n_knots, n_gen), pu.
-
-        Returns:
-            What they add to the free response, (batch, n_gen + 1, n_points).
-        """
-        columns = p_knots.reshape(len(p_knots), -1).T
-        parts = [left @ (right @ columns) for left, right in self._blocks]
-        return np.moveaxis(np.concatenate(parts, axis=1), 2, 0)
-
-    def adjoint(self, outputs: Array) -> Array:
-        """Γᵀ @ outputs: the gradient in the knots of a function with this gradient in (ω, P_s).
-
-        Args:
-            outputs: (batch, n_gen + 1, n_points).
-
-        Returns:
-            (batch, n_knots, n_gen).
-        """
-        total, first = np.zeros((len(outputs), self.gamma.shape[2])), 0
-        for left, right in self._blocks:
-            last = first + left.shape[1]
-            total += np.einsum("bok,okr->br", outputs[:, :, first:last], left) @ right
-            first = last
-        return total.reshape(len(outputs), -1, self.n_gen)
-
-    @functools.cached_property
-    def _blocks(self) -> list[tuple[Array, Array]]:
-        """Γ by blocks of time, each as a product (n_gen + 1, n_block, rank) @ (rank, n_knots n_gen)."""
-        blocks = []
-        for part in np.array_split(self.gamma, N_BLOCKS, axis=1):
-            left, size, right = np.linalg.svd(part.reshape(-1, part.shape[2]), full_matrices=False)
-            rank = int((size > ROUND_OFF * size[0]).sum()) if len(size) else 0
-            left = (left * size)[:, :rank].reshape(*part.shape[:2], rank)
-            blocks.append((np.ascontiguousarray(left), right[:rank].copy()))
-        return blocks
 
 
 def free_response(model: Koopman, psi: Array, p_load: Array, stride: int = 1) -> Array:

@@ -11,11 +11,8 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import Plant, plant_of
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
-
-__all__ = ["default_results", "search_folders"]
 
 #: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
@@ -40,26 +39,20 @@ class Trajectories:
         """(ω, P_s), shape (n_points, batch, n_gen + 1)."""
         return np.concatenate([self.omega, self.p_slack[..., None]], axis=-1)
 
-    def take(self, part: slice) -> Trajectories:
-        """Some of them."""
-        arrays = (a[:, part] for a in (self.theta, self.omega, self.p_slack))
-        initial = self.theta_initial[part]
-        return Trajectories(self.instances[part], self.kinds[part], self.inputs[:, part], initial, *arrays)
-
 
 def trajectories(
     case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
 ) -> Trajectories:
     """Simulate schedules and stack the result; raises SimulationError where the system cannot follow one."""
-    generators = Network(case).generators
     pairs = zip(instances, schedules, strict=True)
-    return _stacked(instances, kinds, [_signals(simulate(case, *pair), generators) for pair in pairs])
+    return _stacked(instances, kinds, [_signals(simulate(case, *pair)) for pair in pairs])
 
 
-def _signals(run: Trajectory, generators: Array) -> tuple[Array, ...]:
+def _signals(run: Trajectory) -> tuple[Array, ...]:
     """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""
-    inputs, theta = np.hstack([run.p_gen, run.p_load]), run.states
-    return inputs, theta[0].copy(), theta[:, generators], run.omega, run.p_slack
+    initial = np.array([run.columns[f"theta_{bus.id}"][0] for bus in run.case.buses])
+    theta = np.stack([run.columns[f"theta_{g}"] for g in run.case.generators], axis=1)
+    return np.hstack([run.p_gen, run.p_load]), initial, theta, run.omega, run.p_slack
 
 
 def _stacked(instances: list[Instance], kinds: list[str], runs: list[tuple[Array, ...]]) -> Trajectories:
@@ -79,14 +72,13 @@ def sample_trajectories(
         InputError: it cannot follow most of them.
     """
     mix = mix or list(KINDS)
-    generators = Network(case).generators
     instances, kinds, runs = [], [], []
     for i, instance in enumerate(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable)):
         kind = mix[i % len(mix)]
         rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
         schedule = Schedule(instance.grid, KINDS[kind](case, instance, rng))
         with contextlib.suppress(SimulationError):
-            runs.append(_signals(simulate(case, instance, schedule), generators))
+            runs.append(_signals(simulate(case, instance, schedule)))
             instances.append(instance)
             kinds.append(kind)
     if 2 * len(runs) < count:

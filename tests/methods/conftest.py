@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from ded_bench.surrogates.energy_form import injection_lift
-from ded_bench.surrogates.linear import linear_model
-from ded_bench.surrogates.koopman import Koopman
 from ded_bench.problem.case import Case
+from ded_bench.surrogates.energy_form import injection_lift
+from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.linear import linear_model
 
 
 @pytest.fixture(scope="module")

@@ -7,22 +7,22 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ded_bench.surrogates.koopman import Koopman
 from ded_bench.methods import ded_ko, ded_ko_knots
-from ded_bench.methods.ded_ko import SETTINGS
+from ded_bench.methods.ded_ko import SOLVERS
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
-from ded_bench.plants.lossless.network import Network
+from ded_bench.surrogates.koopman import Koopman
 
 HORIZON = 3.0
 METHODS = (ded_ko, ded_ko_knots)
-#: Settings that need nothing installed beside the package's dependencies.
-SLUGS = sorted(set(SETTINGS) - {"executable"})
+#: Solvers that need nothing installed beside the package's dependencies.
+INSTALLED = [name for name in SOLVERS if name != "ipopt-executable"]
 
 
 def short(case: Case, index: int, **changes) -> Instance:

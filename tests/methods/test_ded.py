@@ -6,22 +6,21 @@ import numpy as np
 import pyomo.environ as pyo
 import pytest
 
-from ded_bench.methods import ded_sequential, ded_start
 from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
-from ded_bench.methods.ded_sequential import SequentialDed, injections_along
-from ded_bench.methods.ded_start import start_from
+from ded_bench.methods.euler_program import EulerPrograms, injections_along
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 
 HORIZON = 2.0
+ACCELERATED = Settings("accelerated=on")
 
 
 def short(case: Case, index: int, **changes) -> Instance:
@@ -161,7 +160,7 @@ def test_accelerated_finds_the_same_optimum(case: Case) -> None:
         for regime in case.regimes:
             instance = short(case, index)
             usual = prepare(case, regime, Settings())(instance)
-            fast = ded_sequential.prepare(case, regime, Settings("accelerated"))(instance)
+            fast = prepare(case, regime, ACCELERATED)(instance)
             assert usual.status == fast.status == Status.OPTIMAL
             assert fast.solver_version.startswith("piqp")
             assert fast.solver_objective == pytest.approx(usual.solver_objective, rel=1e-6)
@@ -176,7 +175,7 @@ def test_accelerated_finds_the_same_optimum(case: Case) -> None:
 def test_accelerated_meets_the_equations_of_the_model(case: Case) -> None:
     """Its inputs, fixed in the Pyomo model, leave IPOPT nothing to do but to find the same states."""
     instance = short(case, 1)
-    outcome, schedule = SequentialDed(case, "TO", instance.steps, instance.dt_s).solve(instance)
+    outcome, schedule = EulerPrograms(case, "TO", instance.steps, instance.dt_s).solve(instance)
     model = build_ded(case, instance.steps, instance.dt_s)
     set_instance(model, case, instance, "TO")
     for j, g in enumerate(case.generators):
@@ -210,13 +209,13 @@ def test_a_linear_program_has_the_derivatives_of_the_network(case: Case) -> None
 def test_what_a_sequence_cannot_solve_ipopt_decides(threebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     instance = short(threebus, 0)
     bad = instance.initial.model_copy(update={"power": {"plant": 0.95}})  # p_max is 0.9
-    solve = ded_sequential.prepare(threebus, "NO", Settings("accelerated"))
+    solve = prepare(threebus, "NO", ACCELERATED)
     solution = solve(instance.model_copy(update={"initial": bad}))
     assert solution.status == Status.INFEASIBLE
     assert solution.schedule is None
     assert "piqp" in solution.solver_version
     assert "ipopt" in solution.solver_version
-    monkeypatch.setattr("ded_bench.methods.ded_sequential.TOLERANCE", 0.0)
+    monkeypatch.setattr("ded_bench.methods.euler_program.TOLERANCE", 0.0)
     patient = solve(instance)
     assert patient.status == Status.OPTIMAL
     assert "ipopt" in patient.solver_version
@@ -224,29 +223,6 @@ def test_what_a_sequence_cannot_solve_ipopt_decides(threebus: Case, monkeypatch:
     again = solve(instance)
     assert "ipopt" not in again.solver_version
     assert again.solver_objective == pytest.approx(patient.solver_objective, rel=1e-6)
-    hasty = ded_sequential.prepare(threebus, "NO", Settings("accelerated", time_limit_s=1e-9))(instance)
+    hasty = prepare(threebus, "NO", Settings("accelerated=on", time_limit_s=1e-9))(instance)
     assert hasty.status == Status.TIME_LIMIT
     assert hasty.error
-
-
-@pytest.mark.parametrize("start", ded_start.SETTINGS)
-def test_starts_are_schedules_and_the_optimum_does_not_depend_on_them(threebus: Case, start: str) -> None:
-    instance = short(threebus, 2)
-    make = ded_start.SETTINGS[start]["schedule"]
-    schedule = make(threebus, instance, "NO")
-    assert schedule.p.tolist() == make(threebus, instance, "NO").p.tolist()
-    verdict = score(threebus, instance, schedule, "NO")
-    assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8
-    model = build_ded(threebus, instance.steps, instance.dt_s)
-    set_instance(model, threebus, instance, "NO")
-    start_from(model, threebus, instance, schedule)
-    np.testing.assert_allclose(schedule_of(model, threebus, instance).p, schedule.at(instance.grid))
-    for equation in (model.eq_load, model.eq_slack, model.ineq_ramp):
-        for row in equation.values():
-            body, slack = pyo.value(row.body), 1e-8
-            assert (row.lower is None) or body >= pyo.value(row.lower) - slack
-            assert (row.upper is None) or body <= pyo.value(row.upper) + slack
-    there = ded_start.prepare(threebus, "NO", Settings(start))(instance)
-    assert there.status == Status.OPTIMAL
-    usual = prepare(threebus, "NO", Settings())(instance)
-    assert there.solver_objective == pytest.approx(usual.solver_objective, rel=1e-6)

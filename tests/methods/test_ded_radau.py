@@ -7,21 +7,26 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ded_bench.methods.collocation import BETWEEN, POINTS, WEIGHTS, differentiation, lagrange
-from ded_bench.methods.ded_radau import SETTINGS, element_count, element_ends, element_length, prepare
-from ded_bench.methods.ded_radau_model import build_ded_radau, collocation_points
-from ded_bench.methods.radau_program import RadauProgram
+from ded_bench.methods.ded_radau import default_element, element_count, element_ends, prepare
+from ded_bench.methods.radau_program import (
+    BETWEEN,
+    POINTS,
+    WEIGHTS,
+    RadauProgram,
+    differentiation,
+    lagrange,
+)
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
+from tests.methods.pyomo_models import build_ded_radau
 
 HORIZON = 2.0
 
@@ -48,7 +53,7 @@ def test_points_and_weights_are_radaus(threebus: Case) -> None:
     for degree in range(5):
         assert np.dot(WEIGHTS, np.power(POINTS, degree)) == pytest.approx(1 / (degree + 1), abs=1e-15)
     assert np.dot(WEIGHTS, np.power(POINTS, 5)) != pytest.approx(1 / 6, abs=1e-4)
-    for tau, (e, c) in collocation_points(model).items():
+    for tau, (e, c) in model.fractions.items():
         assert tau == pytest.approx(e - 1 + c, abs=1e-6)
 
 
@@ -92,10 +97,8 @@ def test_elements_are_never_finer_than_the_grid_nor_fewer_than_the_kinks(
 
 def test_fast_modes_ask_for_short_elements(ninebus: Case) -> None:
     """An eighth of the period of the fastest mode: docs/grids.md has their frequencies."""
-    default = SETTINGS["default"]
-    assert element_length(ninebus, **default) == 0.1
-    assert element_length(Case.load("39bus"), **default) == pytest.approx(0.125 / 1.57, rel=5e-3)
-    assert element_length(Case.load("140bus"), **SETTINGS["200ms"]) == 0.2
+    assert default_element(ninebus) == 0.1
+    assert default_element(Case.load("39bus")) == pytest.approx(0.125 / 1.57, rel=5e-3)
 
 
 @pytest.mark.parametrize(("regime", "index"), [("NO", 2), ("TO", 0)])
@@ -157,24 +160,6 @@ def test_limits_hold_on_the_true_system(case: Case) -> None:
         assert verdict.bound_violation == 0.0
         assert verdict.feasible_strict
         assert verdict.objective == pytest.approx(solution.solver_objective, rel=1e-5)
-
-
-def test_where_nothing_may_move_the_optimum_is_the_static_one(case: Case, quiet_instance, alter) -> None:
-    """Constant loads, started at their static dispatch, with a frequency bound near zero."""
-    case = alter(case, regimes={"NO": {"omega_hz": 1e-7}})
-    buses = (case.slack, *case.generators)
-    cost = dict(zip(buses, np.linspace(0.9, 0.2, len(buses)).tolist(), strict=True))
-    prices = np.array([cost[g] for g in case.generators])
-    p_opt = merit_order(case, prices, cost[case.slack], case.load_nominal)
-    initial = {
-        "power": dict(zip(case.generators, p_opt.tolist(), strict=True)),
-        "omega": dict.fromkeys(case.generators, 0.0),
-    }
-    instance = quiet_instance(case, horizon_s=HORIZON, cost=cost, initial=initial)
-    solution = prepare(case, "NO", Settings())(instance)
-    p_slack = -p_opt.sum() - case.load_nominal.sum()
-    static = prices @ p_opt + cost[case.slack] * abs(p_slack)
-    assert solution.solver_objective == pytest.approx(static * (instance.steps + 1), rel=1e-4)
 
 
 def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_instance) -> None:

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ded_bench.surrogates.trajectory import linearise_along
 from ded_bench.methods import ded_slp, ed, knot_program
 from ded_bench.methods.ded_slp import MARGIN, prepare
-from ded_bench.methods.ded_slp_model import build_ded_slp
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import PIECE, knot_weights, piece_starts
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.step_rules import FullSteps
+from ded_bench.plants.plant import SimulationError, plant_of
+from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
 from ded_bench.solvers.status import Status
-from ded_bench.plants.score import score
-from ded_bench.plants.simulate import SimulationError, simulate
+from tests.methods.pyomo_models import build_ded_slp
 
 HORIZON = 4.0
 POINTS = np.array([0, 60, 121, 130, 205, 300, 400])
@@ -38,9 +40,8 @@ def program(case: Case, instance: Instance, bound: float, points=POINTS) -> Knot
     """The program around the static dispatch."""
     times = instance.grid[points]
     schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
-    return KnotProgram(
-        case, instance, bound, linearise_along(case, simulate(case, instance, schedule), points)
-    )
+    model = plant_of(case).linearise_along(simulate(case, instance, schedule), points)
+    return KnotProgram(case, instance, bound, model)
 
 
 @pytest.mark.parametrize("index", range(3))
@@ -89,31 +90,6 @@ def test_another_factorisation_follows_where_one_stalled(case, monkeypatch, mess
     assert len(attempts) == 2
 
 
-@pytest.mark.parametrize("radius", [np.inf, 1.0])
-def test_within_a_radius_a_lower_price_of_widening_follows_where_a_program_stalled(case, monkeypatch, radius):
-    """Without one HiGHS decides. A wide radius and prices above all multipliers change no answer."""
-    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(0, 401, 20))
-    made.radius = radius
-    none, solve, costs = np.empty((0, 2), dtype=int), knot_program.solve_form, []
-
-    def stalling(form, *arguments):
-        costs.append(form.cost.max())
-        answer = solve(form, *arguments)
-        if costs[-1] > 0.5 * max(costs):
-            return replace(answer, status=Status.FAILED, message="PIQP_MAX_ITER_REACHED")
-        return answer
-
-    expected = made.solve_relaxed(none, np.inf)[0]
-    monkeypatch.setattr(knot_program, "solve_form", stalling)
-    answer, widening = made.solve_relaxed(none, np.inf)
-    assert answer.status == Status.OPTIMAL
-    assert ("highs" in answer.version) == (radius == np.inf)
-    assert len(set(costs)) == (1 if radius == np.inf else 2)
-    assert widening == pytest.approx(0.0, abs=1e-7)
-    objectives = (made.predict(a.x).objective for a in (answer, expected))
-    assert next(objectives) == pytest.approx(next(objectives), rel=1e-6)
-
-
 @pytest.mark.parametrize("regime", ["NO", "TO"])
 @pytest.mark.parametrize("index", range(2))
 def test_claims_are_what_the_scorer_finds(case, regime, index):
@@ -129,10 +105,10 @@ def test_claims_are_what_the_scorer_finds(case, regime, index):
 def test_what_does_not_converge_says_so(case, monkeypatch):
     """No trajectory counts as one that keeps the bound."""
     monkeypatch.setattr(ded_slp, "ACCEPTED", -np.inf)
-    monkeypatch.setattr(ded_slp, "MAX_ROUNDS", 2)
+    monkeypatch.setattr(ded_slp, "FullSteps", functools.partial(FullSteps, most_programs=2))
     solution = prepare(case, "NO", Settings())(short(case, 1))
     assert (solution.status, solution.schedule) == (Status.FAILED, None)
-    assert solution.error == "no convergence in 2 trajectories"
+    assert solution.error == "no convergence in 2 programs"
 
 
 def test_no_schedule_on_the_knots_nearby_is_cheaper(case):
@@ -170,8 +146,8 @@ def test_finer_knots_cost_no_more(ninebus):
     """The schedules on 0.1 s knots include nearly all those on 50 knots."""
     instance = sample_instance(ninebus, 77, 5).model_copy(update={"horizon_s": 12.0})
     costs = []
-    for slug in ("default", "100ms"):
-        solution = prepare(ninebus, "TO", Settings(name=slug))(instance)
+    for options in ("default", "knot_s=0.1"):
+        solution = prepare(ninebus, "TO", Settings(options))(instance)
         costs.append(score(ninebus, instance, solution.schedule, "TO").objective)
     assert len(solution.schedule.t) == 121
     assert costs[1] <= costs[0] * (1 + 1e-5)
@@ -207,7 +183,7 @@ def test_failures_are_said(case, monkeypatch):
     monkeypatch.setattr(ded_slp, "simulate", lost)
     solution = prepare(case, "TO", Settings())(short(case, 0))
     assert solution.status == Status.FAILED
-    assert "cannot follow" in solution.error
+    assert solution.error == "lost"
 
 
 def test_what_is_feasible_but_not_confirmed_is_no_optimum(case, monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ded_bench.surrogates.linear import linear_model
-from ded_bench.surrogates.find import search_folders
+from ded_bench.results.reference_run import search_folders
 from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper
 from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.dpc.kernels import predict

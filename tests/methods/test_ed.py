@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from ded_bench.files.errors import InputError
-from ded_bench.methods.ed import SETTINGS, dispatch, prepare
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.ed import dispatch, prepare
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.status import Status
-from ded_bench.plants.score import score
 
 RAMP = 0.05  # pu/s, both cases
 
@@ -23,7 +20,7 @@ def test_constant_loads_are_met_at_the_ramp_limit_and_then_held(threebus: Case, 
     load = {"town": {"initial": -0.8, "start": 0.0, "duration": 0.0, "rate": 0.0}}
     instance = quiet_instance(threebus, cost={"s": 0.9, "plant": 0.2}, load=load)
     wanted = np.minimum(0.6 + RAMP * instance.grid, 0.8)
-    for interval in (options["interval_s"] for options in SETTINGS.values()):
+    for interval in (60.0, 10.0, 1.0):
         np.testing.assert_allclose(dispatch(threebus, instance, interval).p[:, 0], wanted, atol=1e-14)
     dear = quiet_instance(threebus, cost={"s": 0.2, "plant": 0.9}, load=load)
     down = np.maximum(0.6 - RAMP * dear.grid, threebus.p_min[0])
@@ -53,8 +50,8 @@ def test_a_last_short_interval_is_dispatched_too(threebus: Case, quiet_instance)
 
 def test_limits_hold_and_no_optimality_is_claimed(case: Case) -> None:
     instances = [sample_instance(case, 77, i).model_copy(update={"horizon_s": 2.0}) for i in range(3)]
-    for slug in SETTINGS:
-        solutions = [prepare(case, "TO", Settings(slug))(instance) for instance in instances]
+    for options in ("default", "every=10", "every=1"):
+        solutions = [prepare(case, "TO", Settings(options))(instance) for instance in instances]
         for instance, solution in zip(instances, solutions, strict=True):
             verdict = score(case, instance, solution.schedule, "TO")
             assert solution.status == Status.FEASIBLE
@@ -82,9 +79,3 @@ def test_slow_loads_are_followed_to_the_static_optimum(ninebus: Case, quiet_inst
     ]
     assert errors[-1] < 0.02
     np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 2.0, rtol=0.05)
-
-
-def test_registered_with_its_settings(case: Case) -> None:
-    assert tuple(get_method("ed").settings) == ("default", "10s", "1s")
-    with pytest.raises(InputError, match="known: default, 10s, 1s"):
-        get_method("ed").prepare(case, "NO", Settings("5min"))

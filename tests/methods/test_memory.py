@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from ded_bench.surrogates.linear import linear_model
-from ded_bench.methods import ded, ded_ko, ded_radau, ded_sequential, memory
+from ded_bench.methods import ded, ded_ko, ded_radau, solution
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.linear import linear_model
 
 
 def on_linear(case: Case, regime: str, settings: Settings) -> Solver:
@@ -21,11 +21,11 @@ def on_linear(case: Case, regime: str, settings: Settings) -> Solver:
 
 PREPARED: list[Any] = [
     pytest.param(ded.prepare, "default", {"68bus", "140bus"}, id="ded"),
-    pytest.param(ded_sequential.prepare, "accelerated", {"140bus"}, id="accelerated"),
+    pytest.param(ded.prepare, "accelerated=on", {"140bus"}, id="accelerated"),
     pytest.param(ded_radau.prepare, "default", {"140bus"}, id="ded-radau"),
     pytest.param(on_linear, "default", {"140bus"}, id="ded-ko"),
-    pytest.param(on_linear, "highs", {"68bus", "140bus"}, id="ded-ko-highs"),
-    pytest.param(on_linear, "ipopt", {"68bus", "140bus"}, id="ded-ko-ipopt"),
+    pytest.param(on_linear, "solver=highs", {"68bus", "140bus"}, id="ded-ko-highs"),
+    pytest.param(on_linear, "solver=ipopt", {"68bus", "140bus"}, id="ded-ko-ipopt"),
 ]
 Prepare = Callable[[Case, str, Settings], Solver]
 
@@ -35,9 +35,9 @@ def test_what_is_too_large_is_refused(prepare: Prepare, settings: str, refused: 
     """By the size of the grid and of the horizon, before anything is made."""
     for name in refused:
         case = Case.load(name)
-        solution = prepare(case, "NO", Settings(settings))(sample_instance(case, 77, 0))
-        assert (solution.status, solution.schedule) == (Status.FAILED, None)
-        assert "GiB" in solution.error
+        refusal = prepare(case, "NO", Settings(settings))(sample_instance(case, 77, 0))
+        assert (refusal.status, refusal.schedule) == (Status.FAILED, None)
+        assert "GiB" in refusal.error
 
 
 @pytest.mark.parametrize(("prepare", "settings", "refused"), PREPARED)
@@ -47,7 +47,7 @@ def test_what_is_small_enough_is_solved(
     instance = sample_instance(threebus, 77, 0).model_copy(update={"horizon_s": 1.0})
     solve = prepare(threebus, "NO", Settings(settings))
     assert solve(instance).status == Status.OPTIMAL
-    monkeypatch.setattr(memory, "MAX_BYTES", 1000)
+    monkeypatch.setattr(solution, "MAX_BYTES", 1000)
     assert solve(instance).status == Status.FAILED
 
 
@@ -55,10 +55,8 @@ def test_what_the_reference_runs_hold_is_allowed() -> None:
     """`ded` on two-area and 39bus, `ded-radau` on 68bus."""
     for name in ("two-area", "39bus"):
         case = Case.load(name)
-        assert ded.program_bytes(case, sample_instance(case, 77, 0)) <= memory.MAX_BYTES
+        assert ded.program_bytes(case, sample_instance(case, 77, 0)) <= solution.MAX_BYTES
     case = Case.load("68bus")
     instance = sample_instance(case, 77, 0)
-    elements = ded_radau.element_count(
-        case, instance, ded_radau.element_length(case, **ded_radau.SETTINGS["default"])
-    )
-    assert ded_radau.program_bytes(case, elements) <= memory.MAX_BYTES
+    elements = ded_radau.element_count(case, instance, ded_radau.default_element(case))
+    assert ded_radau.program_bytes(case, elements) <= solution.MAX_BYTES

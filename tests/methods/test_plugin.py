@@ -18,10 +18,15 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
 MODULE = """
+from dataclasses import dataclass
 import numpy as np
 from ded_bench import Schedule, Solution, Status
+from ded_bench.methods.options import read_options
 
-SETTINGS = {"default": {}, "bold": {}}
+@dataclass(frozen=True)
+class Options:
+    share: float = 1.0
+
 weights = "w1"
 
 def flat(instance, power):
@@ -37,8 +42,9 @@ def with_option(instance, regime, gain=2.0):
     return flat(instance, list(instance.initial.power.values()))
 
 def prepare(case, regime, settings):
+    share = read_options(Options, settings.options).share
     def run(instance):
-        return Solution(Status.OPTIMAL, flat(instance, case.p_nominal), iterations=7, solve_s=0.25)
+        return Solution(Status.OPTIMAL, flat(instance, share * case.p_nominal), iterations=7, solve_s=0.25)
     return run
 
 class Warm:
@@ -96,13 +102,14 @@ def test_it_gets_the_case_if_it_asks(theirs, threebus, instance) -> None:
     assert answer(f"{theirs}:with_case", threebus, instance).schedule.p.tolist() == [[0.6], [0.6]]
 
 
-def test_a_prepare_is_one_with_its_settings(theirs, threebus, instance) -> None:
-    solution = answer(f"{theirs}:prepare", threebus, instance, Settings("bold"))
+def test_a_prepare_is_one_with_its_options(theirs, threebus, instance) -> None:
+    solution = answer(f"{theirs}:prepare", threebus, instance, Settings("share=0.5"))
     assert (solution.status, solution.iterations, solution.solve_s) == (Status.OPTIMAL, 7, 0.25)
-    with pytest.raises(InputError, match=r"--settings: meek: unknown to method .*known: default, bold"):
-        answer(f"{theirs}:prepare", threebus, instance, Settings("meek"))
-    with pytest.raises(InputError, match=r"bold: unknown to method .*known: default\)"):
-        answer(f"{theirs}:solve", threebus, instance, Settings("bold"))
+    assert solution.schedule.p.tolist() == [[0.3], [0.3]]
+    with pytest.raises(InputError, match=r"--set: meek: no such option \(known: share\)"):
+        answer(f"{theirs}:prepare", threebus, instance, Settings("meek=1"))
+    with pytest.raises(InputError, match=r"share: no such option \(this method has none\)"):
+        answer(f"{theirs}:solve", threebus, instance, Settings("share=1"))
     with pytest.raises(TypeError, match="returned nothing, not a function"):
         answer(f"{theirs}:hollow", threebus, instance)
 

@@ -12,8 +12,14 @@ import torch
 
 from ded_bench.analysis.rollouts import rollout_table
 from ded_bench.files.errors import InputError
-from ded_bench.surrogates.identification_data import KINDS, load_ramps, random_knots, sample_trajectories, trajectories
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import Case
+from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.energy_form import EPSILON, energy_form, injection_lift, steady_state
+from ded_bench.surrogates.find import find_model, model_file
+from ded_bench.surrogates.identification_data import KINDS, load_ramps, sample_trajectories, trajectories
 from ded_bench.surrogates.identify import (
     held_out,
     identify,
@@ -22,14 +28,8 @@ from ded_bench.surrogates.identify import (
     predict,
     unpack,
 )
-from ded_bench.surrogates.linear import linear_model, nominal_model, single_sample
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.find import find_model, model_file
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.simulate import SimulationError, simulate
+from ded_bench.surrogates.linear import linear_model, nominal_model
 
 
 def nominal_form(case: Case):
@@ -114,29 +114,6 @@ def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
             if i + 1 < n_points:
                 deviation = (expected - inputs[i] @ model.b.T) @ model.k.T
                 expected = deviation + inputs[i] @ model.b.T + (inputs[i + 1] - inputs[i]) @ model.g.T
-
-
-def test_single_sample_form_is_the_paper_s_and_agrees_to_half_a_step(case: Case) -> None:
-    """Same modes, equilibria and start as the first-order hold; one sample of the input, half a step off."""
-    hold, network = linear_model(case), Network(case)
-    single = single_sample(hold, case)
-    np.testing.assert_allclose(single.g, (np.eye(len(single.k)) - single.k) @ single.b, atol=1e-15)
-    n_gen = len(case.generators)
-    assert not single.k[:, : n_gen + 1].any()  # P_s of a load change does not depend on the old P_s
-    modes = np.sort_complex(np.linalg.eigvals(single.k))[n_gen + 1 :]
-    np.testing.assert_allclose(modes, np.sort_complex(np.linalg.eigvals(hold.k)), atol=1e-9)
-    errors = []
-    for part in (1.0, 0.5):
-        steps = case.sampling.model_copy(update={"dt_s": part * case.sampling.dt_s})
-        finer = case.model_copy(update={"sampling": steps})
-        hold = linear_model(finer)
-        instance = sample_instance(finer, KOOPMAN_SEED, 0).model_copy(update={"horizon_s": 8.0})
-        rng = np.random.default_rng(0)
-        schedule = Schedule(instance.grid, random_knots(finer, instance, rng))
-        data = trajectories(finer, [instance], [schedule], ["random knots"])
-        difference = predict(single_sample(hold, finer), network, data) - predict(hold, network, data)
-        errors.append(np.abs(difference).max())
-    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)  # first order in the step
 
 
 def test_identified_model_beats_the_linearisation_and_is_repeatable(case: Case) -> None:

@@ -6,6 +6,7 @@ where the suite ships it; every library is imported when first used.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
 from pathlib import Path
@@ -111,9 +112,9 @@ def solve(
         method: one of ours, one that an installed package brings, or `module:function`.
         regime: one of the case's, such as `NO` or `TO`.
         case: needed if the instance's case is not a shipped one.
-        settings: a method's settings, Koopman model, policy, time limit and search folders; None:
-            the default ones. Models and policies are looked for in the default results folder,
-            then in the reference run.
+        settings: a method's options, surrogate, policy, time limit and search folders; None: the default
+            ones. Where it names no folders, models and policies are looked for in the default results
+            folder, then in the reference run.
 
     Raises:
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
@@ -124,7 +125,10 @@ def solve(
     own = _case_of(instance, case)
     own.check_regimes([regime])
     instance.check_case(own)
-    return _prepared(own, method, regime, settings or Settings(search=search_folders(own)))(instance)
+    chosen = settings or Settings()
+    if not chosen.search:
+        chosen = dataclasses.replace(chosen, search=search_folders(own))
+    return _prepared(own, method, regime, chosen)(instance)
 
 
 def simulate(

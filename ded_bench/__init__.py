@@ -150,7 +150,7 @@ def simulate(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import simulate
-    from ded_bench.problem.schedule_input import as_schedule
+    from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
     return simulate.simulate(own, instance, as_schedule(schedule, own), _plant_of(own, plant))
@@ -177,7 +177,7 @@ def score(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import score
-    from ded_bench.problem.schedule_input import as_schedule
+    from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
     return score.score(own, instance, as_schedule(schedule, own), regime, _plant_of(own, plant))

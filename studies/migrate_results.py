@@ -102,7 +102,8 @@ class Move:
                 self.study(path.read_text().splitlines(), "exchanged")
             elif name == "rollouts":
                 header, rows = read_cells(path)
-                kept = [r for r in rows if not self.is_gone({"model": r["model"], "method": "", "settings": ""})]
+                none = {"method": "", "settings": ""}
+                kept = [cells for cells in rows if not self.is_gone(cells | none)]
                 write_cells(self.new / "koopman" / path.name, header, kept)
             elif name == "koopman-paper" or (name == "koopman" and self.case.id == WITH_KOOPMAN):
                 copy(path, self.new / "koopman" / f"{name}.{kind}")

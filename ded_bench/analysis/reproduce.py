@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pandas as pd
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
@@ -180,16 +181,9 @@ def _compared(line: Line, row: Row, answer: object) -> Iterator[str]:
 
 def table_of(lines: Sequence[Line]) -> str:
     """One line each: rows, how many differ, the largest differences."""
-    heads = ("method", "settings", "model", "regime", "rows", "differ", "objective", "Hz")
     cells = []
     for line in lines:
-        numbers = str(line.rows), str(len(line.differences)), f"{line.objective:.1e}", f"{line.hz:.1e}"
+        numbers = line.rows, len(line.differences), f"{line.objective:.1e}", f"{line.hz:.1e}"
         cells.append((line.method, line.settings, line.model or "-", line.regime, *numbers))
-    widths = [max(len(row[i]) for row in (heads, *cells)) for i in range(len(heads))]
-    return "\n".join(
-        "  ".join(
-            text.ljust(w) if i < 4 else text.rjust(w)
-            for i, (text, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in (heads, *cells)
-    )
+    heads = ["method", "settings", "model", "regime", "rows", "differ", "objective", "Hz"]
+    return pd.DataFrame(cells, columns=heads).to_string(index=False)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import gzip
 import io
+import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
+from ded_bench.files.table import records
 from ded_bench.problem.case import Array, Case
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: How far a schedule's last time may lie from the horizon, s.
 HORIZON_TOLERANCE = 1e-9
@@ -38,10 +44,8 @@ class Schedule:
     def write(self, path: Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""
         text = io.StringIO()
-        header = ",".join(["t", *(f"P_{g}" for g in generators)])
-        np.savetxt(
-            text, np.column_stack([self.t, self.p]), fmt="%.15g", delimiter=",", header=header, comments=""
-        )
+        header, table = ",".join(["t", *(f"P_{g}" for g in generators)]), np.column_stack([self.t, self.p])
+        np.savetxt(text, table, fmt="%.15g", delimiter=",", header=header, comments="")
         data = text.getvalue().encode()
         write_atomically(path, gzip.compress(data, 3, mtime=0) if path.suffix == ".gz" else data)
 
@@ -54,7 +58,7 @@ class Schedule:
                 finite number, times do not increase strictly from 0 to the horizon.
         """
         header, rows = _read_table(path)
-        wanted = ["t", *(f"P_{g}" for g in case.generators)]
+        wanted = columns_of(case)
         expected = f"expected {','.join(wanted)}, found {repr(','.join(header)[:100])[1:-1] or 'nothing'}"
         for name in wanted:
             if header.count(name) != 1:
@@ -84,22 +88,59 @@ class Schedule:
             raise InputError(source, "t", f"must end at the horizon {horizon_s}, not {self.t[-1]}")
 
 
+def columns_of(case: Case) -> list[str]:
+    """The columns of a schedule's file: time in s, then each generator's power in pu."""
+    return ["t", *(f"P_{generator}" for generator in case.generators)]
+
+
+def as_schedule(given: Schedule | pd.DataFrame, case: Case) -> Schedule:
+    """A schedule whose times and powers are arrays of floats.
+
+    Args:
+        given: a schedule, its `t` and `p` arrays or nested lists; or a data frame with the columns of a
+            schedule's file, `t` (s) and `P_<bus>` (pu), and perhaps others, such as that of a trajectory.
+
+    Raises:
+        InputError: it is something else, a column is missing, or shapes or values are wrong.
+    """
+    if isinstance(given, Schedule):
+        t, p = given.t, given.p
+    elif hasattr(given, "columns"):
+        names = columns_of(case)
+        found = [str(name) for name in given.columns]
+        for name in names:
+            if found.count(name) != 1:
+                raise InputError("schedule", name, f"one such column is needed (found: {', '.join(found)})")
+        t, p = given[names[0]].to_numpy(), given[names[1:]].to_numpy()
+    else:
+        problem = f"is a {type(given).__name__}; give a Schedule, or a data frame with columns t, P_<bus>"
+        raise InputError("schedule", "", problem)
+    try:
+        if np.iscomplexobj(t) or np.iscomplexobj(p):  # NumPy would only warn
+            raise TypeError("some are complex")
+        times, powers = np.asarray(t, dtype=np.float64), np.asarray(p, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError("schedule", "t, P", f"must be real numbers, a row for each time ({error})") from None
+    if times.ndim != 1 or powers.shape != (len(times), len(case.generators)):
+        wanted = f"({len(times)}, {len(case.generators)}): a row per time, a column per generator"
+        raise InputError("schedule", "P", f"has the shape {powers.shape}, but needs {wanted}")
+    return Schedule(times, powers)
+
+
 def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Column names, and the other rows that are not blank, each with its line number."""
     try:
         with open(path, "rb") as raw:
             stream = gzip.GzipFile(fileobj=raw) if str(path).endswith(".gz") else raw
             data = stream.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise InputError(path, "", "is too large for a schedule")
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
-        rows = [(reader.line_num, row) for row in reader if row]
+        text = data.decode()
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None
-    except (UnicodeDecodeError, csv.Error, EOFError, ValueError, zlib.error) as error:
-        if isinstance(error, InputError):
-            raise
+    except (EOFError, ValueError, zlib.error):
         raise InputError(path, "", "is not a CSV text file") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(path, "", "is too large for a schedule")
+    rows = [(line, cells) for line, cells in records(text, path) if cells]
     if not rows:
         raise InputError(path, "t", "is empty")
     return [name.strip() for name in rows[0][1]], rows[1:]
@@ -107,24 +148,13 @@ def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]
 
 def _numbers(rows: list[tuple[int, list[str]]], header: list[str], path: str | Path) -> Array:
     """The numbers of a table, shape (n_rows, n_columns); InputError names the first cell that is none."""
-    shape = len(rows), len(header)
-    try:
-        values = np.array([row for _, row in rows], dtype=float).reshape(shape)
-    except ValueError:  # some cell is no number, or some row too short or too long
-        values = np.full(shape, np.nan)
-    if not np.isfinite(values).all() or any("_" in cell for _, row in rows for cell in row):
-        for number, row in rows:
-            if len(row) != len(header):
-                raise InputError(path, f"line {number}", f"{len(row)} values for {len(header)} columns")
-            for column, cell in zip(header, row, strict=True):
-                _check_number(cell, path, f"line {number}, {column}")
+    values = np.full((len(rows), len(header)), np.nan)
+    for i, (line, cells) in enumerate(rows):
+        if len(cells) != len(header):
+            raise InputError(path, f"line {line}", f"{len(cells)} values for {len(header)} columns")
+        for j, cell in enumerate(cells):
+            with contextlib.suppress(ValueError):
+                values[i, j] = float(cell)
+            if not math.isfinite(values[i, j]) or "_" in cell:
+                raise InputError(path, f"line {line}, {header[j]}", f"{cell[:20]!r} is not a finite number")
     return values
-
-
-def _check_number(cell: str, path: str | Path, field: str) -> None:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value) or "_" in cell:
-        raise InputError(path, field, f"{cell[:20]!r} is not a finite number")

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.case import Case
-from ded_bench.problem.schedule import MAX_BYTES, Schedule
+from ded_bench.problem.schedule import MAX_BYTES, Schedule, columns_of
 
 #: Smaller than deflate by a fourth.
 COMPRESSION = zipfile.ZIP_LZMA
@@ -61,7 +61,7 @@ class Archive:
         Raises:
             InputError: it is missing or damaged, is of other generators, or does not span the horizon.
         """
-        source, wanted = f"{self.path}: {name}", _columns(case)
+        source, wanted = f"{self.path}: {name}", columns_of(case)
         try:  # in this order: a schedule that is packed meanwhile is found
             data = self._file(name).read_bytes()
         except FileNotFoundError:
@@ -79,7 +79,7 @@ class Archive:
     def write(self, name: str, schedule: Schedule, case: Case) -> None:
         """Save a schedule beside the archive."""
         if _COLUMNS not in self:
-            write_atomically(self._file(_COLUMNS), _bytes(np.array(_columns(case))))
+            write_atomically(self._file(_COLUMNS), _bytes(np.array(columns_of(case))))
         table = np.column_stack([schedule.t, schedule.p])
         write_atomically(self._file(name), _bytes(np.asfortranarray(table)))  # a column compresses better
 
@@ -149,10 +149,6 @@ class Archive:
             if archive.getinfo(f"{name}.npy").file_size > MAX_BYTES:
                 raise InputError(self.path, name, "is too large for a schedule")
             return archive.read(f"{name}.npy")
-
-
-def _columns(case: Case) -> list[str]:
-    return ["t", *(f"P_{generator}" for generator in case.generators)]
 
 
 def _entry(name: str) -> zipfile.ZipInfo:

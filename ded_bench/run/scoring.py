@@ -26,10 +26,6 @@ from ded_bench.run.tasks import Question, reason_of, score_all
 BATCH = 50
 #: What a kept schedule, scored again, may differ by from its row.
 OBJECTIVE_RELATIVE, VIOLATION_HZ, VIOLATION_PU = 1e-9, 1e-9, 1e-9
-_TOLERANCES = {
-    "freq_violation_hz": VIOLATION_HZ,
-    **dict.fromkeys(("ramp_violation", "bound_violation", "initial_violation"), VIOLATION_PU),
-}
 _SCORE = tuple(field.name for field in dataclasses.fields(Score))
 
 #: What a kept schedule is worth, or why that cannot be told.
@@ -199,22 +195,20 @@ def validate(
 
 def _differences(old: Row, new: Row) -> Iterator[str]:
     """What a row says and its schedule, scored again, does not."""
-    if old.objective is None or new.objective is None:
-        if old.objective is not None:
-            yield new.error
-        elif new.objective is not None:
-            yield f"the row has no score ({old.error}), but the schedule has"
-        return
-    if not math.isclose(old.objective, new.objective, rel_tol=OBJECTIVE_RELATIVE):
-        yield f"objective {old.objective!r} in the row, {new.objective!r} scored again"
-    missing = [name for name in _TOLERANCES if getattr(old, name) is None]
-    yield from (f"{name} is missing in the row" for name in missing)
-    if missing:
-        return
-    for name, tolerance in _TOLERANCES.items():
-        was, is_now = getattr(old, name), getattr(new, name)
-        if abs(was - is_now) > tolerance:
-            yield f"{name} {was!r} in the row, {is_now!r} scored again"
-    own = Score(**{name: getattr(old, name) for name in _SCORE})
-    if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):
-        yield "feasible or feasible_strict do not follow from the row's own violations"
+    for name in _SCORE:
+        was, now = getattr(old, name), getattr(new, name)
+        if was is None or now is None:
+            same = was is now
+        elif name == "objective":
+            same = math.isclose(was, now, rel_tol=OBJECTIVE_RELATIVE)
+        else:
+            same = abs(was - now) <= (VIOLATION_HZ if name == "freq_violation_hz" else VIOLATION_PU)
+        if not same:
+            why = f" ({old.error or new.error})" if was is None or now is None else ""
+            yield f"{name} {was!r} in the row, {now!r} scored again{why}"
+        if was is None or now is None:
+            return
+    if all(getattr(old, name) is not None for name in _SCORE):
+        own = Score(**{name: getattr(old, name) for name in _SCORE})
+        if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):
+            yield "feasible or feasible_strict do not follow from the row's own violations"

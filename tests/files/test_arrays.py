@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 
 import numpy as np
@@ -56,14 +55,6 @@ def test_other_files_are_refused(tmp_path, content):
     assert caught.value.source == str(path)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    """The name is in the message."""
-    for path in (tmp_path / "missing", tmp_path):
-        with pytest.raises(InputError) as caught:
-            read_arrays(path)
-        assert caught.value.source == str(path)
-
-
 @pytest.mark.parametrize(
     "array", [np.array([1.0, np.nan]), np.array([np.inf]), np.array([1, 2]), np.array([True])]
 )
@@ -73,14 +64,3 @@ def test_arrays_must_hold_finite_floats(tmp_path, array):
     write_arrays(path, {"good": np.eye(2), "weight": array}, {})
     with pytest.raises(InputError, match="weight: must hold finite numbers"):
         read_arrays(path)
-
-
-def test_the_header_is_readable_without_the_suite(tmp_path):
-    """Plain safetensors metadata, each value as JSON."""
-    path = tmp_path / "model.safetensors"
-    write_arrays(path, {"k": np.eye(2)}, {"dt_s": 0.01, "case": "9bus"})
-    with safetensors.safe_open(str(path), framework="np") as file:
-        assert {key: json.loads(value) for key, value in file.metadata().items()} == {
-            "dt_s": 0.01,
-            "case": "9bus",
-        }

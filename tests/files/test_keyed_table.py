@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import random
 import signal
@@ -76,23 +75,6 @@ def test_later_lines_win_and_rows_keep_their_places(tmp_path: Path) -> None:
     table.compact()
     assert (tmp_path / "table.csv").stat() == before
     assert [p.name for p in tmp_path.iterdir() if p.name != ".lock"] == ["table.csv"]
-
-
-def test_a_row_counts_only_for_what_it_was_made_from(tmp_path: Path) -> None:
-    table = old(tmp_path)
-    table.add([Old("a", 1, "one instance")])
-    assert table.made_from("a", "one instance")
-    assert not table.made_from("a", "another")
-    assert not table.made_from("b", "one instance")
-
-
-def test_adding_a_row_does_not_rewrite_the_table(tmp_path: Path) -> None:
-    table = old(tmp_path)
-    table.add([Old(str(i), i) for i in range(1000)])
-    inode, size = os.stat(tmp_path / "table.csv").st_ino, os.stat(tmp_path / "table.csv").st_size
-    table.add([Old("1000", 0)])
-    after = os.stat(tmp_path / "table.csv")
-    assert (after.st_ino, after.st_size) == (inode, size + len("1000,0,\n"))
 
 
 def test_a_table_does_not_grow_without_end(tmp_path: Path) -> None:
@@ -215,27 +197,6 @@ def test_kill_at_any_moment_loses_nothing(tmp_path: Path) -> None:
     table = old(tmp_path)
     table.compact()
     assert Table(Old).read(tmp_path / "table.csv") == list(table.rows.values())
-
-
-def add_twenty(folder: str, first: int) -> None:
-    table = old(Path(folder))
-    for i in range(first, first + 20):
-        table.add([Old(str(i), 0)])
-        table.add([Old(str(i), i)])
-
-
-def test_two_writers_lose_no_row(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=add_twenty, args=(str(tmp_path), first)) for first in (0, 100)]
-    for writer in writers:
-        writer.start()
-    for writer in writers:
-        writer.join()
-        assert writer.exitcode == 0
-    rows = old(tmp_path).rows
-    assert {key: row.number for key, row in rows.items()} == {
-        str(i): i for first in (0, 100) for i in range(first, first + 20)
-    }
 
 
 def test_a_quotation_mark_out_of_place_hides_no_row(tmp_path: Path) -> None:

@@ -11,33 +11,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.options import option
 from ded_bench.methods.registry import METHODS, Method
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants import plant
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Results, Row
-from ded_bench.results.timing import TIMING, TimingRow, read_timing, timing_summary
+from ded_bench.results.timing import TimingRow, read_timing, timing_summary
 from ded_bench.run import bench as bench_module
 from ded_bench.run.bench import (
     ROUNDS,
     Job,
     bench,
     choose_sample,
-    largest_difference,
     rounds_of,
     runs_of,
     timed,
-    timed_turn,
 )
 from ded_bench.run.pool import WorkerDiedError
 from ded_bench.solvers.status import Status
@@ -133,22 +128,6 @@ def test_every_turn_begins_with_another_instance(fake, run, instances) -> None:
         run([TO], warm_up=instances[0])
 
 
-def test_the_command_warms_up_on_what_the_power_flow_can_serve(tmp_path: Path, monkeypatch) -> None:
-    """The first draw is redrawn if it cannot be served."""
-    drawn, warmed = [], []
-
-    def refuse_the_first(case: Case, instances: list[Instance]) -> np.ndarray:
-        drawn.extend(instances)
-        return np.array([instance is not drawn[0] for instance in instances])
-
-    monkeypatch.setattr(plant, "servable", refuse_the_first)
-    monkeypatch.setattr(bench_module, "bench", lambda *_, warm_up, **__: warmed.append(warm_up) or [])
-    row = Row("9bus-0001", "test", "TO", "ed", "default", "Feasible", objective=1.0, case="9bus")
-    Results(tmp_path).add([row])
-    assert main(["bench", "--results", str(tmp_path)]) == 0
-    assert warmed[0].p_initial(Case.load("9bus")).tolist() != drawn[0].p_initial(Case.load("9bus")).tolist()
-
-
 def test_methods_take_turns_in_an_order_that_rotates(fake, run, instances) -> None:
     rows = [row for row in run(BOTH, rounds=2) if row.round]
     assert [row.round for row in rows] == [1] * 6 + [2] * 6
@@ -182,24 +161,6 @@ def test_only_the_instance_that_kills_its_process_is_lost(fake, run, instances, 
     assert [row.instance for row in rows[1:]] == [i.id for i in instances]
 
 
-def test_every_job_has_a_process_of_its_own(fake, run, monkeypatch) -> None:
-    made: list[Inline] = []
-    closed: list[Inline] = []
-
-    class Counted(Inline):
-        def __init__(self, count: int) -> None:
-            super().__init__(count)
-            made.append(self)
-
-        def close(self) -> None:
-            closed.append(self)
-
-    monkeypatch.setattr(bench_module, "Workers", Counted)
-    run(BOTH, rounds=2)
-    assert len(made) == 2
-    assert set(map(id, closed)) == set(map(id, made))
-
-
 def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:
     fake.times = [9.0, 1.0, 2.0, 3.0, 9.0, 4.0, 5.0, 6.0]
     summary = timing_summary(run([TO], rounds=2))
@@ -228,23 +189,6 @@ def test_fast_methods_take_part_in_more_rounds(fake, run) -> None:
     assert max(row.round for row in run([TO], rounds=None, force=True)) == 1  # failures are not repeated
 
 
-def test_a_method_that_does_not_time_itself_is_timed(fake, threebus, instances) -> None:
-    fake.times = [None]
-    _, call = timed_turn(threebus, "fake", "TO", Settings(), instances[0], instances[1:2])
-    assert call.solution.solve_s == call.seconds
-    assert 0 < call.seconds < 1
-
-
-def test_torch_uses_one_thread(fake, threebus, instances) -> None:
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        timed_turn(threebus, "fake", "TO", Settings(), instances[0], instances[1:2])
-        assert torch.get_num_threads() == 1
-    finally:
-        torch.set_num_threads(before)
-
-
 def test_failed_calls_are_counted_and_enter_no_median(fake, run) -> None:
     fake.times = [1.0, 1.0, "none", 3.0]
     row = timing_summary(run([TO])).iloc[0]
@@ -270,13 +214,6 @@ def test_what_is_timed_is_compared_with_what_is_kept(
     rows = run([TO], results=results)
     assert [row.schedule_difference_pu for row in rows] == [None, None, 0.25, None]
     assert timing_summary(rows)["schedule_difference_pu"].to_list() == [0.25]
-
-
-def test_schedules_on_different_points_are_compared_everywhere() -> None:
-    peak = Schedule(np.array([0.0, 1.0, 2.0]), np.array([[0.0], [1.0], [0.0]]))
-    flat = Schedule(np.array([0.0, 2.0]), np.array([[0.0], [0.0]]))
-    assert largest_difference(peak, flat) == largest_difference(flat, peak) == 1.0
-    assert largest_difference(peak, peak) == 0.0
 
 
 def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
@@ -350,25 +287,6 @@ def test_full_ded_in_a_process_of_its_own(threebus: Case, tmp_path: Path) -> Non
     assert row["first_build_s"] > row["build_s"]
     assert "ipopt" in row["solver_version"]
     assert all(row.call_s > row.solve_s for row in rows)
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        (lambda text: text.replace("round,", "", 1), "round"),
-        (lambda text: text.replace(",3.5,", ",nan,"), "solve_s"),
-        (lambda text: text.replace(",3.5,", ",-1,"), "solve_s"),
-        (lambda text: text.replace(",1,", ",one,"), "round"),
-        (lambda text: text.replace("TO,", ",", 1), "regime"),
-    ],
-)
-def test_a_wrong_timing_table_names_the_field(tmp_path: Path, change, field: str) -> None:
-    path = tmp_path / "timing.csv"
-    path.write_text(change(TIMING.format([ROW])))
-    with pytest.raises(InputError) as caught:
-        read_timing(path)
-    assert caught.value.source == str(path)
-    assert field in caught.value.field
 
 
 def test_the_sample_is_spread_and_the_same_every_time(threebus: Case) -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.registry import METHODS
@@ -33,7 +32,6 @@ from ded_bench.run.runner import run
 from ded_bench.run.tasks import make_tasks, pack, solve_task, unpacked
 from ded_bench.surrogates.find import find_model, model_file
 from ded_bench.surrogates.linear import linear_model
-from tests.conftest import CASE_FILES
 from tests.run.test_pool import wait_until
 from tests.strange_methods import STRANGE, solve_strange
 
@@ -203,19 +201,6 @@ def test_no_scheduler_is_bad_input(address_of, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(module, "CONNECT_S", 1.0)
     with pytest.raises(InputError, match=r"--scheduler: .*no Dask scheduler answers"):
         Cluster(address_of())
-
-
-def test_the_command_line_names_the_scheduler_it_cannot_reach(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "CONNECT_S", 1.0)
-    place = f"tcp://127.0.0.1:{free_port()}"
-    shipped = CASE_FILES["9bus"].parent / "instances" / "9bus-0007.json"
-    command = ["solve", "--method", "ed", "--regime", "NO", "--instance", str(shipped)]
-    assert main([*command, "--out", str(tmp_path), "--scheduler", place]) == 2
-    told, line = capsys.readouterr().err.splitlines()
-    assert told.startswith("ded-bench: 1 row to solve")
-    assert line.startswith(f"ded-bench: --scheduler: {place}")
 
 
 def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

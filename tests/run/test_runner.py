@@ -140,14 +140,6 @@ def test_a_run_leaves_one_line_per_row_even_if_interrupted(
     assert all(row.scored for row in ROWS.read(results.path))
 
 
-def test_a_schedule_without_its_score_is_only_scored(strange, make, threebus: Case, tmp_path: Path) -> None:
-    results = Results(tmp_path / "out")
-    rows = run(threebus, make("calm-1"), results)
-    results.add([dataclasses.replace(row, objective=None, feasible=None) for row in rows])
-    assert run(threebus, make("calm-1"), Results(tmp_path / "out")) == rows
-    assert calls(strange) == {"calm-1": 2}
-
-
 def test_failures_are_rows_and_the_run_goes_on(strange, make, threebus: Case, tmp_path: Path) -> None:
     tasks = make("raise-1", "crash-1", "calm-1", "apart-1", regimes=["NO"])
     rows = run(threebus, tasks, Results(tmp_path / "out"), workers=2)
@@ -200,14 +192,6 @@ def test_a_hang_is_a_time_limit_and_blames_nobody_else(
     assert Results(tmp_path / "out").rows[tasks[0].key].error.startswith("no answer after 5 s")
     assert {row.status for row in rows.values()} == {"Feasible"}
     assert calls(strange) == {"hang": 1, "slow-1": 1, "slow-2": 1, "slow-3": 1}
-
-
-def test_without_a_time_limit_nothing_is_killed(
-    strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(runner, "GRACE_S", 0.0)
-    (row,) = run(threebus, make("slow", regimes=["NO"]), Results(tmp_path / "out"))
-    assert row.status == "Feasible"
 
 
 def test_a_failure_takes_an_earlier_schedule_away(

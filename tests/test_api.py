@@ -12,10 +12,10 @@ import pytest
 import ded_bench
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import write_benchmark
-from ded_bench.solvers.status import Status
 from ded_bench.plants import score, simulate
+from ded_bench.problem.benchmark import write_benchmark
+from ded_bench.problem.case import Case
+from ded_bench.solvers.status import Status
 
 HEAVY = ("casadi", "matplotlib", "numba", "pandas", "pyomo", "scipy", "torch")
 

@@ -16,7 +16,7 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import load_split, write_benchmark
+from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.results.rows import Results
 from ded_bench.results.timing import read_timing
 

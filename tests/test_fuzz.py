@@ -24,12 +24,10 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.cli import commands
 from ded_bench.analysis.summary import claims, summary, table_times, worst
-from ded_bench.results.timing import TIMING, TimingRow, read_timing
+from ded_bench.cli import commands
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
-from ded_bench.surrogates.linear import linear_model
 from ded_bench.methods.dpc import policy as dpc_policy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.response import Response
@@ -37,13 +35,15 @@ from ded_bench.methods.dpc_paper import paper_policy
 from ded_bench.methods.dpc_paper.paper_features import n_channels
 from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
 from ded_bench.methods.policy_file import Scope, weights_of
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import Manifest, Split
-from ded_bench.problem.schedule import Schedule
-from ded_bench.run import runner
-from ded_bench.results.rows import ROWS, Results, Row
-from ded_bench.run.scoring import scored_row
 from ded_bench.plants import score as scorer
+from ded_bench.problem.benchmark import Manifest, Split
+from ded_bench.problem.case import Case
+from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import ROWS, Results, Row
+from ded_bench.results.timing import TIMING, TimingRow, read_timing
+from ded_bench.run import runner
+from ded_bench.run.scoring import scored_row
+from ded_bench.surrogates.linear import linear_model
 from tests.damage import (
     Mutant,
     Payload,

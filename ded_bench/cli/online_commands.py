@@ -20,11 +20,10 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.cli.messages import counted, say
 from ded_bench.problem.ac_case import TRUTHS, AcCase
-from ded_bench.problem.benchmark import problem_folder
+from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.scenario import load_scenarios
-from ded_bench.problem.scenario_sampling import scenario_files, scenario_folder
 from ded_bench.results.reference_run import default_results, search_folders
 
 if TYPE_CHECKING:

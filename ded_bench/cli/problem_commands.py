@@ -14,11 +14,19 @@ from ded_bench.cli.arguments import CASE_HELP, DEFAULT_CASE, command, natural, p
 from ded_bench.cli.messages import counted, say
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
-from ded_bench.problem.benchmark import problem_folder
-from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.benchmark import (
+    Manifest,
+    Split,
+    load_manifest,
+    load_split,
+    problem_folder,
+    scenario_folder,
+    write_benchmark,
+    write_scenarios,
+)
+from ded_bench.problem.case import SHIPPED_CASES, Case, case_file
 from ded_bench.problem.instance import check_whole_steps
-from ded_bench.problem.sampling import Manifest, Split, load_manifest, load_split, write_benchmark
-from ded_bench.problem.scenario_sampling import DURATION_S, SCENARIOS, scenario_folder, write_scenarios
+from ded_bench.problem.sampling import DURATION_S, SCENARIOS
 
 if TYPE_CHECKING:
     from ded_bench.analysis.inspect_case import CaseCheck
@@ -65,7 +73,7 @@ def _instances(a: argparse.Namespace) -> int:
     folder = a.out or home
 
     def draw(folder: Path) -> Manifest:
-        return write_benchmark(case, count, seed, folder, test, servable)
+        return write_benchmark(case, count, seed, folder, test, servable, case_file(a.case))
 
     manifest = draw(folder) if a.force else _unless_changed(folder, draw)
     print(f"{counted(count, 'instance')} of {case.id} (seed {seed}) in {folder}, version {manifest.version}")

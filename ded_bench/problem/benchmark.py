@@ -1,21 +1,27 @@
-"""Selection: which instances of a benchmark are meant, by split or by file, and of which version they are."""
+"""A benchmark's folder: its split and manifest, the files that are written, the instances that are meant."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+from pydantic import Field
 
 from ded_bench.files.errors import InputError
-from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.files.strict import Record, read_record, write_atomically, write_record
+from ded_bench.problem.case import SHIPPED_CASES, Case, Name
 from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.sampling import (
+    DURATION_S,
     VALIDATION_SEED,
     Servable,
-    load_manifest,
-    load_split,
+    drawn_with_redraws,
     sample_instances,
+    sample_scenario,
 )
 
 SplitName = Literal["test", "train", "validation", "all"]
@@ -23,6 +29,151 @@ SplitName = Literal["test", "train", "validation", "all"]
 SPLITS: tuple[str, ...] = get_args(SplitName)
 #: How many validation instances there are unless a limit says otherwise.
 VALIDATION_COUNT = 100
+TEST_FRACTION = 0.2
+MANIFEST = "MANIFEST.json"
+
+
+class Split(Record):
+    """Which instances are for training and which for testing."""
+
+    schema_: Literal["ded-bench/split/1"] = Field(alias="schema")
+    seed: int
+    train: tuple[Name, ...]
+    test: tuple[Name, ...]
+
+
+class Manifest(Record):
+    """Version and SHA-256 of each file; results are comparable only between equal versions."""
+
+    schema_: Literal["ded-bench/manifest/1"] = Field(alias="schema")
+    version: str
+    files: dict[str, str]
+    redraws: Annotated[int, Field(ge=0)] = 0  # loads and instances that were drawn again
+
+
+def load_split(folder: Path) -> Split:
+    """Read the split of a benchmark folder; InputError if it is missing or wrong."""
+    return read_record(Split, folder / "split.json")
+
+
+def load_manifest(folder: Path) -> Manifest | None:
+    """Read the manifest of a benchmark folder; None if the folder has none."""
+    path = folder / MANIFEST
+    return read_record(Manifest, path) if path.is_file() else None
+
+
+def problem_folder(name: str | Path, case: Case) -> Path:
+    """The folder that holds a case's instances: the one given, or that of the shipped case."""
+    path = Path(name)
+    if (path / "case.json").is_file():
+        return path
+    return path.parent if path.is_file() else SHIPPED_CASES / case.id
+
+
+def scenario_folder(problem_folder: Path) -> Path:
+    """Where the scenarios of a benchmark's folder lie."""
+    return problem_folder / "scenarios"
+
+
+def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
+    """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
+    files = sorted(read_record(Manifest, folder / MANIFEST).files)
+    return [folder / name for name in files[:limit]]
+
+
+def draw_split(ids: list[str], seed: int, n_test: int | None = None) -> Split:
+    """Choose instances at random for testing: a fifth, at least one, unless `n_test` says how many."""
+    order = np.argsort(np.random.default_rng(np.random.SeedSequence([seed])).random(len(ids)), kind="stable")
+    n_test = max(1, round(TEST_FRACTION * len(ids))) if n_test is None else n_test
+    test = set(order[:n_test].tolist())
+    return Split(
+        schema_="ded-bench/split/1",
+        seed=seed,
+        train=tuple(name for i, name in enumerate(ids) if i not in test),
+        test=tuple(name for i, name in enumerate(ids) if i in test),
+    )
+
+
+def write_benchmark(
+    case: Case,
+    count: int,
+    seed: int,
+    folder: Path,
+    n_test: int | None = None,
+    servable: Servable | None = None,
+    source: Path | None = None,
+) -> Manifest:
+    """Write case, instances, split and manifest of a benchmark into `folder`.
+
+    Args:
+        n_test: how many instances are for testing; None: a fifth.
+        servable: as of `drawn_with_redraws`.
+        source: the case's file, whose bytes a new folder gets, since the version depends on them.
+
+    Raises:
+        InputError: the folder holds another case, there are fewer instances than test instances, or the
+            case's ranges leave hardly anything to draw.
+    """
+    if n_test is not None and n_test > count:
+        raise InputError("instances", "test", f"{n_test} of {count} instances cannot be for testing")
+    place = folder / "case.json"
+    if place.exists():
+        if Case.load(folder) != case:
+            raise InputError(place, "", f"is another case than {case.id}, or another version of it")
+    elif source is None:
+        write_record(case, place)
+    else:
+        write_atomically(place, source.read_bytes())
+    written: dict[str, int] = {}
+    for instance, redraws in drawn_with_redraws(case, seed, count, servable=servable):
+        written[instance.id] = redraws
+        write_record(instance, folder / "instances" / f"{instance.id}.json")
+    write_record(draw_split(list(written), seed, n_test), folder / "split.json")
+    names = [f"instances/{name}.json" for name in written]
+    _remove_others(folder / "instances", names)
+    return _write_manifest(folder, ["case.json", "split.json", *names], sum(written.values()))
+
+
+def write_scenarios(
+    case: Case,
+    count: int,
+    seed: int,
+    folder: Path,
+    servable: Servable | None = None,
+    duration_s: float = DURATION_S,
+) -> Manifest:
+    """Write scenarios and their manifest into `folder`; scenarios of other seeds there are removed.
+
+    Raises:
+        InputError: the case's ranges leave hardly anything to draw.
+    """
+    names = []
+    for index in range(count):
+        scenario = sample_scenario(case, seed, index, servable, duration_s)
+        names.append(f"{scenario.id}.json")
+        text = scenario.model_dump_json(by_alias=True)  # in one line: mostly lists of numbers
+        write_atomically(folder / names[-1], text + "\n")
+    _remove_others(folder, [*names, MANIFEST])
+    return _write_manifest(folder, names)
+
+
+def _remove_others(folder: Path, names: Iterable[str]) -> None:
+    kept = {Path(name).name for name in names}
+    for path in folder.glob("*.json"):
+        if path.name not in kept:
+            path.unlink()
+
+
+def _write_manifest(folder: Path, names: Iterable[str], redraws: int = 0) -> Manifest:
+    """Write the manifest of some files of a folder; `redraws` stands in it only where there are any."""
+    sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in sums.items()).encode()).hexdigest()
+    manifest = Manifest(
+        schema_="ded-bench/manifest/1", version=f"1-{whole[:12]}", files=sums, redraws=redraws
+    )
+    text = manifest.model_dump_json(by_alias=True, indent=1, exclude=None if redraws else {"redraws"})
+    write_atomically(folder / MANIFEST, text + "\n")
+    return manifest
 
 
 @dataclass(frozen=True)
@@ -34,14 +185,6 @@ class Selection:
     version: str  # of the problem files, from their manifest; empty without one
 
 
-def problem_folder(name: str | Path, case: Case) -> Path:
-    """The folder that holds a case's instances: the one given, or that of the shipped case."""
-    path = Path(name)
-    if (path / "case.json").is_file():
-        return path
-    return path.parent if path.is_file() else SHIPPED_CASES / case.id
-
-
 def select_split(
     name: str | Path, split: str = "test", limit: int | None = None, servable: Servable | None = None
 ) -> Selection:
@@ -50,7 +193,7 @@ def select_split(
     Args:
         name: a shipped case, a benchmark's folder, or its case.json.
         split: `test`, `train`, `validation` (drawn afresh, see `validation_instances`) or `all`.
-        servable: tells which instances the power flow can serve, where some are drawn.
+        servable: tells which instances can be served, where some are drawn.
 
     Raises:
         InputError: there is no such case or split, or a file is missing or wrong.
@@ -104,3 +247,18 @@ def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selec
     manifest = load_manifest(folder)
     named = [(i, "train" if i.id in train else "test" if i.id in test else "none") for i in instances]
     return Selection(case, tuple(named), manifest.version if manifest else "")
+
+
+def check_own_name(instance: Instance, source: str | Path, problems: Path, case: Case) -> None:
+    """Check that an instance does not carry the name of another one of its case, whose rows it would replace.
+
+    Args:
+        problems: folder of the case's benchmark.
+
+    Raises:
+        InputError: the benchmark has an instance of this name with other contents.
+    """
+    namesake = problems / "instances" / f"{instance.id}.json"
+    if namesake.is_file() and Instance.load_file(namesake, case)[0] != instance:
+        problem = f"{instance.id} is the name of {namesake}, which says something else: choose another"
+        raise InputError(source, "id", problem)

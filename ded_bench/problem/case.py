@@ -78,8 +78,8 @@ class Machine(_Extended):
         return self
 
 
-class Limits(Record):
-    """One operating regime: |omega| at every generator stays within `omega_hz`."""
+class Regime(Record):
+    """Limits of one operating regime: |omega| at every generator stays within `omega_hz`."""
 
     omega_hz: Magnitude
 
@@ -127,7 +127,7 @@ class Case(Fingerprinted, _Extended):
     lines: tuple[Line, ...]
     machines: dict[Name, Machine]
     ramp_pu_per_s: Magnitude
-    regimes: dict[Name, Limits]
+    regimes: dict[Name, Regime]
     sampling: Sampling
     knots: Annotated[int, Field(ge=2, le=100_000)] | None = None  # case/2: `n_knots`
 
@@ -184,16 +184,7 @@ class Case(Fingerprinted, _Extended):
         Raises:
             InputError: there is no such case, or its file is wrong.
         """
-        path = Path(name_or_path)
-        own, shipped = path / "case.json", SHIPPED_CASES / path / "case.json"
-        if own.is_file() or (path.is_dir() and not shipped.is_file()):
-            path = own
-        elif not path.is_file() and shipped.is_file():
-            path = shipped
-        elif not path.exists():
-            known = ", ".join(sorted(p.parent.name for p in SHIPPED_CASES.glob("*/case.json")))
-            raise InputError(name_or_path, "", f"no such case (shipped: {known})")
-        return read_record(Case, path)
+        return read_record(Case, case_file(name_or_path))
 
     @property
     def plant_name(self) -> str:
@@ -275,3 +266,17 @@ class Case(Fingerprinted, _Extended):
                     "regime",
                     f"unknown regime {regime!r} (known: {', '.join(self.regimes)})",
                 )
+
+
+def case_file(name_or_path: str | Path) -> Path:
+    """The file of a case (see `Case.load`); InputError if there is no such case."""
+    path = Path(name_or_path)
+    own, shipped = path / "case.json", SHIPPED_CASES / path / "case.json"
+    if own.is_file() or (path.is_dir() and not shipped.is_file()):
+        return own
+    if shipped.is_file() and not path.is_file():
+        return shipped
+    if not path.exists():
+        known = ", ".join(sorted(p.parent.name for p in SHIPPED_CASES.glob("*/case.json")))
+        raise InputError(name_or_path, "", f"no such case (shipped: {known})")
+    return path

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_STEPS = 1_000_000
+#: No grid in operation is further from its nominal frequency, Hz; whoever writes more means another quantity.
+LARGEST_DEVIATION_HZ = 1.0
 
 
 class LoadRamp(Record):
@@ -110,8 +113,23 @@ class Initial(Record):
         return {name: value for name, value in write(self).items() if value is not None}
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the generators are at an instant, as a planner is told; it need not be an equilibrium."""
+
+    theta: Array  # (n_gen,), rad, relative to the slack
+    omega: Array  # (n_gen,), rad/s, deviation from nominal
+    p_gen: Array  # (n_gen,), pu: set-points
+
+    def initial(self, case: Case) -> Initial:
+        """The state at t = 0 of an instance that starts here (instance/2)."""
+        arrays = {"power": self.p_gen, "omega": self.omega, "theta": self.theta}
+        by_bus = {n: dict(zip(case.generators, a.tolist(), strict=True)) for n, a in arrays.items()}
+        return Initial(**by_bus)
+
+
 class Instance(Fingerprinted):
-    """One DED problem; angles at t = 0: see `truth.network.Network.initial_angles`."""
+    """One DED problem; angles at t = 0 that it does not give are those of the plant's equilibrium."""
 
     schema_: Literal["ded-bench/instance/1", "ded-bench/instance/2"] = Field(alias="schema")
     id: Name
@@ -233,6 +251,29 @@ class Instance(Fingerprinted):
     def cost_slack(self, case: Case) -> float:
         """Cost c_s of one pu at the slack bus, of either sign."""
         return self.cost[case.slack]
+
+
+def check_plausible(case: Case, instance: Instance, source: str | Path) -> None:
+    """Check signs and units of an instance's loads and frequencies.
+
+    Raises:
+        InputError: a load injects where the case's draws or the other way round, or a frequency deviation
+            is beyond LARGEST_DEVIATION_HZ.
+    """
+    initial = instance.p_load(case, np.zeros(1))[0]
+    for bus, value, nominal in zip(case.loads, initial, case.load_nominal, strict=True):
+        if value * nominal < 0:
+            does = "draws power, which is negative" if nominal < 0 else "feeds in, which is positive"
+            problem = f"{value:g} pu has the wrong sign: in case {case.id} this bus {does}"
+            raise InputError(source, f"load.{bus}", problem)
+    largest = 2 * np.pi * LARGEST_DEVIATION_HZ
+    for bus, value in instance.initial.omega.items():
+        if abs(value) > largest:
+            problem = (
+                f"{value:g} rad/s is {value / (2 * np.pi):.3g} Hz from the nominal frequency; "
+                "give the deviation in rad/s, not the frequency in Hz"
+            )
+            raise InputError(source, f"initial.omega.{bus}", problem)
 
 
 def load_instances(paths: Sequence[str | Path], case: Case | None = None) -> tuple[list[Instance], Case]:

@@ -1,53 +1,48 @@
-"""The sampler of the paper's Table III, the benchmark's files and their manifest."""
+"""The sampler: instances (paper, Table III), and scenarios of the closed loop.
+
+All draws are plain uniforms in a fixed order, from a generator of its own for each instance or scenario, so
+that a file is the same on every machine. What cannot be used is drawn again from the same generator.
+"""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Annotated, Literal
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Record, read_record, write_atomically, write_record
-from ded_bench.problem.case import Array, Case, Name, Range
+from ded_bench.problem.case import Array, Case, Range
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Initial, Instance, LoadRamp
+from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioLoad, ScenarioRamp
 
-#: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 5).
+#: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 4).
 POLICY_SEED, CERTIFICATE_SEED, KOOPMAN_SEED = 1_000_000, 2_000_000, 3_000_000
 #: Between the seeds of policies: instances on which choices are made, so that test instances only score.
 VALIDATION_SEED = POLICY_SEED + 500_000
+#: Scenarios are drawn from master seeds from here on.
+SCENARIO_SEED = 4_000_000
 DECIMALS = 9
-TEST_FRACTION = 0.2
-#: How often an instance is drawn before the case's ranges are taken to be wrong.
+#: How often one is drawn before the case's ranges are taken to be wrong.
 ATTEMPTS = 1000
 #: Instances that are drawn, and checked, together.
 CHUNK = 128
 
-#: Tells which of some instances of a case the power flow can serve, shape (n,).
+#: Scenarios of a case, and their duration, s, unless told otherwise.
+SCENARIOS, DURATION_S = 20, 300.0
+#: Loads of scenarios stay within this part of their nominal value, but for the fluctuation.
+LOAD_RANGE = 0.3
+#: Standard deviations of announced starts (s) and rates (relative), and how many ramps are not announced.
+START_ERROR_S, RATE_ERROR, UNANNOUNCED = 1.5, 0.15, 0.2
+#: The fluctuation's standard deviation as a part of the nominal load, and its times, s.
+FLUCTUATION, STEP_S, DECAY_S, SMOOTH_S = 0.0005, 0.5, 20.0, 2.0
+#: Digits of the fluctuation after the point, in pu: a tenth of a thousandth of its standard deviation.
+FLUCTUATION_DECIMALS = 8
+
+#: Tells which of some instances of a case its plant can serve, shape (n,) (`plants.plant.servable`).
 Servable = Callable[[Case, Sequence[Instance]], NDArray[np.bool_]]
-
-
-class Split(Record):
-    """Which instances are for training and which for testing."""
-
-    schema_: Literal["ded-bench/split/1"] = Field(alias="schema", default="ded-bench/split/1")
-    seed: int
-    train: tuple[Name, ...]
-    test: tuple[Name, ...]
-
-
-class Manifest(Record):
-    """Version and SHA-256 of each file; results are comparable only between equal versions."""
-
-    schema_: Literal["ded-bench/manifest/1"] = Field(alias="schema", default="ded-bench/manifest/1")
-    version: str
-    files: dict[str, str]
-    redraws: Annotated[int, Field(ge=0)] = 0  # loads and instances that were drawn again
 
 
 def sample_instances(
@@ -67,12 +62,11 @@ def drawn_with_redraws(
 ) -> Iterator[tuple[Instance, int]]:
     """Draw instances `first` to `first + count - 1` of a master seed, each with how often it drew again.
 
-    An instance's numbers come from a generator of its own, seeded by (master, index). What cannot be used is
-    drawn again from that generator: a load that changes its sign (in case/2; some of the paper's 9-bus loads
-    do), and an instance that is not servable.
+    An instance's generator is seeded by (master, index). Drawn again are a load that changes its sign (in
+    case/2; some of the paper's 9-bus loads do), and an instance that is not servable.
 
     Args:
-        servable: tells which instances the power flow can serve (`truth.servable`); None: all of them.
+        servable: tells which instances can be served; None: all of them.
 
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
@@ -101,22 +95,12 @@ def drawn_with_redraws(
 
 
 def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -> tuple[Instance, int]:
-    """Draw an instance (paper, Table III and eq. for P_i(0)) and count the loads that were drawn again.
-
-    All draws are plain uniforms in a fixed order, so that a file is the same on every machine; the
-    initial generator power uses the rounded values that the file holds.
-    """
+    """Draw an instance (paper, Table III) and count the loads that were drawn again."""
     ranges = case.sampling
     n_gen, n_load = len(case.generators), len(case.loads)
     draws = generator.random(1 + 2 * n_gen + 6 * n_load + n_gen)
-    cost = _rounded(_between(ranges.cost, draws[: 1 + n_gen]))
-    rest = draws[1 + n_gen :]
+    cost, rest = _rounded(_between(ranges.cost, draws[: 1 + n_gen])), draws[1 + n_gen :]
     ramps, redraws = _draw_ramps(case, rest[: 6 * n_load].reshape(n_load, 6), generator)
-    last = rest[6 * n_load :].reshape(2, n_gen)
-    perturbation = _between(ranges.perturbation, last[0])
-    omega = _rounded(_between(ranges.omega_rad_per_s, last[1]))
-    p_opt = merit_order(case, cost[1:], cost[0], ramps[:, 0])
-    power = _rounded(p_opt - 0.5 * (p_opt - case.p_nominal) * perturbation)
     instance = Instance(
         schema_="ded-bench/instance/1",
         id=f"{case.id}-{index:04d}",
@@ -124,17 +108,32 @@ def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -
         seed=(master, index),
         horizon_s=ranges.horizon_s,
         dt_s=ranges.dt_s,
-        cost=dict(zip((case.slack, *case.generators), cost.tolist(), strict=True)),
+        cost=_by_bus((case.slack, *case.generators), cost),
         load={
             bus: LoadRamp(initial=values[0], start=values[1], duration=values[2], rate=values[3])
             for bus, values in zip(case.loads, ramps.tolist(), strict=True)
         },
-        initial=Initial(
-            power=dict(zip(case.generators, power.tolist(), strict=True)),
-            omega=dict(zip(case.generators, omega.tolist(), strict=True)),
-        ),
+        initial=_initial(case, cost, ramps[:, 0], rest[6 * n_load :]),
     )
     return instance, redraws
+
+
+def _initial(case: Case, cost: Array, load: Array, uniform: Array) -> Initial:
+    """Power and frequencies at t = 0 (paper, eq. for P_i(0)) from the rounded values that the file holds.
+
+    Args:
+        case: gives the ranges.
+        cost: of the slack, then of the generators, (1 + n_gen,).
+        load: at t = 0, (n_load,), pu.
+        uniform: (2 n_gen,).
+    """
+    perturbation, frequency = uniform.reshape(2, -1)
+    p_opt = merit_order(case, cost[1:], cost[0], load)
+    power = p_opt - 0.5 * (p_opt - case.p_nominal) * _between(case.sampling.perturbation, perturbation)
+    omega = _between(case.sampling.omega_rad_per_s, frequency)
+    return Initial(
+        power=_by_bus(case.generators, _rounded(power)), omega=_by_bus(case.generators, _rounded(omega))
+    )
 
 
 def _draw_ramps(case: Case, uniform: Array, generator: np.random.Generator) -> tuple[Array, int]:
@@ -170,74 +169,115 @@ def _changes_sign(case: Case, ramps: Array) -> NDArray[np.bool_]:
     return np.asarray(np.minimum(initial * case.load_nominal, last * case.load_nominal) < 0)
 
 
-def draw_split(ids: list[str], seed: int, n_test: int | None = None) -> Split:
-    """Choose instances at random for testing: a fifth, at least one, unless `n_test` says how many."""
-    order = np.argsort(np.random.default_rng(np.random.SeedSequence([seed])).random(len(ids)), kind="stable")
-    n_test = max(1, round(TEST_FRACTION * len(ids))) if n_test is None else n_test
-    test = set(order[:n_test].tolist())
-    return Split(
-        seed=seed,
-        train=tuple(name for i, name in enumerate(ids) if i not in test),
-        test=tuple(name for i, name in enumerate(ids) if i in test),
+def sample_scenario(
+    case: Case, seed: int, index: int, servable: Servable | None = None, duration_s: float = DURATION_S
+) -> Scenario:
+    """Draw scenario `index` of a seed; it is drawn again if it cannot be served.
+
+    Args:
+        servable: is asked for the loads at 0, at both ends of every ramp and at the end; None: all can be.
+
+    Raises:
+        InputError: the case's ranges leave hardly anything to draw.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence([SCENARIO_SEED + seed, index]))
+    for _ in range(ATTEMPTS):
+        scenario = _draw_scenario(case, seed, index, generator, duration_s)
+        if servable is None or bool(servable(case, _snapshots(case, scenario)).all()):
+            return scenario
+    raise InputError(f"case {case.id}", "sampling", f"{ATTEMPTS} scenarios in a row cannot be served")
+
+
+def _snapshots(case: Case, scenario: Scenario) -> list[Instance]:
+    ends = {t for load in scenario.load.values() for ramp in load.ramps for t in (ramp.start, ramp.end)}
+    last = scenario.duration_s + case.sampling.horizon_s
+    return [scenario.snapshot(case, t) for t in sorted({0.0, *(min(t, last) for t in ends), last})]
+
+
+def _draw_scenario(
+    case: Case, seed: int, index: int, generator: np.random.Generator, duration_s: float
+) -> Scenario:
+    n_gen = len(case.generators)
+    cost = _rounded(_between(case.sampling.cost, generator.random(1 + n_gen)))
+    load = {bus: _draw_load(case, i, generator, duration_s) for i, bus in enumerate(case.loads)}
+    first = np.array([load[bus].initial for bus in case.loads])
+    return Scenario(
+        schema_="ded-bench/scenario/1",
+        id=f"{case.id}-s{index:04d}",
+        case=case.id,
+        seed=(SCENARIO_SEED + seed, index),
+        duration_s=duration_s,
+        dt_s=case.sampling.dt_s,
+        cost=_by_bus((case.slack, *case.generators), cost),
+        initial=_initial(case, cost, first, generator.random(2 * n_gen)),
+        load=load,
     )
 
 
-def write_benchmark(
-    case: Case,
-    count: int,
-    seed: int,
-    folder: Path,
-    n_test: int | None = None,
-    servable: Servable | None = None,
-) -> Manifest:
-    """Write case, instances, split and manifest of a benchmark into `folder`.
+def _draw_load(case: Case, number: int, generator: np.random.Generator, duration_s: float) -> ScenarioLoad:
+    """One ramp in every horizon of the case; it turns round where it would leave the range."""
+    ranges, nominal = case.sampling, float(case.load_nominal[number])
+    spread = min(ranges.load_relative, LOAD_RANGE)
+    level = initial = float(_rounded(nominal * (1 + _between((-spread, spread), generator.random(1))))[0])
+    last, ended, ramps = duration_s + ranges.horizon_s, 0.0, []
+    for window in np.arange(0.0, last, ranges.horizon_s):
+        start, duration, size, sign, *announced = generator.random(7)
+        begin = max(window + float(_between(ranges.start_s, start)), ended)
+        length = float(_between(ranges.duration_s, duration))
+        rate = float(_between(case.load_rate[:, number], size)) * (1 if sign < 0.5 else -1)
+        if abs(level + rate * length - nominal) > LOAD_RANGE * abs(nominal):
+            rate = -rate
+        room = LOAD_RANGE * abs(nominal) + (nominal - level) * np.sign(rate)
+        length = min(length, max(room, 0.0) / abs(rate)) if rate else length
+        ramp = _ramp(begin, length, rate, announced)
+        level, ended = level + ramp.rate * ramp.duration, ramp.end
+        ramps.append(ramp)
+    fluctuation = _draw_fluctuation(abs(nominal), last, generator)
+    return ScenarioLoad(initial=initial, ramps=tuple(ramps), fluctuation=fluctuation)
 
-    Args:
-        n_test: how many instances are for testing; None: a fifth.
-        servable: as of `drawn_with_redraws`.
 
-    Raises:
-        InputError: the folder holds another case, there are fewer instances than test instances, or the
-            case's ranges leave hardly anything to draw.
+def _ramp(start: float, duration: float, rate: float, announced: list[float]) -> ScenarioRamp:
+    """A ramp from its values and three uniforms: whether it is announced, and how wrong."""
+    start, duration, rate = _rounded(np.array([start, duration, rate])).tolist()
+    known = announced[0] >= UNANNOUNCED
+    error_start, error_rate = START_ERROR_S * _normal(announced[1]), RATE_ERROR * _normal(announced[2])
+    return ScenarioRamp(
+        start=start,
+        duration=duration,
+        rate=rate,
+        announced_start=float(_rounded(np.maximum(start + error_start, 0.0))) if known else None,
+        announced_rate=float(_rounded(np.array(rate * (1 + error_rate)))) if known else None,
+    )
+
+
+def _draw_fluctuation(nominal: float, last: float, generator: np.random.Generator) -> Fluctuation:
+    """A random walk that returns within DECAY_S, smoothed over SMOOTH_S; it starts at 0.
+
+    Both are first-order recursions, x⁺ = a x + √(1 - a²) n and y⁺ = b y + (1 - b) x; the stationary
+    variance of y is (1 - b) (1 + a b) / ((1 + b) (1 - a b)).
     """
-    if n_test is not None and n_test > count:
-        raise InputError("instances", "test", f"{n_test} of {count} instances cannot be for testing")
-    if not (folder / "case.json").exists():
-        write_record(case, folder / "case.json")
-    elif Case.load(folder) != case:
-        raise InputError(
-            folder / "case.json", "", f"is another case than {case.id}, or another version of it"
-        )
-    written: dict[str, int] = {}
-    for instance, redraws in drawn_with_redraws(case, seed, count, servable=servable):
-        written[instance.id] = redraws
-        write_record(instance, folder / "instances" / f"{instance.id}.json")
-    for stale in sorted((folder / "instances").glob("*.json")):
-        if stale.stem not in written:
-            stale.unlink()
-    write_record(draw_split(list(written), seed, n_test), folder / "split.json")
-    names = ["case.json", "split.json", *(f"instances/{name}.json" for name in written)]
-    sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
-    whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in sums.items()).encode()).hexdigest()
-    manifest = Manifest(version=f"1-{whole[:12]}", files=sums, redraws=sum(written.values()))
-    without = None if manifest.redraws else {"redraws"}
-    text = manifest.model_dump_json(by_alias=True, indent=1, exclude=without)
-    write_atomically(folder / "MANIFEST.json", text + "\n")
-    return manifest
+    a, b = np.exp(-STEP_S / DECAY_S), np.exp(-STEP_S / SMOOTH_S)
+    n = int(np.ceil(last / STEP_S - 1e-9))
+    noise = [_normal(uniform) for uniform in generator.random(n)]
+    values, x = np.zeros(n + 1), 0.0
+    for k in range(n):
+        x = a * x + np.sqrt(1 - a**2) * noise[k]
+        values[k + 1] = b * values[k] + (1 - b) * x
+    deviation = np.sqrt((1 - b) * (1 + a * b) / ((1 + b) * (1 - a * b)))
+    values = np.round(values * (FLUCTUATION * nominal / deviation), FLUCTUATION_DECIMALS) + 0.0
+    return Fluctuation(step_s=STEP_S, values=tuple(values.tolist()), decay_s=DECAY_S)
 
 
-def load_split(folder: Path) -> Split:
-    """Read the split of a benchmark folder; InputError if it is missing or wrong."""
-    return read_record(Split, folder / "split.json")
+def _by_bus(buses: tuple[str, ...], values: Array) -> dict[str, float]:
+    return dict(zip(buses, values.tolist(), strict=True))
 
 
-def load_manifest(folder: Path) -> Manifest | None:
-    """Read the manifest of a benchmark folder; None if the folder has none."""
-    path = folder / "MANIFEST.json"
-    return read_record(Manifest, path) if path.is_file() else None
+def _normal(uniform: float) -> float:
+    """A standard normal number from a uniform one in [0, 1)."""
+    return NormalDist().inv_cdf(max(float(uniform), 2.0**-54))
 
 
-def _between(ends: Range | Array, uniform: Array) -> Array:
+def _between(ends: Range | Array, uniform: Array | float) -> Array:
     return np.asarray(ends[0] + (ends[1] - ends[0]) * uniform)
 
 

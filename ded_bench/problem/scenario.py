@@ -78,7 +78,7 @@ class ScenarioLoad(Record):
 class Scenario(Fingerprinted):
     """Operation of one case for `duration_s`; the loads go on for a horizon of the case beyond it."""
 
-    schema_: Literal["ded-bench/scenario/1"] = Field(alias="schema", default="ded-bench/scenario/1")
+    schema_: Literal["ded-bench/scenario/1"] = Field(alias="schema")
     id: Name
     case: Name
     seed: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]

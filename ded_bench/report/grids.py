@@ -20,7 +20,7 @@ from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.sampling import load_split
+from ded_bench.problem.benchmark import load_split
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.rows import Results

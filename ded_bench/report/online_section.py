@@ -21,7 +21,7 @@ from ded_bench.analysis.summary import title
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
-from ded_bench.problem.scenario_sampling import scenario_folder
+from ded_bench.problem.benchmark import scenario_folder
 from ded_bench.report.columns import Column
 from ded_bench.report.figures.online import (
     KIND_NAMES,

@@ -19,7 +19,7 @@ from ded_bench.files.strict import read_text
 from ded_bench.files.table import records
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import load_manifest, load_split
+from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.rows import Results

@@ -6,13 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.lossless.network import check_servable
+from ded_bench.problem.benchmark import load_manifest, write_benchmark
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.sampling import drawn_with_redraws, load_manifest, sample_instances, write_benchmark
-from ded_bench.plants.lossless.network import check_servable
-from ded_bench.plants.lossless.servable import servable
+from ded_bench.problem.sampling import drawn_with_redraws, sample_instances
 
 COUNT = 200
 

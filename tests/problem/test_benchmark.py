@@ -10,18 +10,15 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.problem.benchmark import (
     VALIDATION_COUNT,
+    load_manifest,
+    load_split,
     select_files,
     select_split,
     validation_instances,
-)
-from ded_bench.problem.case import Case
-from ded_bench.problem.sampling import (
-    VALIDATION_SEED,
-    load_manifest,
-    load_split,
-    sample_instance,
     write_benchmark,
 )
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
+from ded_bench.problem.benchmark import check_own_name
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.plausibility import check_own_name, check_plausible
+from ded_bench.problem.instance import Instance, check_plausible
 
 
 def test_shipped_instances_are_plausible() -> None:

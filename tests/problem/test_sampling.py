@@ -13,20 +13,10 @@ from scipy.optimize import linprog
 from scipy.stats import binom, kstest
 
 from ded_bench.files.errors import InputError
+from ded_bench.problem.benchmark import draw_split, load_manifest, load_split, write_benchmark
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.instance import load_instances
-from ded_bench.problem.sampling import (
-    CERTIFICATE_SEED,
-    KOOPMAN_SEED,
-    POLICY_SEED,
-    draw_split,
-    drawn_with_redraws,
-    load_manifest,
-    load_split,
-    sample_instance,
-    sample_instances,
-    write_benchmark,
-)
+from ded_bench.problem.sampling import CERTIFICATE_SEED, KOOPMAN_SEED, POLICY_SEED, drawn_with_redraws, sample_instance, sample_instances
 
 COUNT, SEED = 500, 2022
 #: A sound sampler fails a test at this level once in a million; seeds are fixed, so never by chance later.

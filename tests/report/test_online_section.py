@@ -14,7 +14,7 @@ from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.results.online_results import OnlineKey, OnlineResults, OnlineRow, keep_trajectory
 from ded_bench.analysis.online_summary import online_rows, operated, own_latency, sweeps
 from ded_bench.run.online.planner import Plan
-from ded_bench.problem.scenario_sampling import sample_scenario
+from ded_bench.problem.sampling import sample_scenario
 from ded_bench.report.figures.online import forecast_figure, latency_figure
 from ded_bench.report.overview import write_overview
 from ded_bench.report.report import write_report

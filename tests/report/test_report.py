@@ -21,7 +21,7 @@ from ded_bench.surrogates.linear import linear_model
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import load_split
+from ded_bench.problem.benchmark import load_split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.columns import GAPS, TABLE_V, TABLE_VI
 from ded_bench.report.figures.plan import plan

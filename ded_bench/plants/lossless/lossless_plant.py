@@ -20,8 +20,7 @@ from ded_bench.plants.plant import Piece, SimulationError
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, series_step
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.instance import Instance, LoadRamp
-from ded_bench.problem.state import State
+from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.trajectory import Trajectory
 
 #: Longest step times the fastest mode: far inside the region of stability; errors of the exact method are
@@ -73,12 +72,12 @@ class LosslessPlant:
         self, state: LosslessState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
     ) -> Piece:
         """See `Plant.advance`; steps of fixed length lead from point to point, so that none spans a kink."""
-        from ded_bench.plants.lossless.stepper import DORMAND_PRINCE_8, KUTTA_4, Inputs, integrate
+        from ded_bench.plants.lossless.stepper import DORMAND_PRINCE_8, KUTTA_4, GridInputs, integrate
 
         network, n = self.network, len(p_set)
         theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
         theta[0], omega[0], p_slack = state.theta, state.omega, np.empty(n)
-        inputs = Inputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
+        inputs = GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
         steps = max(int(np.ceil(state.divisions * dt_s)), 1)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
         try:
@@ -131,41 +130,37 @@ class LosslessPlant:
         """See `Plant.servable`.
 
         The power flow must serve the initial loads from P_0, and the loads at 0, at each kink and at the
-        horizon from the static dispatch. The loads of drawn instances ramp once each.
+        horizon from the static dispatch.
         """
-        powers = [self._kink_powers(instance) for instance in instances]
-        p_gen = np.concatenate([gen for gen, _ in powers])
-        p_load = np.concatenate([load for _, load in powers])
-        return np.asarray(self._served(p_gen, p_load).reshape(len(instances), -1).all(axis=1))
+        p_gen, p_load, first = [], [], [0]
+        for instance in instances:
+            _, gen, load = self._tested(instance)
+            p_gen += [instance.p_initial(self.case)[None], gen]
+            p_load += [load[:1], load]
+            first.append(first[-1] + 1 + len(load))
+        served = self._served(np.concatenate(p_gen), np.concatenate(p_load))
+        return np.logical_and.reduceat(served, first[:-1])
 
     def check_servable(self, instance: Instance, source: str) -> None:
         """See `Plant.check_servable`."""
-        case, network = self.case, self.network
         try:
-            network.initial_angles(instance)
+            self.network.initial_angles(instance)
         except PowerFlowError as error:
             given = "power" if instance.initial.theta is None else "theta"
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
-        kinks = {0.0, instance.horizon_s, *(t for load in instance.load.values() for t in load.kinks)}
-        times = np.array(sorted(t for t in kinks if t <= instance.horizon_s))
-        p_load = instance.p_load(case, times)
-        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
-        for t, gen, load in zip(times, p_gen, p_load, strict=True):
+        for t, gen, load in zip(*self._tested(instance), strict=True):
             try:
-                network.power_flow(gen, load)
+                self.network.power_flow(gen, load)
             except PowerFlowError as error:
                 raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
 
-    def _kink_powers(self, instance: Instance) -> tuple[Array, Array]:
-        """Powers that must be servable, shapes (2 n_load + 3, n_gen) and (2 n_load + 3, n_load), pu."""
-        case = self.case
-        ramps = [load for load in instance.load.values() if isinstance(load, LoadRamp)]
-        ends = [t for ramp in ramps for t in (ramp.start, ramp.start + ramp.duration)]
-        times = np.minimum([0.0, *ends, instance.horizon_s], instance.horizon_s)
+    def _tested(self, instance: Instance) -> tuple[Array, Array, Array]:
+        """Times at which the power flow must serve the loads, s; static dispatch and loads there, pu."""
+        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
+        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
         p_load = instance.p_load(case, times)
-        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
-        return np.vstack([instance.p_initial(case), p_gen]), np.vstack([p_load[0], p_load])
+        return times, merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load), p_load
 
     def _served(self, p_gen: Array, p_load: Array) -> NDArray[np.bool_]:
         """Tell which rows of powers can be served; a batch that fails is halved until one is left."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.state import State
 
 if TYPE_CHECKING:
     from ded_bench.plants.lossless.stepper import CompiledGrid, Indices
@@ -135,10 +134,6 @@ class Network:
             raise PowerFlowError("an angle across a line exceeds 90 degrees")
         return theta
 
-    def acceleration(self, omega: Array, p_gen: Array, f_gen: Array) -> Array:
-        """dω/dt = (P - f - D ω) / M, shape (..., n_gen), rad/s² (paper, swing equation)."""
-        return np.asarray((p_gen - f_gen - self.d * omega) / self.m)
-
     def initial_angles(self, instance: Instance) -> Array:
         """Angles at t = 0, shape (n_bus,), rad.
 
@@ -152,27 +147,13 @@ class Network:
         theta = instance.theta_initial(self.case)
         if theta is None:
             return self.power_flow(instance.p_initial(self.case), p_load)
-        state = State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
-        return self.angles(state, p_load)
-
-    def initial_state(self, instance: Instance) -> State:
-        """The generators at t = 0; raises PowerFlowError where `initial_angles` does."""
-        theta = self.initial_angles(instance)[self.generators]
-        return State(theta, instance.omega_initial(self.case), instance.p_initial(self.case))
-
-    def angles(self, state: State, p_load: Array) -> Array:
-        """Angles of all buses, shape (n_bus,), rad: loads, shape (n_load,), pu, fix those not in the state.
-
-        Raises:
-            PowerFlowError: the loads cannot be served at these angles of the generators.
-        """
-        theta = np.zeros(self.n_bus)
-        theta[self.generators] = state.theta
+        angles = np.zeros(self.n_bus)
+        angles[self.generators] = theta
         # Newton's guess: angles that the lines, linearised at zero, would give the other buses.
-        alg, gen = self.algebraic, self.generators
-        wanted = self.load_injections(p_load) - self._flat[np.ix_(alg, gen)] @ state.theta
-        theta[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], wanted)
-        return self.solve_loads(theta, self.load_injections(p_load))[0]
+        alg, gen, wanted = self.algebraic, self.generators, self.load_injections(p_load)
+        drawn = wanted - self._flat[np.ix_(alg, gen)] @ theta
+        angles[alg] = np.linalg.solve(self._flat[np.ix_(alg, alg)], drawn)
+        return self.solve_loads(angles, wanted)[0]
 
     def linearise(self, theta: Array) -> Linearisation:
         """Linearise at the angles of an equilibrium, shape (n_bus,)."""
@@ -190,12 +171,11 @@ class Network:
     def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
         from ded_bench.plants.lossless.stepper import solve_angles  # here only, as in `grid`
 
-        theta = np.array(theta)
-        f = np.empty(theta.shape)
+        theta, f = np.array(theta), np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
         wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(free))).reshape(-1, len(free))
         try:
-            solved = solve_angles(self.grid, free, np.ascontiguousarray(wanted), *rows)
+            solved = solve_angles(self.grid._replace(algebraic=free), np.ascontiguousarray(wanted), *rows)
         except np.linalg.LinAlgError:
             solved = False
         if not solved:

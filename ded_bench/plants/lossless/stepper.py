@@ -1,7 +1,7 @@
 """The index-1 swing DAE, integrated by an explicit Runge-Kutta method with steps of fixed length; compiled.
 
-The method is whatever tableau is given. At every stage the angles of load and junction buses are solved for
-by Newton's method with a kept inverse of the Jacobian ("chord"), which is renewed where it converges slowly.
+The method is whatever tableau is given. At every stage the angles of load and junction buses are solved for.
+Newton's method keeps the inverse of the Jacobian ("chord"), and renews it where it converges slowly.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class CompiledGrid(NamedTuple):
     lines: Indices  # (n_line, 2): the buses that each joins
     coupling: Array  # (n_line,), pu
     generators: Indices  # (n_gen,): their buses
-    algebraic: Indices  # (n_algebraic,): load and junction buses
+    algebraic: Indices  # (n_algebraic,): buses whose angles follow from injections, such as loads
     slack: int
     m: Array  # (n_gen,), s² pu/rad
     d: Array  # (n_gen,), s pu/rad
     mismatch: float  # algebraic equations are solved to this, pu
 
 
-class Inputs(NamedTuple):
+class GridInputs(NamedTuple):
     """What drives the grid at the points of time, linear between them."""
 
     p_gen: Array  # (n, n_gen), pu
@@ -65,7 +65,7 @@ class Inputs(NamedTuple):
 def integrate(
     tableau: Tableau,
     grid: CompiledGrid,
-    inputs: Inputs,
+    inputs: GridInputs,
     steps: int,
     theta: Array,
     omega: Array,
@@ -155,20 +155,11 @@ def _solve_algebraic(grid: CompiledGrid, wanted: Array, inverse: Array, angle: A
     correction = np.empty(n)
     last = np.inf
     for _ in range(NEWTON_STEPS):
-        f[:] = 0.0
-        for i in range(len(grid.coupling)):
-            near, far = grid.lines[i, 0], grid.lines[i, 1]
-            flow = grid.coupling[i] * np.sin(angle[near] - angle[far])
-            f[near] += flow
-            f[far] -= flow
-        worst = 0.0
-        for i in range(n):
-            off = abs(f[grid.algebraic[i]] - wanted[i])
-            if not off < np.inf:  # before max, which passes over what is not a number
-                return False
-            worst = max(worst, off)
+        worst = _mismatch(grid, wanted, angle, f)
         if worst < grid.mismatch:
             return True
+        if not worst < np.inf:
+            return False
         if worst > CONTRACTION * last:
             _invert(grid, angle, inverse)
         last = worst
@@ -183,12 +174,75 @@ def _solve_algebraic(grid: CompiledGrid, wanted: Array, inverse: Array, angle: A
 
 
 @compiled
+def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> bool:
+    """Find the angles of algebraic buses that give wanted injections, one instance after another.
+
+    Newton's method, whose equations are solved anew in every step.
+
+    Args:
+        grid: the network.
+        wanted: injections, (batch, n_algebraic), pu.
+        theta: angles of all buses, (batch, n_bus), rad; guesses of the algebraic ones become answers.
+        f: receives the injections of all buses, (batch, n_bus), pu.
+
+    Returns:
+        Whether there is a solution for all; LinAlgError where a Jacobian is singular.
+    """
+    n = wanted.shape[1]
+    jacobian, off = np.empty((n, n)), np.empty(n)
+    for b in range(len(theta)):
+        solved = False
+        for _ in range(NEWTON_STEPS):
+            worst = _mismatch(grid, wanted[b], theta[b], f[b])
+            solved = worst < grid.mismatch
+            if solved or not worst < np.inf:
+                break
+            _set_jacobian(grid, theta[b], jacobian)
+            for i in range(n):
+                off[i] = f[b, grid.algebraic[i]] - wanted[b, i]
+            step = np.linalg.solve(jacobian, off)
+            for i in range(n):
+                theta[b, grid.algebraic[i]] -= step[i]
+        if not solved:
+            return False
+    return True
+
+
+@compiled
+def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> float:
+    """Largest difference of injections at algebraic buses from those wanted, pu; infinite if one is no number.
+
+    f receives the injections of all buses.
+    """
+    f[:] = 0.0
+    for i in range(len(grid.coupling)):
+        near, far = grid.lines[i, 0], grid.lines[i, 1]
+        flow = grid.coupling[i] * np.sin(angle[near] - angle[far])
+        f[near] += flow
+        f[far] -= flow
+    worst = 0.0
+    for i in range(len(wanted)):
+        off = abs(f[grid.algebraic[i]] - wanted[i])
+        if not off < np.inf:  # before max, which passes over what is not a number
+            return np.inf
+        worst = max(worst, off)
+    return worst
+
+
+@compiled
 def _invert(grid: CompiledGrid, angle: Array, inverse: Array) -> None:
-    """Set the inverse of the algebraic buses' Jacobian ∂f/∂θ; LinAlgError if it is singular."""
+    """Set the inverse of the algebraic buses' Jacobian; LinAlgError if it is singular."""
+    _set_jacobian(grid, angle, inverse)
+    inverse[:] = np.linalg.inv(inverse)
+
+
+@compiled
+def _set_jacobian(grid: CompiledGrid, angle: Array, jacobian: Array) -> None:
+    """Set ∂f/∂θ of the algebraic buses, (n_algebraic, n_algebraic), pu/rad."""
     place = np.full(len(angle), -1)
     for i in range(len(grid.algebraic)):
         place[grid.algebraic[i]] = i
-    jacobian = np.zeros((len(grid.algebraic), len(grid.algebraic)))
+    jacobian[:] = 0.0
     for i in range(len(grid.coupling)):
         near, far = place[grid.lines[i, 0]], place[grid.lines[i, 1]]
         slope = grid.coupling[i] * np.cos(angle[grid.lines[i, 0]] - angle[grid.lines[i, 1]])
@@ -199,57 +253,3 @@ def _invert(grid: CompiledGrid, angle: Array, inverse: Array) -> None:
         if near >= 0 and far >= 0:
             jacobian[near, far] -= slope
             jacobian[far, near] -= slope
-    inverse[:] = np.linalg.inv(jacobian)
-
-
-@compiled
-def solve_angles(grid: CompiledGrid, free: Indices, wanted: Array, theta: Array, f: Array) -> bool:
-    """Find the angles of some buses that give wanted injections there, one instance after another.
-
-    Newton's method, whose equations are solved anew in every step.
-
-    Args:
-        grid: the network.
-        free: the buses whose angles are searched, (n_free,).
-        wanted: their injections, (batch, n_free), pu.
-        theta: angles of all buses, (batch, n_bus), rad; guesses of the free ones become answers.
-        f: receives the injections of all buses, (batch, n_bus), pu.
-
-    Returns:
-        Whether there is a solution for all; LinAlgError where a Jacobian is singular.
-    """
-    n, place = len(free), np.full(theta.shape[1], -1)
-    for i in range(n):
-        place[free[i]] = i
-    off, jacobian = np.empty(n), np.empty((n, n))
-    for b in range(len(theta)):
-        solved = False
-        for _ in range(NEWTON_STEPS):
-            f[b] = 0.0
-            jacobian[:] = 0.0
-            for i in range(len(grid.coupling)):
-                near, far = grid.lines[i, 0], grid.lines[i, 1]
-                across = theta[b, near] - theta[b, far]
-                flow, slope = grid.coupling[i] * np.sin(across), grid.coupling[i] * np.cos(across)
-                f[b, near] += flow
-                f[b, far] -= flow
-                first, second = place[near], place[far]
-                if first >= 0:
-                    jacobian[first, first] += slope
-                if second >= 0:
-                    jacobian[second, second] += slope
-                if first >= 0 and second >= 0:
-                    jacobian[first, second] -= slope
-                    jacobian[second, first] -= slope
-            for i in range(n):
-                off[i] = f[b, free[i]] - wanted[b, i]
-            worst = np.abs(off).max()
-            solved = worst < grid.mismatch
-            if solved or not worst < np.inf:
-                break
-            step = np.linalg.solve(jacobian, off)
-            for i in range(n):
-                theta[b, free[i]] -= step[i]
-        if not solved:
-            return False
-    return True

@@ -11,12 +11,12 @@ from ded_bench.methods.ded_slp_ac import AcDynamics
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.trust_region import TrustRegionSequence
 from ded_bench.plants.simulate import simulate
-from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.ac_case import AcCase
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.run.online.judgement import Judgement, judge_operation
 from ded_bench.truth.ac_simulate import simulate_ac
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.plants.score import STRICT_HZ, judge
-from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.plants.plant import SimulationError
-from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
-from ded_bench.problem.instance import Initial, Instance
+from ded_bench.problem.instance import Initial, Instance, State
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.state import State
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.run.online.planner import Ask, Plan
 from ded_bench.run.online.record import Grid, Plant, Record
 

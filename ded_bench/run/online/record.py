@@ -11,10 +11,10 @@ from ded_bench.plants.lossless.integrator import Inputs, integrate
 from ded_bench.plants.lossless.network import Network, PowerFlowError
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.simulate import METHOD, STEP_BY_MODE
-from ded_bench.problem.trajectory import Trajectory
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import State
 from ded_bench.problem.scenario import Scenario
-from ded_bench.problem.state import State
+from ded_bench.problem.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.scenario_sampling import sample_scenario
+from ded_bench.problem.sampling import sample_scenario
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.hindsight import hindsight, whole_instance
 from ded_bench.run.online.judgement import judge_operation

@@ -13,7 +13,7 @@ from ded_bench.plants.lossless.servable import servable
 from ded_bench.cli import main
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.scenario import load_scenarios
-from ded_bench.problem.scenario_sampling import scenario_files, write_scenarios
+from ded_bench.problem.benchmark import scenario_files, write_scenarios
 from ded_bench.results.online_results import OnlineResults, read_trajectory
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions

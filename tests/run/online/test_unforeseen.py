@@ -8,7 +8,7 @@ from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioRamp
-from ded_bench.problem.scenario_sampling import sample_scenario
+from ded_bench.problem.sampling import sample_scenario
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import Plan

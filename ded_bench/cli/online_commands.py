@@ -19,7 +19,7 @@ from ded_bench.cli.arguments import (
     positive_number,
 )
 from ded_bench.cli.messages import counted, say
-from ded_bench.problem.ac_case import TRUTHS, AcCase
+from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
@@ -60,7 +60,7 @@ def add_commands(commands: Any) -> None:
         default="predicted",
         help="what plans start from: the state when they take effect, or the measured one",
     )
-    p.add_argument("--truth", choices=TRUTHS, default=TRUTHS[0], help="network that is operated")
+    p.add_argument("--plant", choices=PLANTS, help="what is operated; default: the case's own")
     p.add_argument("--cold", action="store_true", help="never start a method from its last plan")
     p.add_argument("--time-limit", type=positive_number, metavar="S", help="per plan, of the clock (60 s)")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
@@ -96,8 +96,7 @@ def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operati
 
     search = search_folders(case, folder)
     files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
-    methods, data = chosen_methods(a, search), AcCase.of(case) if a.truth == "ac" else None
-    scenarios, regimes = load_scenarios(files, case), a.regime or tuple(case.regimes)
+    methods, scenarios = chosen_methods(a, search), load_scenarios(files, case)
     return [
         operation
         for forecast, latency in itertools.product(a.forecast, a.latency)
@@ -105,12 +104,12 @@ def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operati
             case,
             scenarios,
             methods,
-            regimes,
+            a.regime or tuple(case.regimes),
             LoopOptions(a.period, forecast=forecast, predict=a.state == "predicted", warm=not a.cold),
             latency,
             search,
             a.time_limit or LIMIT_S,
-            data,
+            a.plant,
         )
     ]
 

@@ -16,7 +16,6 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import (
     Manifest,
-    Split,
     load_manifest,
     load_split,
     problem_folder,
@@ -65,11 +64,13 @@ def _instances(a: argparse.Namespace) -> int:
 
     case = _drawable(a.case, None)
     home = problem_folder(a.case, case)
-    split = load_split(home) if (home / "split.json").is_file() else Split(seed=SEED, train=(), test=())
-    there = len(split.train) + len(split.test)
+    split = load_split(home) if (home / "split.json").is_file() else None
+    test, seed = a.test, SEED if split is None else split.seed
+    there = 0 if split is None else len(split.train) + len(split.test)
     count = a.count or there or COUNT
-    test = a.test or (len(split.test) if count == there else None)
-    seed = split.seed if a.seed is None else a.seed
+    if test is None and split is not None and count == there:
+        test = len(split.test)
+    seed = seed if a.seed is None else a.seed
     folder = a.out or home
 
     def draw(folder: Path) -> Manifest:

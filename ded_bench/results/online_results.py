@@ -11,27 +11,31 @@ import numpy as np
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table, cell, plain_name
-from ded_bench.problem.trajectory import Trajectory
-from ded_bench.problem.ac_case import TRUTHS
 from ded_bench.problem.forecast import QUALITIES
+from ded_bench.problem.trajectory import Trajectory
+from ded_bench.results.legacy import upgraded
 
 #: Trajectories are kept at points this far apart, s.
 KEPT_S = 0.1
+#: The plant of rows that name none.
+PLANT = "lossless"
 
 
 class OnlineKey(NamedTuple):
-    """What makes a row of `online.csv` unique."""
+    """What makes a row of `online.csv` unique. `model` and `policy` are `name@fingerprint`, or empty."""
 
     scenario: str
     regime: str
     method: str
     settings: str
+    model: str
+    policy: str
     period_s: float
     latency_s: float
     forecast: str
     predicted: bool
     warm: bool
-    truth: str = TRUTHS[0]
+    plant: str = PLANT
 
 
 class HindsightKey(NamedTuple):
@@ -39,7 +43,7 @@ class HindsightKey(NamedTuple):
 
     scenario: str
     regime: str
-    truth: str = TRUTHS[0]
+    plant: str = PLANT
 
 
 def _quality(text: str) -> str:
@@ -48,19 +52,11 @@ def _quality(text: str) -> str:
     return text
 
 
-def _truth(text: str) -> str:
-    if text not in TRUTHS:
-        raise ValueError(text)
-    return text
-
-
 @dataclass(frozen=True)
 class OnlineRow:
-    """One scenario operated with one method's plans, judged on the true DAE (see `Judgement`).
+    """One scenario operated with one method's plans, judged on the plant that was operated (see `Judgement`).
 
-    `truth` names the network that was operated: the lossless one, or the full AC network. `unforeseen_hz`
-    is how far loads that no plan knew of move frequencies (see `unforeseen`); it depends on no method.
-
+    `unforeseen_hz` is how far loads that no plan knew of move frequencies; it depends on no method.
     `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
     that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
@@ -77,7 +73,7 @@ class OnlineRow:
     forecast: str = cell(check=_quality)
     predicted: bool = cell()
     warm: bool = cell()
-    truth: str = cell(default=TRUTHS[0], check=_truth)
+    plant: str = cell(default=PLANT, check=plain_name)
     objective: float | None = None
     increase_percent: float | None = None
     max_excess_hz: float | None = cell(default=None, lowest=0)
@@ -98,12 +94,12 @@ class OnlineRow:
     loop_s: float | None = None
     latency_source: str = ""  # timing, zero or given
     case: str = ""
-    model: str = ""
-    policy: str = ""
+    model: str = cell(default="", check=plain_name)
+    policy: str = cell(default="", check=plain_name)
     fingerprint: str = ""
-    code: str = ""
-    online_code: str = ""
     version: str = ""
+    commit: str = ""
+    method_version: int = 0
     host: str = ""
     date: str = ""
 
@@ -119,7 +115,7 @@ class HindsightRow:
 
     scenario: str = cell(check=plain_name)
     regime: str = cell(check=plain_name)
-    truth: str = cell(default=TRUTHS[0], check=_truth)
+    plant: str = cell(default=PLANT, check=plain_name)
     method: str = ""
     objective: float | None = None
     max_excess_hz: float | None = None
@@ -127,18 +123,20 @@ class HindsightRow:
     error: str = ""
     case: str = ""
     fingerprint: str = ""
-    online_code: str = ""
     version: str = ""
+    commit: str = ""
+    method_version: int = 0
     host: str = ""
     date: str = ""
 
     @property
     def key(self) -> HindsightKey:
         """The row's place in the table."""
-        return HindsightKey(self.scenario, self.regime, self.truth)
+        return HindsightKey(self.scenario, self.regime, self.plant)
 
 
-ONLINE, HINDSIGHT = Table(OnlineRow), Table(HindsightRow)
+ONLINE = Table(OnlineRow, since="method_version", upgrade=upgraded)
+HINDSIGHT = Table(HindsightRow, since="method_version", upgrade=upgraded)
 
 
 @dataclass(frozen=True)
@@ -160,20 +158,14 @@ class OnlineFiles:
     def trajectory(self, key: OnlineKey) -> Path:
         """The trajectory of a row."""
         loop = f"{key.period_s:g}s-{key.latency_s:g}s-{key.forecast}"
-        loop += "" if key.predicted else "-present"
-        loop += "" if key.warm else "-cold"
-        loop += _suffix(key.truth)
-        place = self.folder / "online" / key.method / key.settings / key.regime
+        loop += ("" if key.predicted else "-present") + ("" if key.warm else "-cold")
+        made_with = "+".join(filter(None, (key.settings, key.model, key.policy)))
+        place = self.folder / "online" / key.plant / key.method / made_with / key.regime
         return place / loop / f"{key.scenario}.safetensors"
 
-    def hindsight_trajectory(self, scenario: str, regime: str, truth: str = TRUTHS[0]) -> Path:
+    def hindsight_trajectory(self, scenario: str, regime: str, plant: str = PLANT) -> Path:
         """The trajectory of a scenario's hindsight."""
-        place = self.folder / "online" / f"hindsight{_suffix(truth)}"
-        return place / regime / f"{scenario}.safetensors"
-
-
-def _suffix(truth: str) -> str:
-    return "" if truth == TRUTHS[0] else f"-{truth}"
+        return self.folder / "online" / plant / "hindsight" / regime / f"{scenario}.safetensors"
 
 
 class OnlineResults:
@@ -187,6 +179,10 @@ class OnlineResults:
         self.files = OnlineFiles(folder)
         self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
         self.hindsight = KeyedTable[HindsightKey, HindsightRow](self.files.hindsight, HINDSIGHT)
+
+    def has(self, key: OnlineKey, fingerprint: str, version: int) -> bool:
+        """Whether there is a row of this key, from the same input and by no older version of the method."""
+        return self.table.made_from(key, fingerprint) and self.table.rows[key].method_version >= version
 
 
 def keep_trajectory(path: Path, trajectory: Trajectory) -> None:

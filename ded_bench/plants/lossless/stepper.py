@@ -210,7 +210,7 @@ def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> b
 
 @compiled
 def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> float:
-    """Largest difference of injections at algebraic buses from those wanted, pu; infinite if one is no number.
+    """Largest difference of algebraic buses' injections from those wanted, pu; infinite if one is no number.
 
     f receives the injections of all buses.
     """

@@ -1,8 +1,8 @@
 """The loop: measure, forecast, predict, plan, and follow the plan while the next one is made.
 
-A decision at τ leads to a plan from τ + latency on. Until then the grid follows the last plan, so that
-the state at τ + latency can be predicted; the loads of that prediction are forecast, the grid is the
-true one. Times are whole steps of the scenario's grid; a latency is rounded up to them.
+A decision at τ leads to a plan from τ + latency on. Until then the plant follows the last plan, so that the
+state at τ + latency can be predicted: the loads of that prediction are forecast, the plant is the true one.
+Times are whole steps of the scenario's grid; a latency is rounded up to them.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.plants.plant import SimulationError
+from ded_bench.methods.ramp_follower import follow
+from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
-from ded_bench.problem.instance import Initial, Instance, State
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
-from ded_bench.run.online.planner import Ask, Plan
-from ded_bench.run.online.record import Grid, Plant, Record
+from ded_bench.run.online.planner import Ask, Planned
 
 #: Steps that differ from a whole number by less are whole.
 WHOLE = 1e-6
@@ -36,9 +36,13 @@ class LoopOptions:
     predict: bool = True  # plan from the state predicted for τ + latency; False: from that at τ
     warm: bool = True  # methods that can use the plan in force are given it
 
+    def steps(self, dt_s: float) -> tuple[int, int]:
+        """Period and latency in steps of the grid."""
+        return max(round(self.period_s / dt_s), 1), math.ceil(self.latency_s / dt_s - WHOLE)
+
 
 @dataclass(frozen=True)
-class Outcome:
+class LoopOutcome:
     """What happened, and how the plans came."""
 
     trajectory: Trajectory
@@ -71,9 +75,40 @@ class _Course:
         return Schedule(times, self.schedule.at(times + (start - self.start) * self.dt))
 
 
+class _History:
+    """What a plant has done since t = 0, and where it is; grows piece by piece."""
+
+    def __init__(self, case: Case, scenario: Scenario, plant: Plant) -> None:
+        first, n = scenario.snapshot(case, 0.0), scenario.steps + 1
+        self._case, self._plant, self._grid, self._dt = case, plant, scenario.grid, scenario.dt_s
+        self.now, self.state = 0, plant.initial(first)
+        self.p_load = scenario.p_load(case)
+        self.omega, self.p_set, self.p_gen = np.empty((3, n, len(case.generators)))
+        self.p_slack = np.empty(n)
+        self.p_set[0] = first.p_initial(case)
+
+    def go_on(self, p_set: Array) -> None:
+        """Go on under set-points at the present point and those after it, shape (n, n_gen), pu."""
+        k = slice(self.now, self.now + len(p_set))
+        piece = self.ahead(p_set, self.p_load[k])
+        self.omega[k], self.p_set[k], self.p_gen[k] = piece.omega, p_set, piece.p_gen
+        self.p_slack[k], self.state = piece.p_slack, piece.end
+        self.now += len(p_set) - 1
+
+    def ahead(self, p_set: Array, p_load: Array) -> Piece:
+        """What set-points and loads from now on would lead to; raises as `Plant.advance`."""
+        return self._plant.advance(self.state, p_set, p_load, self._dt)
+
+    def trajectory(self) -> Trajectory:
+        """All of it, without the plant's own states."""
+        return Trajectory(
+            self._grid, self.omega, self.p_set, self.p_gen, self.p_load, self.p_slack, self._case
+        )
+
+
 def run_loop(
-    case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Grid | None = None
-) -> Outcome:
+    case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Plant | None = None
+) -> LoopOutcome:
     """Operate one scenario with plans of one method.
 
     The first plan is made for the true initial state and is there at t = 0; decisions follow every period,
@@ -85,76 +120,68 @@ def run_loop(
         scenario: what happens.
         ask: for plans.
         options: how the loop runs.
-        plant: what is operated; without it, the lossless network.
+        plant: what is operated; None: the case's own.
 
     Raises:
-        SimulationError: the system loses synchronism.
+        SimulationError: the plant cannot follow.
     """
-    return _Loop(case, scenario, ask, options, plant or Plant(case, scenario)).run()
+    return _Loop(case, scenario, ask, options, plant or plant_of(case)).run()
 
 
 class _Loop:
-    def __init__(self, case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Grid) -> None:
-        self.case, self.scenario, self.ask, self.options = case, scenario, ask, options
+    def __init__(self, case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Plant) -> None:
+        self.case, self.scenario, self.ask, self.options, self.plant = case, scenario, ask, options, plant
         self.dt, self.horizon = scenario.dt_s, case.sampling.horizon_s
-        self.lag = math.ceil(options.latency_s / self.dt - WHOLE)
-        self.period = max(round(options.period_s / self.dt), 1)
-        self.record = Record(case, scenario, plant)
-        power = self.record.p_gen[0]
+        self.history = _History(case, scenario, plant)
+        power = self.history.p_set[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
         self.course, self.held = _Course(stay, 0, self.dt), False
-        self.plans: list[Plan] = []
+        self.asked: list[Planned] = []
 
-    def run(self) -> Outcome:
+    def run(self) -> LoopOutcome:
         last = self.scenario.steps
+        period, lag = self.options.steps(self.dt)
         self._take(self._decide(0), 0)
-        decision = self.period
-        while decision + self.lag < last:
+        decision = period
+        while decision + lag < last:
             self._go_on(decision)
-            due = decision + self.lag
-            plan = self._decide(self.lag)
+            due = decision + lag
+            answer = self._decide(lag)
             self._go_on(due)
-            self._take(plan, due if self.options.predict else decision)
-            decision = max(decision + self.period, due)
+            self._take(answer, due if self.options.predict else decision)
+            decision = max(decision + period, due)
         self._go_on(last)
         return self._outcome()
 
-    def _decide(self, lag: int) -> Plan:
+    def _decide(self, lag: int) -> Planned:
         """Ask for a plan from `lag` steps after now, or from now on."""
-        now = self.record.now
-        loads = self._forecast(now, now + lag)
+        now = self.history.now
         start = now + lag if self.options.predict else now
+        until = (now + lag) * self.dt + self.horizon
+        loads = forecast(self.scenario, self.case, self.options.forecast, now * self.dt, until)
         try:
             instance = self._instance(self._state(loads, start), loads, start)
         except SimulationError as error:
-            plan = Plan(None, error=f"no prediction: {error}")
+            answer = Planned(None, error=f"no prediction: {error}")
         else:
             warm = self.options.warm and self.held
-            plan = self.ask(instance, self.course.later(start, self.horizon) if warm else None)
-        self.plans.append(plan)
-        return plan
+            answer = self.ask(instance, self.course.later(start, self.horizon) if warm else None)
+        self.asked.append(answer)
+        return answer
 
-    def _take(self, plan: Plan, start: int) -> None:
-        if plan.schedule is not None:
-            self.course, self.held = _Course(plan.schedule, start, self.dt), True
+    def _take(self, answer: Planned, start: int) -> None:
+        if answer.schedule is not None:
+            self.course, self.held = _Course(answer.schedule, start, self.dt), True
 
-    def _forecast(self, now: int, start: int) -> Forecast:
-        until = start * self.dt + self.horizon
-        return forecast(self.scenario, self.case, self.options.forecast, now * self.dt, until)
-
-    def _state(self, loads: Forecast, start: int) -> State:
+    def _state(self, loads: Forecast, start: int) -> PlantState:
         """The state that a plan from `start` begins with."""
-        if start == self.record.now:
-            return self.record.state()
-        times = np.arange(self.record.now, start + 1, dtype=np.float64) * self.dt
-        return self.record.predicted(self._followed(start), loads.at(times))
+        if start == self.history.now:
+            return self.history.state
+        times = np.arange(self.history.now, start + 1, dtype=np.float64) * self.dt
+        return self.history.ahead(self._followed(start), loads.at(times)).end
 
-    def _instance(self, state: State, loads: Forecast, start: int) -> Instance:
+    def _instance(self, state: PlantState, loads: Forecast, start: int) -> Instance:
         points = loads.points(start * self.dt, self.horizon)
-        values = ((state.p_gen, "power"), (state.omega, "omega"), (state.theta, "theta"))
-        initial = {
-            name: dict(zip(self.case.generators, array.tolist(), strict=True)) for array, name in values
-        }
         return Instance(
             schema_="ded-bench/instance/2",
             id=f"{self.scenario.id[:50]}-{start}",
@@ -164,44 +191,29 @@ class _Loop:
             dt_s=self.dt,
             cost=self.scenario.cost,
             load=dict(zip(self.case.loads, points, strict=True)),
-            initial=Initial(**initial),
+            initial=self.plant.observed(state).initial(self.case),
         )
 
     def _go_on(self, until: int) -> None:
-        if until > self.record.now:
-            self.record.advance(self._followed(until))
+        if until > self.history.now:
+            self.history.go_on(self._followed(until))
 
     def _followed(self, until: int) -> Array:
-        """Powers from now to `until` on the way to the plan's, within ramp limits."""
-        wanted = self.course.at(self.record.now, until)
-        return follow(wanted, self.record.p_gen[self.record.now], self.case.ramp * self.dt)
+        """Set-points from now to `until` on the way to the plan's, within ramp limits."""
+        now = self.history.now
+        wanted = self.course.at(now, until)
+        power: Array = follow(wanted[None, 1:], self.history.p_set[None, now], self.case.ramp * self.dt)[0]
+        return power
 
-    def _outcome(self) -> Outcome:
-        missing = [plan for plan in self.plans if plan.schedule is None]
-        return Outcome(
-            trajectory=self.record.trajectory(),
-            plans=len(self.plans),
-            late=sum(plan.late for plan in missing),
-            failed=sum(not plan.late for plan in missing),
-            infeasible=sum(plan.infeasible and plan.schedule is not None for plan in self.plans),
-            warm=any(plan.warm for plan in self.plans),
-            method_s=sum(plan.seconds for plan in self.plans),
+    def _outcome(self) -> LoopOutcome:
+        missing = [answer for answer in self.asked if answer.schedule is None]
+        return LoopOutcome(
+            trajectory=self.history.trajectory(),
+            plans=len(self.asked),
+            late=sum(answer.late for answer in missing),
+            failed=sum(not answer.late for answer in missing),
+            infeasible=sum(answer.infeasible and answer.schedule is not None for answer in self.asked),
+            warm=any(answer.warm for answer in self.asked),
+            method_s=sum(answer.seconds for answer in self.asked),
             error=missing[0].error if missing else "",
         )
-
-
-def follow(wanted: Array, power: Array, step: Array) -> Array:
-    """Powers that start at `power` and change by at most `step` from point to point towards the wanted ones.
-
-    Args:
-        wanted: shape (n, n_gen), pu; its first row is that of `power`.
-        power: shape (n_gen,), pu.
-        step: shape (n_gen,), pu.
-    """
-    followed = wanted.copy()
-    followed[0] = power
-    if not (np.abs(np.diff(followed, axis=0)) > step).any():
-        return followed
-    for k in range(1, len(followed)):
-        followed[k] = followed[k - 1] + np.clip(wanted[k] - followed[k - 1], -step, step)
-    return followed

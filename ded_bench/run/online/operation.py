@@ -8,18 +8,20 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.artifact import Artifact, named
+from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings
-from ded_bench.online.ac_plant import AcPlant
-from ded_bench.problem.ac_case import TRUTHS, AcCase
+from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import (
     HindsightKey,
     HindsightRow,
@@ -29,56 +31,37 @@ from ded_bench.results.online_results import (
     OnlineRow,
     keep_trajectory,
 )
-from ded_bench.run.code import code_of, code_of_method, named
-from ded_bench.run.environment import host, now, version
-from ded_bench.run.online import hindsight as hindsight_module
-from ded_bench.run.online import loop as loop_module
-from ded_bench.run.online.hindsight import hindsight
-from ded_bench.run.online.judgement import Judgement, judge_operation
-from ded_bench.run.online.latency import timed_latency
+from ded_bench.results.timing import model_name, read_timing
+from ded_bench.run.environment import commit, host, now, version
+from ded_bench.run.online.judgement import Judgement, hindsight, judge_operation, unforeseen_hz
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import LIMIT_S, Planner
-from ded_bench.run.online.record import Grid, Plant
-from ded_bench.run.online.unforeseen import unforeseen_hz
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import reason_of
-
-#: Settings and models whose plans start from angles of the AC network: they stand for it.
-AC_ANGLES = {"ac", "trajectory-ac"}
 
 
 @dataclass(frozen=True)
 class Operation:
-    """One row to be made."""
+    """One row to be made. `settings` are canonical, `version` is the method's, `plant` what is operated."""
 
     scenario: Scenario
     regime: str
     method: str
     settings: Settings
+    version: int
     options: LoopOptions
     limit_s: float
     latency_source: str
     artifacts: tuple[Artifact, ...]
+    plant: str
     fingerprint: str
-    code: str
-    data: AcCase | None = None  # operate the full AC network
-
-    @property
-    def truth(self) -> str:
-        """Which network is operated."""
-        return TRUTHS[self.data is not None]
-
-    @property
-    def plans_on_ac(self) -> bool:
-        """Whether plans are made with a model in which angles are those of the AC network."""
-        return bool({self.settings.name, *(a.name for a in self.artifacts)} & AC_ANGLES)
 
     @property
     def key(self) -> OnlineKey:
         """The row's place in the table."""
-        o = self.options
-        name = self.scenario.id, self.regime, self.method, self.settings.slug
-        return OnlineKey(*name, o.period_s, o.latency_s, o.forecast, o.predict, o.warm, self.truth)
+        o, made_with = self.options, (named(self.artifacts, "model"), named(self.artifacts, "policy"))
+        name = self.scenario.id, self.regime, self.method, self.settings.options, *made_with
+        return OnlineKey(*name, o.period_s, o.latency_s, o.forecast, o.predict, o.warm, self.plant)
 
 
 def make_operations(
@@ -90,38 +73,49 @@ def make_operations(
     latency: str,
     timing: Sequence[Path],
     limit_s: float = LIMIT_S,
-    data: AcCase | None = None,
+    plant: str | None = None,
 ) -> list[Operation]:
     """List every row of a run, a method's together.
 
     Args:
+        case: the grid.
+        scenarios: to be operated.
         methods: names with their settings.
+        regimes: of the case.
         options: of the loop; its latency is replaced.
         latency: `timing`, `zero`, or seconds.
         timing: results folders whose `timing.csv` may tell the latency.
         limit_s: how long a method may take for a plan, s of the clock.
-        data: of the case's AC network, to operate that.
+        plant: name of what is operated; None: the case's own.
 
     Raises:
-        InputError: unknown method, regime or settings, a model or policy that is missing, or no latency.
+        InputError: unknown method, regime, options or plant, no model or policy, or no latency.
     """
     case.check_regimes(regimes)
-    operations, ac = [], () if data is None else (data.fingerprint,)
-    for name, settings in methods:
-        method = get_method(name)
+    operated = plant_of(case, plant)
+    operations = []
+    for method, given in ((get_method(name), settings) for name, settings in methods):
+        settings = method.canonical(given)
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
-            timed = dataclasses.replace(settings, name=method.timed_as(settings.name))
-            seconds, source = _latency(case, (regime, method.name, timed.slug), latency, timing)
+            seconds, source = _latency(case, regime, method, settings, artifacts, latency, timing)
             own = dataclasses.replace(options, latency_s=seconds)
-            code = code_of_method(method, settings.name, artifacts)
-            shared = own, limit_s, source, artifacts
             for scenario in scenarios:
-                fingerprint = _fingerprint(
-                    case, scenario, *(a.fingerprint for a in artifacts), f"{limit_s:g}", *ac
-                )
+                made_from = *(a.fingerprint for a in artifacts), f"{limit_s:g}"
                 operations.append(
-                    Operation(scenario, regime, method.name, settings, *shared, fingerprint, code, data)
+                    Operation(
+                        scenario=scenario,
+                        regime=regime,
+                        method=method.name,
+                        settings=settings,
+                        version=method.version,
+                        options=own,
+                        limit_s=limit_s,
+                        latency_source=source,
+                        artifacts=artifacts,
+                        plant=operated.name,
+                        fingerprint=_fingerprint(case, operated.name, scenario, *made_from),
+                    )
                 )
     return operations
 
@@ -141,7 +135,7 @@ def operate(
     Raises:
         WorkersLostError: the workers cannot run this package.
     """
-    todo = [o for o in operations if not results.table.made_from(o.key, o.fingerprint)]
+    todo = [o for o in operations if not results.has(o.key, o.fingerprint, o.version)]
     with Workers(workers) as pool:
         _look_back(case, todo, results, pool)
         calls = ((operate_one, (case, o, results.files)) for o in todo)
@@ -157,11 +151,8 @@ def operate(
 
 def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineRow:
     """Operate one scenario in this process, and keep its trajectory."""
-    o, started = operation, time.perf_counter()
+    o, started, plant = operation, time.perf_counter(), plant_of(case, operation.plant)
     planner = Planner(case, o.regime, o.method, o.settings, o.limit_s)
-    plant: Grid = Plant(case, o.scenario)
-    if o.data is not None:
-        plant = AcPlant(case, o.scenario, o.data, not o.plans_on_ac)
     outcome = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, outcome.trajectory, o.regime)
     keep_trajectory(files.trajectory(o.key), outcome.trajectory)
@@ -180,15 +171,15 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     )
 
 
-def look_back(
-    case: Case, scenario: Scenario, regime: str, data: AcCase | None, files: OnlineFiles
-) -> HindsightRow:
+def look_back(case: Case, scenario: Scenario, regime: str, plant: str, files: OnlineFiles) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
-    found, row = hindsight(case, scenario, regime, data), _hindsight_row(case, scenario, regime, data)
-    keep_trajectory(files.hindsight_trajectory(scenario.id, regime, row.truth), found.trajectory)
+    found = hindsight(case, scenario, regime, plant_of(case, plant))
+    row = _hindsight_row(case, scenario, regime, plant)
+    keep_trajectory(files.hindsight_trajectory(*row.key), found.trajectory)
     return dataclasses.replace(
         row,
         method=found.method,
+        method_version=get_method(found.method).version,
         objective=found.judgement.objective,
         max_excess_hz=found.judgement.max_excess_hz,
         slack_travel_pu=found.judgement.slack_travel_pu,
@@ -197,26 +188,22 @@ def look_back(
 
 def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:
     """Find the hindsight of every scenario and regime that is not there yet."""
-    wanted = [_hindsight_row(case, o.scenario, o.regime, o.data) for o in todo]
-    new = {
-        row.key: (o.scenario, o.regime, o.data)
-        for o, row in zip(todo, wanted, strict=True)
-        if not results.hindsight.made_from(row.key, row.fingerprint)
-    }
-    missing = list(new.values())
+    asked = {(o.scenario.id, o.regime, o.plant): (o.scenario, o.regime, o.plant) for o in todo}
+    wanted = {one: _hindsight_row(case, *one) for one in asked.values()}
+    missing = [
+        one for one, row in wanted.items() if not results.hindsight.made_from(row.key, row.fingerprint)
+    ]
     calls = ((look_back, (case, *one, results.files)) for one in missing)
-    for (scenario, regime, data), answer in tqdm(
+    for one, answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
     ):
-        row = answer
-        if not isinstance(row, HindsightRow):
-            row = dataclasses.replace(_hindsight_row(case, scenario, regime, data), error=reason_of(answer))
-        results.hindsight.add([row])
+        failed = dataclasses.replace(wanted[one], error=reason_of(answer))
+        results.hindsight.add([answer if isinstance(answer, HindsightRow) else failed])
 
 
 def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:
     """A row with its cost over hindsight, where both are known."""
-    best = results.hindsight.rows[HindsightKey(row.scenario, row.regime, row.truth)].objective
+    best = results.hindsight.rows[HindsightKey(row.scenario, row.regime, row.plant)].objective
     if row.objective is None or not best:
         return row
     return dataclasses.replace(row, increase_percent=100 * (row.objective / best - 1))
@@ -229,41 +216,40 @@ def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> O
     return OnlineRow(
         **o.key._asdict(),
         **numbers,
+        **_made(o.fingerprint),
         error=error,
         limit_s=o.limit_s,
         latency_source=o.latency_source,
         case=o.scenario.case,
-        model=named(o.artifacts, "model"),
-        policy=named(o.artifacts, "policy"),
-        fingerprint=o.fingerprint,
-        code=o.code,
-        online_code=code_of(loop_module.__name__),
-        version=version(),
-        host=host(),
-        date=now(),
+        method_version=o.version,
     )
 
 
-def _hindsight_row(case: Case, scenario: Scenario, regime: str, data: AcCase | None) -> HindsightRow:
-    ac = () if data is None else (data.fingerprint,)
-    return HindsightRow(
-        scenario=scenario.id,
-        regime=regime,
-        truth=TRUTHS[data is not None],
-        case=case.id,
-        fingerprint=_fingerprint(case, scenario, *ac),
-        online_code=code_of(hindsight_module.__name__),
-        version=version(),
-        host=host(),
-        date=now(),
-    )
+def _hindsight_row(case: Case, scenario: Scenario, regime: str, plant: str) -> HindsightRow:
+    made = _made(_fingerprint(case, plant, scenario))
+    return HindsightRow(scenario=scenario.id, regime=regime, plant=plant, case=case.id, **made)
+
+
+def _made(fingerprint: str) -> dict[str, Any]:
+    """What made a row, where and when."""
+    facts = {"fingerprint": fingerprint, "version": version(), "commit": commit()}
+    return facts | {"host": host(), "date": now()}
 
 
 def _latency(
-    case: Case, name: tuple[str, str, str], latency: str, timing: Sequence[Path]
+    case: Case,
+    regime: str,
+    method: Method,
+    settings: Settings,
+    artifacts: Sequence[Artifact],
+    latency: str,
+    timing: Sequence[Path],
 ) -> tuple[float, str]:
+    """Seconds from measurement to plan, and where they are from."""
     if latency == "timing":
-        return timed_latency(case, *name, timing), "timing"
+        timed = method.canonical(settings, timed=True).options
+        job = regime, method.name, timed, model_name(named(artifacts, "model"))
+        return timed_latency(case, job, timing), "timing"
     if latency == "zero":
         return 0.0, "zero"
     try:
@@ -275,7 +261,33 @@ def _latency(
     return seconds, "given"
 
 
-def _fingerprint(case: Case, scenario: Scenario, *parts: str) -> str:
-    """Twelve hex digits that change with case, scenario and what else decides on a row."""
-    text = "|".join([case.fingerprint, scenario.fingerprint, *parts])
+def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[Path]) -> float:
+    """Median build and solve time in the `timing.csv` of the first folder that timed a method, s.
+
+    Args:
+        case: the grid.
+        job: regime, method, settings and surrogate (see `TimingRow.job`).
+        folders: of results.
+
+    Raises:
+        InputError: none of the folders has such times (names the command that makes them).
+    """
+    for folder in folders:
+        rows = read_timing(ResultsFolder(folder).timing)
+        times = [
+            (row.build_s or 0.0) + (row.solve_s or 0.0)
+            for row in rows
+            if row.case == case.id and row.job == job and row.counts
+        ]
+        if times:
+            return float(np.median(times))
+    problem = "is not timed; run `ded-bench bench`, or give --latency in seconds"
+    raise InputError("--latency timing", " ".join(filter(None, (*job[1:], job[0]))), problem)
+
+
+def _fingerprint(case: Case, plant: str, scenario: Scenario, *parts: str) -> str:
+    """Twelve hex digits that change with case, plant, scenario and what else decides on a row."""
+    # A plant whose data are the case's has its fingerprint, which then counts once.
+    data = dict.fromkeys([case.fingerprint, plant_of(case, plant).fingerprint])
+    text = "|".join([*data, scenario.fingerprint, *parts])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -24,7 +24,7 @@ LIMIT_S = 60.0
 
 
 @dataclass(frozen=True)
-class Plan:
+class Planned:
     """A method's answer to one instance: a schedule, or why there is none."""
 
     schedule: Schedule | None
@@ -36,7 +36,7 @@ class Plan:
 
 
 #: Asks for a plan; the second argument is the last one, on the time of the instance.
-Ask = Callable[[Instance, Schedule | None], Plan]
+Ask = Callable[[Instance, Schedule | None], Planned]
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Planner:
     limit_s: float = LIMIT_S
     _ready: bool = False
 
-    def __call__(self, instance: Instance, last: Schedule | None = None) -> Plan:
+    def __call__(self, instance: Instance, last: Schedule | None = None) -> Planned:
         """Ask for a plan; the process prepares the method first, if it has not done so yet."""
         started = time.perf_counter()
         job = self.case, self.method, self.regime, self.settings
@@ -64,12 +64,12 @@ class Planner:
             return self._none(answer, started)
         solution, warm = answer
         seconds, infeasible = time.perf_counter() - started, solution.status == Status.INFEASIBLE
-        return Plan(solution.schedule, False, warm, infeasible, seconds, solution.error)
+        return Planned(solution.schedule, False, warm, infeasible, seconds, solution.error)
 
-    def _none(self, error: object, started: float) -> Plan:
+    def _none(self, error: object, started: float) -> Planned:
         self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
         late = isinstance(error, NoAnswerError)
-        return Plan(None, late, seconds=time.perf_counter() - started, error=str(error))
+        return Planned(None, late, seconds=time.perf_counter() - started, error=str(error))
 
 
 def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:

@@ -1,22 +1,22 @@
-"""The loop does what its plans say, predicts rightly, compensates latency and survives faults."""
+"""The loop does what its plans say, predicts rightly, compensates latency, survives faults, and is judged."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.methods import ded_slp
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.plants.plant import plant_of, servable
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
+from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioRamp
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.online.hindsight import hindsight, whole_instance
-from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, follow, run_loop
-from ded_bench.run.online.planner import Plan, Planner
+from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz, whole_instance
+from ded_bench.run.online.loop import LoopOptions, run_loop
+from ded_bench.run.online.planner import Planned, Planner
 from ded_bench.solvers.status import Status
 from tests.conftest import CASE_FILES
 
@@ -38,14 +38,14 @@ class Asked:
         self.last: list[Schedule | None] = []
         self.schedules: list[Schedule] = []
 
-    def __call__(self, instance: Instance, last: Schedule | None) -> Plan:
+    def __call__(self, instance: Instance, last: Schedule | None) -> Planned:
         start = None if last is None else Solution(Status.FEASIBLE, last)
         schedule = self.solver.solve(instance, start).schedule
         self.instances.append(instance)
         self.last.append(last)
         if schedule is not None:  # else no plan keeps the bound any more
             self.schedules.append(schedule)
-        return Plan(schedule, warm=last is not None)
+        return Planned(schedule, warm=last is not None)
 
 
 def drawn(case: Case, horizons: int = 2):
@@ -75,12 +75,13 @@ def test_plans_start_from_the_state_when_they_take_effect(small, quality, tolera
     trajectory = run_loop(small, scenario, asked, options).trajectory
     starts = [round(int(i.id.rsplit("-", 1)[1])) for i in asked.instances]
     assert starts[:3] == [0, 50 + 74, 50 + 74 + 74]  # latencies are rounded up to steps
-    gens = [i for i, bus in enumerate(small.buses) if bus.kind == "generator"]
+    again = simulate(small, whole_instance(small, scenario), Schedule(trajectory.t, trajectory.p_set))
+    angles = np.stack([again.columns[f"theta_{bus}"] for bus in small.generators], axis=1)
     wrong = []
     for k, instance in zip(starts, asked.instances, strict=True):
-        np.testing.assert_allclose(instance.p_initial(small), trajectory.p_gen[k], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(instance.p_initial(small), trajectory.p_set[k], rtol=0, atol=1e-12)
         wrong.append(np.abs(instance.omega_initial(small) - trajectory.omega[k]).max())
-        wrong.append(np.abs(instance.theta_initial(small) - trajectory.theta[k, gens]).max())
+        wrong.append(np.abs(instance.theta_initial(small) - angles[k]).max())
     assert max(wrong) < tolerance
     assert (max(wrong) > 1e-9) == (quality != "perfect")
 
@@ -138,7 +139,7 @@ def test_prediction_buys_back_latency():
 def test_a_faulty_method_is_counted_and_the_loop_goes_on(threebus, name, late, failed):
     """Plans at 2 s and 5 s do not come; without any plan, powers stay."""
     scenario = drawn(threebus, 1)
-    planner = Planner(threebus, REGIME, f"tests.online.faulty_methods:{name}", Settings(), limit_s=2.0)
+    planner = Planner(threebus, REGIME, f"tests.run.online.faulty_methods:{name}", Settings(), limit_s=2.0)
     outcome = run_loop(threebus, scenario, planner, LoopOptions())
     assert (outcome.plans, outcome.late, outcome.failed) == (6, late, failed)
     assert outcome.error
@@ -150,25 +151,34 @@ def test_a_faulty_method_is_counted_and_the_loop_goes_on(threebus, name, late, f
 @pytest.mark.parametrize("warm", [True, False])
 def test_plans_that_meet_not_every_limit_are_followed_and_counted(threebus, warm):
     """By a method of others, which is given the plan in force if that is wanted."""
-    planner = Planner(threebus, REGIME, "tests.online.faulty_methods:strained", Settings())
+    planner = Planner(threebus, REGIME, "tests.run.online.faulty_methods:strained", Settings())
     outcome = run_loop(threebus, drawn(threebus, 1), planner, LoopOptions(warm=warm))
     assert (outcome.plans, outcome.late, outcome.failed, outcome.infeasible) == (6, 0, 0, 2)
     assert (outcome.warm, outcome.error) == (warm, "")
 
 
-def test_following_respects_ramps():
-    """Towards a jump at the limit; unchanged where the plan is within it."""
-    step = np.array([0.1, 1.0])
-    wanted = np.array([[0.0, 0.0], [0.5, 0.5], [0.5, 0.5], [0.15, 0.5]])
-    followed = follow(wanted, np.array([0.0, 0.0]), step)
-    np.testing.assert_allclose(followed, [[0, 0], [0.1, 0.5], [0.2, 0.5], [0.15, 0.5]], atol=1e-15)
-    assert (follow(wanted, wanted[0], np.array([1.0, 1.0])) == wanted).all()
+def test_another_plant_is_operated_and_plans_are_for_the_own_one(threebus, lagged):
+    """Delivered powers lag behind set-points; plans go on from set-points, and the cost is of what came."""
+    scenario, asked = drawn(threebus, 1), Asked(threebus)
+    plant = plant_of(threebus, "lagged")
+    found = run_loop(threebus, scenario, asked, LoopOptions(latency_s=0.3), plant).trajectory
+    assert 1e-3 < np.abs(found.p_gen - found.p_set).max() < 0.1
+    for instance in asked.instances:
+        k = int(instance.id.rsplit("-", 1)[1])
+        np.testing.assert_allclose(instance.p_initial(threebus), found.p_set[k], rtol=0, atol=1e-12)
+    schedule = Schedule(found.t, found.p_set)
+    wanted = simulate(threebus, whole_instance(threebus, scenario), schedule, plant)
+    np.testing.assert_allclose(found.omega, wanted.omega, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.p_gen, wanted.p_gen, rtol=0, atol=1e-12)
+    judgement = judge_operation(threebus, scenario, found, REGIME)
+    instance = whole_instance(threebus, scenario)
+    assert judgement.objective == found.cost(instance.cost_gen(threebus), instance.cost_slack(threebus))
 
 
 def test_the_judgement_of_a_known_trajectory(threebus):
     """Half of the time beyond the bound by a known excess; slack travel by hand."""
     scenario = drawn(threebus, 1)
-    trajectory = run_loop(threebus, scenario, lambda *_: Plan(None), LoopOptions()).trajectory
+    trajectory = run_loop(threebus, scenario, lambda *_: Planned(None), LoopOptions()).trajectory
     bound, n = threebus.omega_bound(REGIME), len(trajectory.t)
     trajectory.omega[:] = 0.0
     trajectory.omega[: n // 2] = -(bound + 2 * np.pi * 0.001)
@@ -181,3 +191,48 @@ def test_the_judgement_of_a_known_trajectory(threebus):
     assert found.slack_travel_pu == 1.0
     cost = trajectory.p_gen[0] @ [scenario.cost[g] for g in threebus.generators]
     assert found.objective == pytest.approx(n * (cost + 0.25 * scenario.cost[threebus.slack]))
+
+
+def surprising(case: Case, rate: float) -> Scenario:
+    """Nothing happens but one ramp that nobody announced."""
+    scenario = sample_scenario(case, 0, 3, servable, 20.0)
+    load = {}
+    for number, (bus, one) in enumerate(scenario.load.items()):
+        ramp = ScenarioRamp(start=4.45, duration=10.0, rate=rate, announced_start=None, announced_rate=None)
+        still = Fluctuation(step_s=1.0, values=(0.0, 0.0), decay_s=20.0)
+        load[bus] = one.model_copy(update={"ramps": (ramp,) if number == 0 else (), "fluctuation": still})
+    return scenario.model_copy(update={"load": load})
+
+
+def stay(instance, last):
+    """Powers stay as they are."""
+    power = np.array(list(instance.initial.power.values()))
+    return Planned(Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power])))
+
+
+@pytest.mark.parametrize("options", [LoopOptions(), LoopOptions(period_s=0.7, latency_s=1.2)])
+def test_it_is_what_happens_when_powers_stay(case: Case, options: LoopOptions) -> None:
+    """From the one ramp to the plan that knows of it: the difference it makes."""
+    scenario = surprising(case, -1e-2)
+    found = unforeseen_hz(case, scenario, options, plant_of(case))
+    with_ramp, without = (
+        run_loop(case, one, stay, options).trajectory.omega for one in (scenario, surprising(case, 0.0))
+    )
+    moved = np.abs(with_ramp - without) / (2 * np.pi)
+    decisions = np.arange(0.0, 20.0, max(options.period_s, options.latency_s))
+    known = decisions[decisions > 4.45][0] + options.latency_s
+    reached = moved[: round(known / scenario.dt_s) + 1].max()
+    # The grid is nearly linear: it matters little that one swings a little at t = 0 and the other rests.
+    assert found == pytest.approx(reached, rel=1e-2)
+    assert found > 0
+
+
+def test_what_is_foreseen_moves_nothing_and_what_comes_late_moves_more(case: Case) -> None:
+    scenario = surprising(case, -1e-3)
+    plant = plant_of(case)
+    foreseen = unforeseen_hz(case, scenario, LoopOptions(forecast="perfect"), plant)
+    assert foreseen == pytest.approx(0.0, abs=1e-12)
+    moved = [unforeseen_hz(case, scenario, LoopOptions(period_s=s), plant) for s in (0.1, 1.0, 2.0)]
+    assert 0 < moved[0] < moved[1] < moved[2]
+    twice = unforeseen_hz(case, surprising(case, -2e-3), LoopOptions(period_s=1.0), plant)
+    assert twice == pytest.approx(2 * moved[1], rel=1e-3)  # nearly linear

@@ -8,18 +8,19 @@ import shutil
 
 import numpy as np
 import pytest
-from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.cli import main
 from ded_bench.methods.solution import Settings
-from ded_bench.problem.scenario import load_scenarios
+from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import scenario_files, write_scenarios
-from ded_bench.results.online_results import OnlineResults, read_trajectory
+from ded_bench.problem.scenario import load_scenarios
+from ded_bench.results.online_results import OnlineKey, OnlineResults, read_trajectory
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions
 from ded_bench.run.online.operation import make_operations, operate
 from tests.conftest import CASE_FILES
 
+FAULTY = "tests.run.online.faulty_methods"
 #: What the clock and the day decide on.
 VARYING = {"method_s": None, "loop_s": None, "date": ""}
 
@@ -35,7 +36,7 @@ def scenarios(threebus, tmp_path_factory):
 def operations(case, files, latency="0.3", method="ed", limit_s=60.0):
     """Rows of one method in one regime."""
     loaded = load_scenarios(files, case)
-    chosen = [(method, Settings("1s" if method == "ed" else "default"))]
+    chosen = [(method, Settings("every=1" if method == "ed" else "default"))]
     return make_operations(case, loaded, chosen, ["TO"], LoopOptions(), latency, [], limit_s)
 
 
@@ -54,13 +55,13 @@ def test_rows_hold_all_that_is_judged(threebus, first_run):
     for row in rows:
         assert (row.plans, row.late, row.failed, row.error) == (6, 0, 0, "")
         assert (row.latency_s, row.latency_source, row.period_s) == (0.3, "given", 1.0)
-        best = results.hindsight.rows[row.scenario, "TO", "paper"]
+        best = results.hindsight.rows[row.scenario, "TO", "lossless"]
         assert best.method == "ded-slp"
         assert best.max_excess_hz < 1e-6
         assert row.increase_percent == pytest.approx(100 * (row.objective / best.objective - 1))
         assert row.max_excess_hz > row.mean_excess_hz >= 0
         assert row.loop_s > 0
-        assert row.code != row.online_code != ""
+        assert (row.settings, row.plant, row.method_version) == ("every=1", "lossless", 1)
         kept = read_trajectory(results.files.trajectory(row.key))
         np.testing.assert_allclose(kept["t"], np.arange(61) * 0.1, atol=1e-12)
         assert kept["omega"].shape == (61, len(threebus.generators))
@@ -97,10 +98,10 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
 
 def test_faults_are_in_the_row(threebus, scenarios, tmp_path):
     """A method that raises every third time."""
-    chosen = operations(threebus, scenarios[:1], method="tests.online.faulty_methods:raises")
+    chosen = operations(threebus, scenarios[:1], method=f"{FAULTY}:raises")
     (row,) = operate(threebus, chosen, OnlineResults(tmp_path))
     assert (row.plans, row.late, row.failed) == (6, 0, 2)
-    assert row.method == "tests.online.faulty_methods.raises"
+    assert row.method == f"{FAULTY}.raises"
     assert "no idea how" in row.error
     assert row.objective is not None
 
@@ -110,34 +111,68 @@ def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_p
     times = [(0, 9.0, ""), (1, 0.1, ""), (2, 0.3, ""), (3, 0.2, ""), (4, 7.0, "failed")]
     rows = [
         TimingRow("r", n, "TO", "ed", s, "i", "Feasible", 0.25, 5.0, solve, error=error, case="threebus")
-        for s, more in (("1s", 0.0), ("10s", 1.0))
+        for s, more in (("every=1", 0.0), ("every=10", 1.0))
         for n, solve, error in ((n, solve + more, error) for n, solve, error in times)
     ]
-    TIMING.write(tmp_path / "timing.csv", rows)
-    loaded = load_scenarios(scenarios, threebus)
-    folders = [tmp_path / "nothing", tmp_path]
-    (found, _) = make_operations(
-        threebus, loaded, [("ed", Settings("1s"))], ["TO"], LoopOptions(), "timing", folders
-    )
-    assert found.options.latency_s == pytest.approx(0.45)
+    assert timed(threebus, scenarios, tmp_path, rows, "ed", Settings("every=1")) == pytest.approx(0.45)
+
+
+def timed(case, scenarios, folder, rows, method, settings) -> float:
+    """The latency of a method, and that the row says where it is from."""
+    TIMING.write(folder / "timing.csv", rows)
+    chosen, loaded = [(method, settings)], load_scenarios(scenarios[:1], case)
+    folders = [folder / "nothing", folder]
+    (found,) = make_operations(case, loaded, chosen, ["TO"], LoopOptions(), "timing", folders)
     assert found.latency_source == "timing"
+    assert found.key.settings == settings.options
+    return found.options.latency_s
 
 
-def test_settings_that_differ_in_operation_only_have_the_time_of_others(threebus, scenarios, tmp_path):
-    """On the same model."""
-    settings = Settings("receding", model="linear")
-    row = TimingRow("r", 1, "TO", "ded-ko-knots", "default-linear", "i", "Optimal", 0.25, 5.0, 0.5)
-    TIMING.write(tmp_path / "timing.csv", [dataclasses.replace(row, case="threebus")])
-    loaded = load_scenarios(scenarios[:1], threebus)
-    (found,) = make_operations(
-        threebus, loaded, [("ded-ko-knots", settings)], ["TO"], LoopOptions(), "timing", [tmp_path]
-    )
-    assert (found.key.settings, found.options.latency_s) == ("receding-linear", pytest.approx(0.75))
+def test_options_that_matter_in_operation_only_have_the_time_of_others(threebus, scenarios, tmp_path):
+    """On the model of the same name."""
+    row = TimingRow("r", 1, "TO", "ded-ko-knots", "default", "i", "Optimal", 0.25, 5.0, 0.5, case="threebus")
+    rows = [
+        dataclasses.replace(row, model="linear@00"),
+        dataclasses.replace(row, model="koopman@00", build_s=9.0),
+    ]
+    settings = Settings("receding=on", model="linear")
+    found = timed(threebus, scenarios, tmp_path, rows, "ded-ko-knots", settings)
+    assert found == pytest.approx(0.75)
+
+
+def test_rows_and_files_of_models_and_plants_stand_side_by_side(tmp_path):
+    """Nothing that a row was made with is left out of its key, or of the name of its trajectory."""
+    key = OnlineKey("s", "TO", "m", "margin=0.25", "linear@0a", "", 1.0, 0.3, "announced", True, True)
+    changes = {
+        "settings": "default",
+        "model": "trajectory@0a",
+        "policy": "p@0b",
+        "plant": "other",
+        "warm": False,
+    }
+    keys = [key, *(key._replace(**{name: value}) for name, value in changes.items())]
+    assert len({OnlineResults(tmp_path).files.trajectory(k) for k in keys}) == len(keys)
+
+
+def test_another_plant_has_rows_and_hindsight_of_its_own(threebus, scenarios, tmp_path, lagged):
+    loaded, chosen = load_scenarios(scenarios[:1], threebus), [("ed", Settings("every=1"))]
+    rows = [
+        operate(
+            threebus,
+            make_operations(threebus, loaded, chosen, ["TO"], LoopOptions(), "0", [], plant=plant),
+            OnlineResults(tmp_path),
+        )[0]
+        for plant in (None, "lagged")
+    ]
+    assert [row.plant for row in rows] == ["lossless", "lagged"]
+    assert rows[0].fingerprint != rows[1].fingerprint
+    assert rows[0].objective != rows[1].objective
+    assert len(OnlineResults(tmp_path).hindsight.rows) == 2
 
 
 def test_the_command(scenarios, tmp_path, capsys):
     """Rows are printed as they are made, once."""
-    line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--settings", "1s"]
+    line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--set", "every=1"]
     line += ["--regime", "TO", "--scenario", str(scenarios[0]), "--out", str(tmp_path)]
     assert main([*line, "--latency", "zero"]) == 0
     assert "over hindsight" in capsys.readouterr().out
@@ -159,6 +194,7 @@ def test_the_command(scenarios, tmp_path, capsys):
         (["--latency", "0,-1"], "neither timing nor zero nor a number"),
         (["--method", "nobody"], "unknown method"),
         (["--regime", "XX"], "unknown regime"),
+        (["--set", "every=0"], "--set: every"),
         (["--scenario", "nowhere.json"], "cannot be read"),
     ],
 )

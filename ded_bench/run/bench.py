@@ -22,7 +22,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -35,7 +35,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Results, Row
-from ded_bench.results.timing import PARTS, TIMING, WARM_UP, TimingRow, model_name, read_timing
+from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name, read_timing
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import failed
@@ -48,8 +48,6 @@ SAMPLE = 10
 ROUNDS, ENOUGH_S = (1, 2, 5, 10), 5.0
 #: Changes with the way in which calls are timed: a run that was timed in another way is timed anew.
 PROCEDURE = "all instances in a row"
-#: What is the same in all rows of a job.
-Facts = Mapping[str, Any]
 
 
 class Job(NamedTuple):
@@ -114,12 +112,12 @@ def bench(
     if warm_up.id in {instance.id for instance in instances}:
         raise InputError(f"instance {warm_up.id}", "", "cannot be timed, since it warms up")
     case.check_regimes([job.regime for job in jobs])
-    facts = {job: _facts(case, job, problems_version) for job in jobs}
-    run = _run_id(case, instances, facts, rounds)
+    own = {job: _template(case, job, problems_version) for job in jobs}
+    run = _run_id(case, instances, own, rounds)
     there = read_timing(path)
     if not force and there and {row.run for row in there} == {run}:
         return there
-    if others := {row.job for row in there} - {_name(fact) for fact in facts.values()}:
+    if others := {row.job for row in there} - {row.job for row in own.values()}:
         regime, method, *_ = sorted(others)[0]
         raise InputError(
             path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
@@ -129,20 +127,21 @@ def bench(
     rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
     try:
         for round_ in itertools.count(1):
-            present = [job for job in jobs if round_ <= _last_round(rows.values(), facts[job], rounds)]
+            present = [job for job in jobs if round_ <= _last_round(rows.values(), own[job], rounds)]
             if not present:
                 break
             shift = (round_ - 1) % len(present)
             order = present[shift:] + present[:shift]
             for job in tqdm(order, unit="turn", disable=None, desc=f"bench, round {round_}"):
-                if (round_, *_name(facts[job]), instances[-1].id) not in rows:
+                if (round_, *own[job].job, instances[-1].id) not in rows:
                     calls = _ask(pools[job], case, job, warm_up, instances)
                     for instance, call in zip([warm_up, *instances], calls, strict=True):
-                        own = facts[job] | {"run": run, "round": WARM_UP if instance is warm_up else round_}
-                        row = _row(case, job, own, instance, call, results)
+                        number = WARM_UP if instance is warm_up else round_
+                        row = dataclasses.replace(own[job], run=run, round=number, instance=instance.id)
+                        row = _timed_row(row, call, _kept(case, job, own[job], instance, results))
                         rows.setdefault(row.key, row)  # the warm-up of the first turn stands
                     TIMING.write(partial, rows.values())
-                if round_ >= _last_round(rows.values(), facts[job], rounds):
+                if round_ >= _last_round(rows.values(), own[job], rounds):
                     pools[job].close()  # on large grids a process holds gigabytes
     finally:
         for pool in pools.values():
@@ -158,44 +157,36 @@ def rounds_of(rows: Iterable[TimingRow]) -> int:
     return next((count for count in ROUNDS if count * sum(seconds) >= ENOUGH_S), ROUNDS[-1])
 
 
-def _last_round(rows: Iterable[TimingRow], facts: Facts, rounds: int | None) -> int:
-    first = [row for row in rows if row.round == 1 and row.job == _name(facts)]
+def _last_round(rows: Iterable[TimingRow], own: TimingRow, rounds: int | None) -> int:
+    first = [row for row in rows if row.round == 1 and row.job == own.job]
     return rounds or (rounds_of(first) if first else 1)
 
 
-def _name(facts: Facts) -> tuple[str, str, str, str]:
-    """What rows of a job are known by (see `TimingRow.job`)."""
-    return facts["regime"], facts["method"], facts["settings"], model_name(facts["model"])
-
-
-def _facts(case: Case, job: Job, problems_version: str) -> dict[str, Any]:
-    """What all rows of a job say."""
+def _template(case: Case, job: Job, problems_version: str) -> TimingRow:
+    """A row of a job, without what only a call can tell."""
     method = get_method(job.method)
     settings = method.canonical(job.settings)
     used = method.artifacts(case, job.regime, settings)
-    return {
-        "case": case.id,
-        "method": method.name,
-        "regime": job.regime,
-        "settings": settings.options,
-        "model": named(used, "model"),
-        "policy": named(used, "policy"),
-        "problems_version": problems_version,
-        "version": version(),
-        "commit": commit(),
-        "method_version": method.version,
-        "host": host(),
-    }
+    return TimingRow(
+        *("", WARM_UP, job.regime, method.name, settings.options, "", ""),
+        model=named(used, "model"),
+        policy=named(used, "policy"),
+        case=case.id,
+        problems_version=problems_version,
+        version=version(),
+        commit=commit(),
+        method_version=method.version,
+        host=host(),
+    )
 
 
-def _run_id(case: Case, instances: Sequence[Instance], facts: Mapping[Job, Facts], rounds: int | None) -> str:
+def _run_id(
+    case: Case, instances: Sequence[Instance], own: Mapping[Job, TimingRow], rounds: int | None
+) -> str:
     """Twelve hex digits that change with all that a run's times depend on, but the day and the commit."""
     parts = [PROCEDURE, case.fingerprint, *(i.fingerprint for i in instances), str(rounds)]
-    for job, fact in facts.items():
-        parts += [
-            str(job.settings.time_limit_s),
-            str(sorted((k, v) for k, v in fact.items() if k != "commit")),
-        ]
+    for job, row in own.items():
+        parts += [str(job.settings.time_limit_s), str(dataclasses.replace(row, commit=""))]
     return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
@@ -210,25 +201,31 @@ def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequ
     return [single[0][0], *(call for _, call in single)]
 
 
-def _row(
-    case: Case, job: Job, facts: Facts, instance: Instance, call: Call, results: Results | None
-) -> TimingRow:
-    solution, difference = call.solution, None
-    if solution.schedule is not None and results is not None:
-        made_with = (facts[name] for name in ("regime", "method", "settings", "model", "policy"))
-        row = results.rows.get(Key(case.id, instance.id, *made_with, job.settings.time_limit_s))
-        if row and results.has_schedule(row):
-            difference = largest_difference(solution.schedule, results.schedule(row, case, instance))
-    return TimingRow(
-        **facts,
-        **{name: getattr(solution, name) for name in PARTS},
-        instance=instance.id,
+def _kept(
+    case: Case, job: Job, own: TimingRow, instance: Instance, results: Results | None
+) -> Schedule | None:
+    """The schedule that a results folder keeps of a job and an instance, if any."""
+    if results is None:
+        return None
+    made_with = own.regime, own.method, own.settings, own.model, own.policy, job.settings.time_limit_s
+    row = results.rows.get(Key(case.id, instance.id, *made_with))
+    return results.schedule(row, case, instance) if row and results.has_schedule(row) else None
+
+
+def _timed_row(row: TimingRow, call: Call, kept: Schedule | None) -> TimingRow:
+    """A row with what a call told; `kept` is compared with its schedule."""
+    solution, made = call.solution, call.solution.schedule
+    return dataclasses.replace(
+        row,
         status=str(solution.status),
+        build_s=solution.build_s,
+        setup_s=solution.setup_s,
+        solve_s=solution.solve_s,
         call_s=call.seconds,
-        schedule_difference_pu=difference,
+        schedule_difference_pu=None if made is None or kept is None else largest_difference(made, kept),
         load_average=call.load_average,
         peak_memory_mib=call.peak_memory_mib,
-        error="" if solution.schedule is not None else solution.error or solution.status.sentence,
+        error="" if made is not None else solution.error or solution.status.sentence,
         solver_version=solution.solver_version,
         date=now(),
     )

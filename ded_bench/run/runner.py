@@ -111,27 +111,24 @@ def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
 
 def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
     """The row of a task with what the solver claims; `where` is the host that solved it."""
-    seed, claimed = task.instance.seed, solution.solver_objective
+    seed, objective = task.instance.seed, solution.solver_objective
+    claimed = {
+        f.name: getattr(solution, f.name) for f in dataclasses.fields(Solution) if f.name != "schedule"
+    }
+    claimed["solver_objective"] = objective if objective is not None and abs(objective) <= LARGEST else None
     return Row(
+        **task.key._asdict(),
+        **claimed | {"status": str(solution.status)},
         split=task.split,
-        status=str(solution.status),
-        iterations=solution.iterations,
-        build_s=solution.build_s,
-        setup_s=solution.setup_s,
-        solve_s=solution.solve_s,
-        solver_objective=claimed if claimed is not None and abs(claimed) <= LARGEST else None,
-        error=solution.error,
         workers=workers,
         problems_version=problems_version,
         version=version(),
         commit=commit(),
         method_version=task.version,
-        solver_version=solution.solver_version,
         host=where,
         date=now(),
         seed=" ".join(map(str, seed)) if isinstance(seed, tuple) else str(seed),
         fingerprint=task.fingerprint,
-        **task.key._asdict(),
     )
 
 

@@ -11,11 +11,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.cli.arguments import matching
 from ded_bench.cli.outputs import sweep
 from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results, Row
@@ -38,12 +38,15 @@ def test_solve_prints_one_object_per_row_and_score_agrees(
     assert {row["regime"] for row in rows} == {"NO", "TO"}
     for row in rows:
         assert row["status"] == "Optimal"
+        with np.load(row["schedule"], allow_pickle=False) as archive:
+            table, header = archive[row["schedule_member"]], ",".join(archive["columns"])
+        np.savetxt(tmp_path / "s.csv", table, "%.17g", ",", header=header, comments="")
         scored = run_cli(
             "score",
             "--instance",
             instance_file,
             "--schedule",
-            row["schedule"],
+            tmp_path / "s.csv",
             "--regime",
             row["regime"],
             "--json",
@@ -121,7 +124,7 @@ def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys
     assert main([*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]) == 0
     results = Results(out)
     first, second, *_ = results.rows.values()
-    results.schedule_path(first.key).unlink()
+    results.archive(first).drop([first.member])
     check = ["score", "--results", str(out), "--case", str(problem)]
     capsys.readouterr()
     assert main(check) == 0
@@ -192,13 +195,6 @@ def test_a_locale_without_arrows(tmp_path: Path) -> None:
     assert done.returncode == 1, done.stderr
     assert b"Optimal ? Infeasible" in done.stdout
 
-
-def test_settings_are_named_or_matched() -> None:
-    known = {"default": {}, "steps25": {}, "steps100": {}}
-    assert matching("default", known) == ["default"]
-    assert matching("steps*,default,steps25", known) == ["steps25", "steps100", "default"]
-    assert matching("nope", known) == ["nope"]  # its method says what is wrong
-    assert matching("nope*", known) == []
 
 
 def test_only_policies_that_need_a_koopman_model_ask_for_one(

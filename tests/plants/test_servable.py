@@ -6,16 +6,20 @@ import json
 
 import numpy as np
 import pytest
-from ded_bench.plants.lossless.servable import servable
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.lossless.network import check_servable
+from ded_bench.plants.plant import plant_of, servable
 from ded_bench.problem.benchmark import load_manifest, write_benchmark
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import drawn_with_redraws, sample_instances
 
 COUNT = 200
+
+
+def check_servable(case: Case, instance: Instance, source: str) -> None:
+    plant_of(case).check_servable(instance, source)
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +85,36 @@ def test_the_manifest_counts_redraws(weak: Case, threebus: Case, tmp_path) -> No
 def test_shipped_draws_of_the_paper_are_servable(ninebus: Case) -> None:
     """So the 9-bus instances, and all training data, are the same with the rule as without it."""
     assert servable(ninebus, list(sample_instances(ninebus, 2022, 500))).all()
+
+
+def _ramp(case, **changes):
+    """Nominal loads, the first of which ramps."""
+    loads = {
+        bus: {"initial": value, "start": 1.0, "duration": 2.0, "rate": 0.0}
+        for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)
+    }
+    loads[case.loads[0]] |= changes
+    return loads
+
+
+def test_check_servable_names_source_and_field(case, quiet_instance):
+    """Too much load at the start, at the end of a ramp, or at the horizon; what lies beyond is no matter."""
+    too_much = quiet_instance(case, load=_ramp(case, initial=-40.0))
+    with pytest.raises(InputError, match=r"my\.json: load, initial\.power: initial loads and power cannot"):
+        check_servable(case, too_much, "my.json")
+    ramps_up = quiet_instance(case, load=_ramp(case, rate=-20.0))
+    with pytest.raises(InputError, match=r"my\.json: load: loads at t = 3 s cannot be served"):
+        check_servable(case, ramps_up, "my.json")
+    horizon = case.sampling.horizon_s
+    cut_off = quiet_instance(case, load=_ramp(case, duration=2 * horizon, rate=-40 / horizon))
+    with pytest.raises(InputError, match=rf"my\.json: load: loads at t = {horizon:g} s cannot be served"):
+        check_servable(case, cut_off, "my.json")
+    check_servable(case, quiet_instance(case, load=_ramp(case, start=horizon + 1, rate=-40.0)), "my.json")
+
+
+def test_check_servable_refuses_initial_power_that_no_line_carries(case, quiet_instance):
+    """Generators of an instance may lie outside their limits, but not outside physics."""
+    power = dict.fromkeys(case.generators, 50.0)
+    instance = quiet_instance(case, initial={"power": power, "omega": dict.fromkeys(case.generators, 0.0)})
+    with pytest.raises(InputError, match="initial loads and power cannot be served"):
+        check_servable(case, instance, "my.json")

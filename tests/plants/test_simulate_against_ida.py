@@ -18,11 +18,11 @@ from scipy.optimize import root
 from sksundae.ida import IDA
 
 from ded_bench.files.strict import parse_record
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.plants.simulate import simulate
 
 RTOL, ATOL = 1e-10, 1e-12
 #: In rad/s and pu: what IDA's own errors, accumulated over some thousand steps, allow.

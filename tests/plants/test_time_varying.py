@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ded_bench.surrogates.trajectory import TrajectoryModel, linearise_along
 from ded_bench.methods import ed
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.plants.time_varying import Delivered, LocalRows, TimeVarying, series_step
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.simulate import Trajectory, simulate
+from ded_bench.problem.trajectory import Trajectory
 
 STEPS = 400
 #: Knots at unequal distances, as after rounding to the grid.
@@ -28,7 +31,7 @@ class Made(NamedTuple):
     instance: Instance
     schedule: Schedule
     trajectory: Trajectory
-    model: TrajectoryModel
+    model: TimeVarying
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +40,10 @@ def made(case: Case) -> Made:
     times = instance.grid[POINTS]
     schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
     trajectory = simulate(case, instance, schedule)
-    return Made(instance, schedule, trajectory, linearise_along(case, trajectory, POINTS))
+    return Made(instance, schedule, trajectory, plant_of(case).linearise_along(trajectory, POINTS))
 
 
-def increments(model: TrajectoryModel) -> Array:
+def increments(model: TimeVarying) -> Array:
     """Random input increments at the knots, none at the first."""
     u = np.random.default_rng(5).normal(size=model.p_gen.shape)
     u[0] = 0.0
@@ -58,7 +61,7 @@ def test_error_is_of_second_order(case, quiet_instance, constant):
     """Along an equilibrium, against simulations: half the increments, a quarter of the error."""
     instance = quiet_instance(case, horizon_s=STEPS * case.sampling.dt_s)
     trajectory = simulate(case, instance, constant(instance, case.p_nominal))
-    model = linearise_along(case, trajectory, POINTS)
+    model = plant_of(case).linearise_along(trajectory, POINTS)
     u = 0.1 * increments(model)
     errors = []
     for size in (1.0, 0.5, 0.25):
@@ -85,7 +88,7 @@ def test_maps_are_the_matrix_exponential(case, made):
     """Over a step and over an interval, against `expm` of the system with its inputs."""
     network, n, dt = Network(case), len(case.generators), made.instance.dt_s
     for j, length in enumerate(made.model.lengths):
-        linear = network.linearise(made.trajectory.theta[(POINTS[j] + POINTS[j + 1]) // 2])
+        linear = network.linearise(made.trajectory.states[(POINTS[j] + POINTS[j + 1]) // 2])
         whole = np.zeros((4 * n, 4 * n))  # (δθ, δω, u, slope of u)
         whole[:n, n : 2 * n] = np.eye(n)
         whole[n : 2 * n, :n] = -linear.stiffness / linear.m[:, None]
@@ -126,23 +129,70 @@ def test_adjoint_is_the_transpose(made):
     assert (model.adjoint(on_omega, on_slack) * u).sum() == pytest.approx(forward, rel=1e-10)
 
 
+def value_of(rows: LocalRows, x: Array, u: Array) -> Array:
+    """What rows give with x and u at the ends of their intervals."""
+    j = rows.interval
+    parts = ((rows.x, x[j]), (rows.start, u[j]), (rows.end, u[j + 1]))
+    return sum((row * value).sum(axis=1) for row, value in parts)
+
+
 def test_rows_are_local_to_their_interval(made):
-    """With x and u at the ends of its interval a row gives ω at its point, or its sum of P_s."""
+    """A row gives ω at its point, or its sum of P_s."""
     model, u = made.model, increments(made.model)
     omega, p_slack = model.outputs(u)
     x = model.states(u)
-    generators, points = (
-        np.array([g for g in range(u.shape[1]) for _ in range(5)]),
-        np.tile([1, 37, 38, 152, 399], u.shape[1]),
-    )
+    generators = np.repeat(np.arange(u.shape[1]), 5)
+    points = np.tile([1, 37, 38, 152, 399], u.shape[1])
+    rows = model.frequency_rows(generators, points)
+    assert value_of(rows, x, u) == pytest.approx((omega - model.omega)[points, generators], abs=1e-10)
     first = np.array([0, 20, 37, 75, 112, 150, 151, 153, 230, 301, 350])
     stretches = np.add.reduceat(p_slack - model.p_slack, first)
-    for rows, expected in (
-        (model.frequency_rows(generators, points), (omega - model.omega)[points, generators]),
-        (model.slack_rows(first), stretches),
+    assert value_of(model.slack_rows(first), x, u) == pytest.approx(stretches, abs=1e-10)
+
+
+def test_speeds_may_be_any_combination_of_the_state(made):
+    """C as a matrix that picks entries is the slice of these entries."""
+    model, n_gen = made.model, made.model.p_gen.shape[1]
+    pick = np.zeros((len(model.lengths), n_gen, 2 * n_gen))
+    pick[:, :, model.speed] = np.eye(n_gen)
+    other, u = dataclasses.replace(model, speed=pick), increments(model)
+    points, generators = np.array([1, 37, 38, 152, 399]), np.arange(5) % n_gen
+    for name, arguments in (
+        ("outputs", (u,)),
+        ("frequency_rows", (generators, points)),
+        ("adjoint", (model.omega, model.p_slack)),
+        ("rollout", (np.tile(model.p_gen[0], (STEPS + 1, 1)),)),
     ):
-        j = rows.interval
-        value = (
-            (rows.x * x[j]).sum(axis=1) + (rows.start * u[j]).sum(axis=1) + (rows.end * u[j + 1]).sum(axis=1)
-        )
-        assert value == pytest.approx(expected, abs=1e-10)
+        for one, same in zip(getattr(model, name)(*arguments), getattr(other, name)(*arguments), strict=True):
+            np.testing.assert_allclose(same, one, rtol=0, atol=1e-12)
+
+
+def test_cost_rows_sum_what_is_delivered(made):
+    """Cost · (C_p δx + D_p u), summed point by point; the last point is the last interval's."""
+    model, rng, n_gen = made.model, np.random.default_rng(7), made.model.p_gen.shape[1]
+    c = rng.normal(size=(len(model.lengths), n_gen, 2 * n_gen))
+    d, cost = rng.normal(size=(len(model.lengths), n_gen, n_gen)), rng.uniform(size=n_gen)
+    given = dataclasses.replace(model, delivered=Delivered(c, d, np.zeros((STEPS + 1, n_gen))))
+    u, expected = increments(model), np.zeros(len(model.lengths))
+    x = model.states(u)
+    for j, length in enumerate(model.lengths):
+        state, slope = x[j], (u[j + 1] - u[j]) / length
+        for r in range(length + (j == len(model.lengths) - 1)):
+            expected[j] += cost @ (c[j] @ state + d[j] @ (u[j] + r * slope))
+            f, g, h = (part[j] for part in model.step)
+            state = f @ state + g @ (u[j] + r * slope) + h @ slope
+    assert value_of(given.cost_rows(cost), x, u) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    with pytest.raises(ValueError, match="set-points are delivered"):
+        model.cost_rows(cost)
+
+
+def test_the_series_is_the_exponential():
+    """exp(A), φ_1 and φ_2 are blocks of the exponential of A beside two identities (Van Loan)."""
+    a = 0.3 * np.random.default_rng(8).normal(size=(4, 5, 5))
+    found = series_step(lambda value: a @ value, 4, 5, float(np.linalg.norm(a, axis=(1, 2)).max()))
+    for i, one in enumerate(a):
+        whole = np.zeros((15, 15))
+        whole[:5, :5], whole[:5, 5:10], whole[5:10, 10:] = one, np.eye(5), np.eye(5)
+        exact = expm(whole)[:5]
+        for part, expected in zip(found, np.split(exact, 3, axis=1), strict=True):
+            np.testing.assert_allclose(part[i], expected, rtol=0, atol=1e-14)

@@ -1,0 +1,95 @@
+"""What every registered plant keeps: it is a value, rests where it should, and goes on from any state."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from ded_bench.files.errors import InputError
+from ded_bench.plants.plant import PLANTS, Plant, plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instance
+from ded_bench.problem.schedule import Schedule
+
+SHIPPED = sorted(path.parent.name for path in SHIPPED_CASES.glob("*/case.json"))
+
+
+@pytest.fixture(scope="module", params=PLANTS)
+def plant(request, case) -> Plant:
+    """Each plant of each case for tests."""
+    return plant_of(case, request.param)
+
+
+def moving(case: Case) -> tuple[Instance, Schedule]:
+    """An instance of 4 s that begins far from rest, and a schedule that bends at eight places."""
+    instance = sample_instance(case, 31, 2).model_copy(update={"horizon_s": 4.0})
+    omega = {bus: 0.1 * (-1) ** i for i, bus in enumerate(case.generators)}
+    instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": omega})})
+    p = np.random.default_rng(2).uniform(case.p_min, case.p_max, (9, len(case.generators)))
+    p[0] = instance.p_initial(case)
+    return instance, Schedule(np.linspace(0.0, 4.0, 9), p)
+
+
+def test_a_plant_is_a_value(plant, case):
+    """Nothing of it can be set; sent to another process it is the same, and does the same to the last bit."""
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        plant.case = case
+    sent, (instance, schedule) = pickle.loads(pickle.dumps(plant)), moving(case)
+    assert (sent.name, sent.fingerprint, sent.case) == (plant.name, plant.fingerprint, plant.case)
+    assert len(plant.fingerprint) == 12
+    runs = [simulate(case, instance, schedule, one) for one in (plant, plant, sent)]
+    for run in runs[1:]:
+        for name in ("omega", "p_set", "p_gen", "p_slack"):
+            np.testing.assert_array_equal(getattr(run, name), getattr(runs[0], name))
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+@pytest.mark.parametrize("name", SHIPPED)
+def test_it_rests_at_an_equilibrium(name, kind, quiet_instance, constant):
+    """Of nominal powers and loads, for a minute: within 1e-9 Hz."""
+    case = Case.load(name)
+    instance = quiet_instance(case, horizon_s=60.0)
+    run = simulate(case, instance, constant(instance, case.p_nominal), plant_of(case, kind))
+    assert np.abs(run.omega).max() < 2 * np.pi * 1e-9
+    np.testing.assert_allclose(run.p_gen, run.p_set, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(run.p_slack, run.p_slack[0], rtol=0, atol=1e-8)
+
+
+def test_in_pieces_it_does_what_it_does_at_once(plant, case):
+    instance, schedule = moving(case)
+    whole = simulate(case, instance, schedule, plant)
+    p_load, state = instance.p_load(case), plant.initial(instance)
+    for first, last in ((0, 1), (1, 137), (137, 137), (137, 400)):
+        k = slice(first, last + 1)
+        piece = plant.advance(state, whole.p_set[k], p_load[k], instance.dt_s)
+        state = piece.end
+        for name in ("omega", "p_gen", "p_slack"):
+            np.testing.assert_allclose(getattr(piece, name), getattr(whole, name)[k], rtol=0, atol=1e-9)
+
+
+def test_what_is_observed_leads_to_the_same_state(plant, case, alter):
+    """An instance that starts from it, far from any equilibrium, goes on as the trajectory does."""
+    instance, schedule = moving(case)
+    whole, p_load, k = simulate(case, instance, schedule, plant), instance.p_load(case), 137
+    state = plant.advance(plant.initial(instance), whole.p_set[: k + 1], p_load[: k + 1], instance.dt_s).end
+    grid = whole.t[k:] - whole.t[k]
+    load = {
+        bus: {"points": np.column_stack([grid, column]).tolist()}
+        for bus, column in zip(case.loads, p_load[k:].T, strict=True)
+    }
+    initial = plant.observed(state).initial(case).model_dump()
+    second = {"schema": "ded-bench/instance/2", "horizon_s": float(grid[-1])}
+    rest = alter(instance, load=load, initial=initial, **second)
+    part = simulate(case, rest, Schedule(rest.grid, whole.p_set[k:]), plant)
+    np.testing.assert_allclose(part.omega, whole.omega[k:], rtol=0, atol=2e-9)
+    np.testing.assert_allclose(part.p_slack, whole.p_slack[k:], rtol=0, atol=2e-9)
+
+
+def test_other_names_are_refused(case):
+    with pytest.raises(InputError, match="plant: atlantis: is not one of lossless"):
+        plant_of(case, "atlantis")

@@ -1,4 +1,4 @@
-"""The simulator: rest, energy, small perturbations, closed forms, SciPy's integrator, loss of synchronism."""
+"""The simulator: rest, energy, closed forms, the cheaper integration for plans, loss of synchronism."""
 
 from __future__ import annotations
 

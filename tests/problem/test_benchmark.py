@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.strict import parse_record, write_record
 from ded_bench.problem.benchmark import (
     VALIDATION_COUNT,
+    Manifest,
+    Split,
+    check_own_name,
     load_manifest,
     load_split,
     select_files,
@@ -19,6 +23,7 @@ from ded_bench.problem.benchmark import (
 )
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
+from ded_bench.problem.scenario import Scenario
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +90,41 @@ def test_a_folder_of_results_does_not_hide_the_shipped_case(tmp_path, monkeypatc
     chosen = select_split("two-area", "test", 1)
     assert chosen.case.id == "two-area"
     assert len(chosen.instances) == 1
+
+
+def test_an_edited_copy_needs_a_name_of_its_own(
+    threebus: Case, quiet_instance, alter, tmp_path: Path
+) -> None:
+    instance = quiet_instance(threebus)
+    place = tmp_path / "instances" / f"{instance.id}.json"
+    check_own_name(instance, "copy.json", tmp_path, threebus)
+    write_record(instance, place)
+    check_own_name(instance, "copy.json", tmp_path, threebus)  # the same instance, wherever it lies
+    edited = alter(instance, horizon_s=2 * instance.horizon_s)
+    with pytest.raises(InputError, match=rf"copy.json: id: {instance.id} is the name of .*: choose another"):
+        check_own_name(edited, "copy.json", tmp_path, threebus)
+    check_own_name(alter(edited, id="mine"), "copy.json", tmp_path, threebus)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        (Split, {"seed": 1, "train": [], "test": []}),
+        (Manifest, {"version": "1-abc", "files": {}}),
+        (Scenario, {"id": "s"}),
+    ],
+)
+def test_a_file_says_what_it_is(kind, fields) -> None:
+    """Of which schema."""
+    with pytest.raises(InputError, match=r"a\.json: schema: field required"):
+        parse_record(kind, json.dumps(fields), "a.json")
+
+
+def test_a_copy_of_a_benchmark_has_its_version(tmp_path: Path, threebus: Case) -> None:
+    """The case's file keeps its bytes, however it is written."""
+    source = tmp_path / "mine.json"
+    source.write_text(threebus.model_dump_json(by_alias=True, indent=7))
+    versions = [write_benchmark(threebus, 3, 1, tmp_path / n, source=source).version for n in ("a", "b")]
+    assert versions[0] == versions[1]
+    assert (tmp_path / "a" / "case.json").read_bytes() == source.read_bytes()
+    assert write_benchmark(threebus, 3, 1, tmp_path / "c").version != versions[0]

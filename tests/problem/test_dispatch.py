@@ -62,21 +62,6 @@ def test_merit_order_is_optimal_on_random_cases(star):
         np.testing.assert_allclose(p_gen, p_lp, rtol=0, atol=1e-9)  # unique: costs differ almost surely
 
 
-def test_merit_order_is_optimal_where_the_sampler_draws(case):
-    """300 draws of costs and initial loads from the case's own ranges, in one batch."""
-    rng = np.random.default_rng(0)
-    ranges = case.sampling
-    cost_gen = rng.uniform(*ranges.cost, (300, len(case.generators)))
-    cost_slack = rng.uniform(*ranges.cost, 300)
-    spread = rng.uniform(-ranges.load_relative, ranges.load_relative, (300, len(case.loads)))
-    p_load = case.load_nominal * (1 + spread)
-    p_gen = merit_order(case, cost_gen, cost_slack, p_load)
-    for row in range(300):
-        demand = -p_load[row].sum()
-        _, p_lp = linear_program(case.p_min, case.p_max, cost_gen[row], cost_slack[row], demand)
-        np.testing.assert_allclose(p_gen[row], p_lp, rtol=0, atol=1e-9)
-
-
 def test_merit_order_on_ties_and_zero_costs(ninebus):
     """Where the optimum is not unique, it is still an optimum within the bounds."""
     for cost_gen in ([0.0, 0.0], [0.3, 0.3], [0.3, 0.0], [1.0, 0.3]):

@@ -9,7 +9,8 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
-from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp, instances_frame
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp, check_plausible, instances_frame
 from ded_bench.problem.sampling import sample_instance
 
 
@@ -141,3 +142,31 @@ def test_angles_are_given_for_exactly_the_generators(threebus, quiet_instance):
         with pytest.raises(InputError) as caught:
             instance.check_case(threebus)
         assert caught.value.field == f"initial.theta.{field}"
+
+
+# Mistakes that no file format refuses.
+
+
+def test_every_load_has_the_sign_of_the_case(case: Case, quiet_instance) -> None:
+    """A feed-in among the loads is positive, and a mistake if negative."""
+    good = quiet_instance(case)
+    check_plausible(case, good, "good.json")
+    for bus in case.loads:
+        wrong = good.load[bus].model_copy(update={"initial": -good.load[bus].initial})
+        bad = good.model_copy(update={"load": good.load | {bus: wrong}})
+        with pytest.raises(InputError, match=rf"bad.json: load.{bus}: .* pu has the wrong sign"):
+            check_plausible(case, bad, "bad.json")
+
+
+@pytest.mark.parametrize("frequency", [60.0, 59.98, -6.3, 6.3])
+def test_a_frequency_in_hertz_is_no_deviation(case: Case, quiet_instance, frequency: float) -> None:
+    good = quiet_instance(case)
+    first = case.generators[0]
+    for value in (frequency, np.copysign(6.2, frequency)):
+        initial = good.initial.model_copy(update={"omega": good.initial.omega | {first: float(value)}})
+        changed = good.model_copy(update={"initial": initial})
+        if abs(value) < 2 * np.pi:
+            check_plausible(case, changed, "x.json")
+        else:
+            with pytest.raises(InputError, match=rf"initial.omega.{first}: .* give the deviation in rad/s"):
+                check_plausible(case, changed, "x.json")

@@ -7,12 +7,11 @@ import json
 
 import numpy as np
 import pytest
-from ded_bench.plants.lossless.servable import servable
 
-from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import read_record
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import Manifest, scenario_files, write_scenarios
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.forecast import QUALITIES, forecast
@@ -193,11 +192,3 @@ def test_a_shipped_scenario_is_what_the_sampler_writes():
     """The first one of the smallest case, byte for byte."""
     drawn = sample_scenario(Case.load("9bus"), 0, 0, servable).model_dump_json(by_alias=True) + "\n"
     assert drawn == (SHIPPED_CASES / "9bus" / "scenarios" / "9bus-s0000.json").read_text()
-
-
-def test_the_command_writes_scenarios(tmp_path, capsys):
-    """As many as asked for, and says where."""
-    assert main(["scenarios", "--case", "9bus", "--count", "2", "--out", str(tmp_path)]) == 0
-    assert "2 scenarios of 9bus" in capsys.readouterr().out
-    for path in scenario_files(tmp_path):
-        assert path.read_bytes() == (SHIPPED_CASES / "9bus" / "scenarios" / path.name).read_bytes()

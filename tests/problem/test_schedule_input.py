@@ -8,8 +8,7 @@ import pytest
 import ded_bench
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.schedule import as_schedule
+from ded_bench.problem.schedule import Schedule, as_schedule
 
 
 def test_lists_and_frames_mean_what_arrays_mean(case: Case, quiet_instance, constant) -> None:

@@ -112,11 +112,11 @@ def sequence(parts: Parts[F, A], first: Iterable[Array], deadline: float) -> End
         if not is_solved or without == PATIENCE or parts.stop is None:
             return End(answer.status, now, answer, iterations, answer.message)
         try:
-            now, is_whole = parts.rule.step(now, answer, parts.follow)
+            now, reached = parts.rule.step(now, answer, parts.follow)
         except NoStepError as error:
             return End(Status.FAILED, now, answer, iterations, str(error))
-        if is_whole and not is_limited and parts.stop(now, answer):
-            return End(Status.OPTIMAL, now, answer, iterations, "")
+        if reached is not None and not is_limited and parts.stop(reached, answer):
+            return End(Status.OPTIMAL, reached, answer, iterations, "")
     reason = f"no convergence in {parts.rule.most_programs} programs"
     return End(Status.FAILED, now, answer, iterations, reason)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,13 @@ class Followed(Protocol):
 F = TypeVar("F", bound=Followed)
 
 
+class Step(NamedTuple, Generic[F]):
+    """A step taken, or not."""
+
+    around: F  # where the next program is made
+    reached: F | None  # what the program's answer itself leads to, if it was followed
+
+
 class StepRule(Protocol):
     """How far to go."""
 
@@ -55,11 +62,8 @@ class StepRule(Protocol):
     def limits(self, now: Followed, answer: Any) -> bool:
         """Whether the radius limits an answer."""
 
-    def step(self, now: F, answer: Any, follow: Callable[[Array], F]) -> tuple[F, bool]:
+    def step(self, now: F, answer: Any, follow: Callable[[Array], F]) -> Step[F]:
         """Go there, or not as far.
-
-        Returns:
-            Where the next program is made, and whether that is all the way.
 
         Raises:
             NoStepError: no step leads on.
@@ -78,12 +82,13 @@ class FullSteps:
         """Never."""
         return False
 
-    def step(self, now: F, answer: Any, follow: Callable[[Array], F]) -> tuple[F, bool]:
+    def step(self, now: F, answer: Any, follow: Callable[[Array], F]) -> Step[F]:
         """See `StepRule.step`."""
         at = answer.wanted
         for number in range(self.tries):
             try:
-                return follow(at), number == 0
+                new = follow(at)
+                return Step(new, new if number == 0 else None)
             except SimulationError as error:
                 reason = error
             at = (now.at + at) / 2
@@ -109,8 +114,10 @@ class TrustRegion:
         """Whether a component goes as far as it may."""
         return float(np.abs(answer.wanted - now.at).max()) > 0.999 * self.radius
 
-    def step(self, now: Any, answer: Any, follow: Callable[[Array], Any]) -> tuple[Any, bool]:
+    def step(self, now: Any, answer: Any, follow: Callable[[Array], Any]) -> Step[Any]:
         """See `StepRule.step`; without progress the next program is around the same place."""
+        if self.radius < SMALLEST:
+            raise NoStepError("no step brings the schedule closer to one that is feasible")
         size = float(np.abs(answer.wanted - now.at).max())
         saved = now.cost - answer.prediction.objective
         closer = now.over - self.over(answer.prediction.omega)
@@ -121,16 +128,11 @@ class TrustRegion:
         try:
             new = follow(answer.wanted)
         except SimulationError:
-            self._shrink(NOT_FOLLOWED * size)
-            return now, False
+            self.radius = NOT_FOLLOWED * size
+            return Step(now, None)
         gained = now.cost - new.cost + self._price * (now.over - new.over)
         if gained > GOOD * promised and self.limits(now, answer):
             self.radius *= 2.0
-        if gained < POOR * promised and new.over > 0.0:
-            self._shrink(SHORTER * size)
-        return (new, True) if gained >= TAKEN * promised or new.over == 0.0 else (now, False)
-
-    def _shrink(self, radius: float) -> None:
-        self.radius = radius
-        if radius < SMALLEST:
-            raise NoStepError("no step brings the schedule closer to one that is feasible")
+        if gained < POOR * promised:
+            self.radius = SHORTER * size
+        return Step(new if gained >= TAKEN * promised else now, new)

@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 import pyomo.environ as pyo
 from pyomo.common.errors import ApplicationError
-from pyomo.opt import SolverResults, SolverStatus, TerminationCondition
+from pyomo.opt import TerminationCondition
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.files.errors import InputError
@@ -42,14 +42,6 @@ LINEAR_OPTIONS: dict[str, Any] = {
     "hessian_constant": "yes",
 }
 _IPOPT_VERSION = f"ipopt (casadi {importlib.metadata.version('casadi')})"
-#: What `SolverFactory("ipopt_casadi")` reports.
-_PYOMO_STATUS = {
-    Status.OPTIMAL: (SolverStatus.ok, TerminationCondition.optimal),
-    Status.FEASIBLE: (SolverStatus.ok, TerminationCondition.feasible),
-    Status.INFEASIBLE: (SolverStatus.warning, TerminationCondition.infeasible),
-    Status.TIME_LIMIT: (SolverStatus.aborted, TerminationCondition.maxTimeLimit),
-    Status.FAILED: (SolverStatus.error, TerminationCondition.error),
-}
 
 
 class CasadiIpopt:
@@ -226,37 +218,3 @@ def _silent_failure() -> Iterator[list[str]]:
         yield caught
     except RuntimeError as error:
         caught.append(str(error).splitlines()[0][:200])
-
-
-@pyo.SolverFactory.register("ipopt_casadi", doc="IPOPT from the casadi wheel")
-class IpoptCasadi:
-    """`SolverFactory("ipopt_casadi")`: IPOPT for any continuous Pyomo model, without an executable."""
-
-    def __init__(self, options: Options | None = None, **_: Any) -> None:
-        self.options: dict[str, Any] = dict(options or {})
-
-    def __enter__(self) -> IpoptCasadi:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def available(self, exception_flag: bool = True) -> bool:
-        """Always: CasADi is a dependency."""
-        return True
-
-    def solve(
-        self,
-        model: pyo.ConcreteModel,
-        options: Options | None = None,
-        timelimit: float | None = None,
-        tee: bool = False,
-    ) -> SolverResults:
-        """Solve from the model's current values; variables get values only if there is a solution."""
-        own = self.options | dict(options or {}) | ({"print_level": 5} if tee else {})
-        outcome = CasadiIpopt(model, own).solve(timelimit)
-        results = SolverResults()
-        results.solver.status, results.solver.termination_condition = _PYOMO_STATUS[outcome.status]
-        results.solver.message = outcome.message
-        results.solver.time = outcome.solve_s
-        return results

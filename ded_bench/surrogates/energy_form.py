@@ -91,10 +91,10 @@ def energy_form(case: Case, theta: Array) -> EnergyForm:
     return EnergyForm(skew, dissipation, energy, feedthrough)
 
 
-def injection_lift(case: Case, n_extra: int = 0) -> Array:
+def injection_lift(case: Case) -> Array:
     """The lift ψ = (ω, P_s, N) that makes equilibria of the nonlinear system exact."""
     n, n_bus = len(case.generators), len(case.buses)
-    lift = np.zeros((2 * n + n_extra, 2 * n_bus + n + len(case.loads) + 1))
+    lift = np.zeros((2 * n, 2 * n_bus + n + len(case.loads) + 1))
     lift[:n, 2 * n_bus : 2 * n_bus + n] = np.eye(n)
     lift[n : 2 * n, :n_bus] = injection_rows(case)
     return lift

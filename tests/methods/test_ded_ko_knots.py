@@ -21,7 +21,7 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.condensed import CondensedRollout, free_response
 from ded_bench.surrogates.energy_form import injection_lift
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import linear_model
@@ -33,7 +33,7 @@ def knots_with_all_rows(case: Case, koopman: Koopman, instance: Instance, regime
     n_gen, grid = len(case.generators), instance.grid
     knots = grid[knot_points(case.knot_times(grid[-1]), instance.dt_s)]
     condensed = CondensedRollout.make(case, koopman, grid, knots)
-    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
+    free = free_response(koopman, koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
     n_x, n_s = len(knots) * n_gen, len(grid)
     slack, omega = condensed.gamma[n_gen], condensed.gamma[:n_gen, 1:].reshape(-1, n_x)
     ramps = np.kron(np.diff(np.eye(len(knots)), axis=0), np.eye(n_gen))
@@ -80,7 +80,7 @@ def least_excess(case: Case, koopman: Koopman, instance: Instance, regime: str) 
     points = knot_points(case.knot_times(grid[-1]), instance.dt_s)
     first, knots = points[:-1], grid[points]
     condensed = CondensedRollout.make(case, koopman, grid, knots)
-    free = condensed.free_response(koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
+    free = free_response(koopman, koopman.initial(Network(case), [instance]), instance.p_load(case)[None])[0]
     excess = np.eye(len(first))[np.searchsorted(points, np.arange(1, len(grid))) - 1]
     excess = np.tile(excess, (n_gen, 1))
     omega = condensed.gamma[:n_gen, 1:].reshape(-1, len(knots) * n_gen)

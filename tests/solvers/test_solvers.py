@@ -11,7 +11,6 @@ import numpy as np
 import pyomo.environ as pyo
 import pytest
 import scipy.sparse as sp
-from pyomo.opt import TerminationCondition
 
 from ded_bench.files.errors import InputError
 from ded_bench.solvers import highs, piqp
@@ -178,26 +177,6 @@ def test_read_linear_gives_the_arrays_of_the_model() -> None:
     assert (program.row_lower.tolist(), program.row_upper.tolist()) == ([0.0], [np.inf])
     assert program.objective(numbers, point) == pytest.approx(2 * 1.5 + 3 * 0.25 + 1)
     assert sorted(v.name for v, free in zip(program.columns, numbers.free, strict=True) if free) == ["x", "y"]
-
-
-def test_pyomo_knows_ipopt_casadi() -> None:
-    model = rosenbrock()
-    with pyo.SolverFactory("ipopt_casadi") as solver:
-        assert solver.available()
-        results = solver.solve(model, options={"max_iter": 200})
-    pyo.assert_optimal_termination(results)
-    assert model.x.value == pytest.approx(1.0)
-    results = pyo.SolverFactory("ipopt_casadi", options={"max_iter": 2}).solve(rosenbrock())
-    assert results.solver.termination_condition == TerminationCondition.error
-    assert results.solver.message == "Maximum_Iterations_Exceeded"
-    bad = diet()
-    bad.y.setub(0.25)
-    before = bad.x.value
-    results = pyo.SolverFactory("ipopt_casadi").solve(bad)
-    assert results.solver.termination_condition == TerminationCondition.infeasible
-    assert bad.x.value == before
-    results = pyo.SolverFactory("ipopt_casadi").solve(transport(), timelimit=1e-4)
-    assert results.solver.termination_condition == TerminationCondition.maxTimeLimit
 
 
 def test_unknown_and_missing_solvers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -170,7 +170,7 @@ def test_model_files_round_trip(case: Case, tmp_path: Path) -> None:
         k=rng.normal(size=(n, n)),
         b=rng.normal(size=(n, plain.b.shape[1])),
         g=rng.normal(size=(n, plain.b.shape[1])),
-        lift=injection_lift(case, n_extra),
+        lift=np.vstack([injection_lift(case), np.zeros((n_extra, injection_lift(case).shape[1]))]),
         mlp=(
             (rng.normal(size=(5, width)), rng.normal(size=5)),
             (rng.normal(size=(3, 5)), rng.normal(size=3)),

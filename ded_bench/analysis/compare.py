@@ -1,6 +1,7 @@
 """What changed between two results folders: a benchmark's regression test.
 
-Rows are compared by their key. Status, feasibility, objective and violations decide; gaps and times
+Rows are compared that answer the same question: by instance, regime, method, settings and the name of the
+surrogate, the newest of each. Status, feasibility, objective and violations decide; gaps and times
 are printed for information.
 """
 
@@ -10,16 +11,29 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
+from ded_bench.analysis.lines import GROUP, groups, head, line_table, named, title
 from ded_bench.analysis.paper_numbers import read_paper
 from ded_bench.analysis.reference import choose_reference
-from ded_bench.analysis.summary import GROUP, gaps, groups, table, title
+from ded_bench.analysis.summary import gaps
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import SHIPPED_CASES
-from ded_bench.results.rows import Key, Results, Row
-from ded_bench.results.timing import read_timing, timing_summary
+from ded_bench.results.rows import Results, Row
+from ded_bench.results.timing import model_name, read_timing, timing_summary
+
+
+class Asked(NamedTuple):
+    """What rows of two folders are compared by."""
+
+    case: str
+    instance: str
+    regime: str
+    method: str
+    settings: str
+    model: str
 
 
 @dataclass(frozen=True)
@@ -35,7 +49,7 @@ class Tolerance:
 class Change:
     """One value of one row, before (in A) and after (in B); None is an empty cell."""
 
-    key: Key
+    key: Asked
     column: str
     before: str | float | bool | None
     after: str | float | bool | None
@@ -51,8 +65,8 @@ class Comparison:
     heads: tuple[str, str]
     common: int
     incomparable: str  # why nothing was compared; else empty
-    only_a: tuple[Key, ...]
-    only_b: tuple[Key, ...]
+    only_a: tuple[Asked, ...]
+    only_b: tuple[Asked, ...]
     changes: tuple[Change, ...]
     summary: pd.DataFrame  # SUMMARY_COLUMNS, for information
 
@@ -78,7 +92,7 @@ def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: b
     shared = [key for key in before if key in after]
     facts = (a, b, (_head(before), _head(after)), len(shared))
     if reason := _incomparable(before, after, shared):
-        return Comparison(*facts, reason, (), (), (), table([], SUMMARY_COLUMNS))
+        return Comparison(*facts, reason, (), (), (), line_table([], SUMMARY_COLUMNS))
     only_a = () if common_only else tuple(key for key in before if key not in after)
     only_b = () if common_only else tuple(key for key in after if key not in before)
     limits = tolerance or Tolerance()
@@ -87,20 +101,25 @@ def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: b
     return Comparison(*facts, "", only_a, only_b, tuple(changes), _summary(a, b))
 
 
-def _read(folder: Path) -> dict[Key, Row]:
+def _read(folder: Path) -> dict[Asked, Row]:
     results = Results(folder)
     if not results.path.is_file():
         raise InputError(results.path, "", "is missing: this is no results folder")
-    return results.rows
+    rows = sorted(results.rows.values(), key=lambda row: row.date)
+    return {_asked(row): row for row in rows}
 
 
-def _head(rows: Mapping[Key, Row]) -> str:
+def _asked(row: Row) -> Asked:
+    return Asked(row.case, row.instance, row.regime, row.method, row.settings, model_name(row.model))
+
+
+def _head(rows: Mapping[Asked, Row]) -> str:
     versions = ", ".join(sorted({row.version for row in rows.values()})) or "–"
     problems = ", ".join(sorted({row.problems_version or "(none)" for row in rows.values()})) or "–"
     return f"{len(rows)} rows, ded-bench {versions}, problems {problems}"
 
 
-def _incomparable(before: Mapping[Key, Row], after: Mapping[Key, Row], shared: Sequence[Key]) -> str:
+def _incomparable(before: Mapping[Asked, Row], after: Mapping[Asked, Row], shared: Sequence[Asked]) -> str:
     """Why the two tables are not about the same problems; empty if they are."""
     pairs = [(before[key], after[key]) for key in shared]
     other = [(x, y) for x, y in pairs if (x.case, x.problems_version) != (y.case, y.problems_version)]
@@ -108,7 +127,7 @@ def _incomparable(before: Mapping[Key, Row], after: Mapping[Key, Row], shared: S
         x, y = other[0]
         return (
             f"{len(other)} common rows are of different problems, "
-            f"such as {name_of(x.key)}: {_problems(x)} in A, {_problems(y)} in B"
+            f"such as {name_of(_asked(x))}: {_problems(x)} in A, {_problems(y)} in B"
         )
     if not shared and before and after:
         return "no row is in both"
@@ -137,7 +156,7 @@ def _changes(before: Row, after: Row, tolerance: Tolerance) -> Iterator[Change]:
         x, y = getattr(before, column), getattr(after, column)
         size = _distance(x, y, relative=column == "objective")
         if size > limit:
-            yield Change(before.key, column, x, y, size)
+            yield Change(_asked(before), column, x, y, size)
 
 
 def _distance(x: object, y: object, relative: bool) -> float:
@@ -150,35 +169,32 @@ def _distance(x: object, y: object, relative: bool) -> float:
 
 def _summary(a: Path, b: Path) -> pd.DataFrame:
     """Mean gap and time per method over the common rows that have one in both folders."""
-    names = list(Key._fields)
-    frames = [_with_gaps(Results(folder).frame()).set_index(names, drop=False) for folder in (a, b)]
+    names = list(Asked._fields)
+    frames = []
+    for folder in (a, b):
+        frame = named(Results(folder).frame()).sort_values("date", kind="stable")
+        frames.append(_with_gaps(frame.drop_duplicates(names, keep="last")).set_index(names, drop=False))
     common = frames[0].index.intersection(frames[1].index, sort=False)
     x, y = (frame.loc[common] for frame in frames)
-    timings = []
-    for folder in (a, b):
-        timing = timing_summary(read_timing(folder / "timing.csv"))
-        timings.append(timing.set_index(GROUP)["solve_s"])
+    timings = [
+        timing_summary(read_timing(folder / "timing.csv")).set_index(GROUP)["solve_s"] for folder in (a, b)
+    ]
     rows = []
-    for regime, method, settings, part in groups(x.reset_index(drop=True)):
+    for regime, key, part in groups(x.reset_index(drop=True)):
         chosen = pd.MultiIndex.from_frame(part[names])
         mine, theirs = x.loc[chosen], y.loc[chosen]
         both = (mine["gap_percent"].notna() & theirs["gap_percent"].notna()).to_numpy()
         ratios = (theirs["solve_s"] / mine["solve_s"].where(mine["solve_s"] > 0)).dropna()
-        alone = [timing.get((regime, method, settings), math.nan) for timing in timings]
-        rows.append(
-            {
-                "regime": regime,
-                "title": title(method, settings),
-                "method": method,
-                "settings": settings,
-                "common": len(part),
-                "gap_percent_a": float(mine["gap_percent"][both].mean()),
-                "gap_percent_b": float(theirs["gap_percent"][both].mean()),
-                "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
-                "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
-            }
-        )
-    return table(rows, SUMMARY_COLUMNS)
+        alone = [timing.get((regime, *key), math.nan) for timing in timings]
+        facts = {
+            "common": len(part),
+            "gap_percent_a": float(mine["gap_percent"][both].mean()),
+            "gap_percent_b": float(theirs["gap_percent"][both].mean()),
+            "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
+            "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
+        }
+        rows.append(head(regime, key) | facts)
+    return line_table(rows, SUMMARY_COLUMNS)
 
 
 def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
@@ -190,12 +206,13 @@ def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts) if parts else gaps(frame, pd.Series(dtype=float))
 
 
-def name_of(key: Key) -> str:
-    """A row's key as a reader sees it; default settings go without saying."""
-    return " ".join(key[:3]) + ("" if key.settings == "default" else f" [{key.settings}]")
+def name_of(key: Asked) -> str:
+    """What a row answers as a reader sees it; the usual settings and surrogate go without saying."""
+    unusual = title(key.method, key.settings, key.model).removeprefix(title(key.method))
+    return f"{key.instance} {key.regime} {key.method}{unusual}"
 
 
 SUMMARY_COLUMNS = [
-    *("regime", "title", "method", "settings", "common"),
+    *("regime", "title", "method", "settings", "model", "common"),
     *("gap_percent_a", "gap_percent_b", "time_ratio", "time_ratio_alone"),
 ]

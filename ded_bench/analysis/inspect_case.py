@@ -8,8 +8,7 @@ import numpy as np
 
 from ded_bench.methods import ed
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import servable
-from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pandas as pd
 
-from ded_bench.problem.ac_case import TRUTHS
+from ded_bench.analysis.lines import GROUP, line_table, named
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
 #: What rows of one line of a table share, besides the scenario.
-LOOP = ["regime", "method", "settings", "period_s", "latency_s", "forecast", "predicted", "warm"]
-RUN = ["regime", "method", "settings"]
-#: The operator's practice that others are set beside.
-STATIC = ("ed", "1s")
+LOOP = [*GROUP, "period_s", "latency_s", "forecast", "predicted", "warm"]
+#: The operator's practice that others are set beside: method and settings.
+STATIC = ("ed", "every=1")
 #: A method with so many latencies at one forecast was swept.
 SWEPT = 3
 #: Own latencies that differ by so small a part share a line.
@@ -21,22 +22,22 @@ SAME = 0.01
 KINDS = (*QUALITIES, "present")
 
 
-def online_rows(results: OnlineResults, case: str, truth: str = TRUTHS[0]) -> pd.DataFrame:
-    """Rows of a case on one network in the order of the table; `kind` is the forecast, or `present`.
+def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
+    """Rows of a case in the order of the table; `kind` is the forecast, or `present`.
 
     `over_known_percent` is the cost over the same method's on the scenario with a perfect forecast and no
     latency, %; `static_objective` and `static_excess_hz` are those of static dispatch of every second.
     """
-    rows = (row for row in results.table.rows.values() if row.case == case and row.truth == truth)
-    frame = ONLINE.frame(rows)
-    announced = frame["forecast"] == QUALITIES[0]
-    frame["kind"] = frame["forecast"].where(frame["predicted"].astype(bool), "present")
-    frame = frame[frame["predicted"].astype(bool) | announced].reset_index(drop=True)
+    rows = list(results.table.rows.values())
+    frame = named(ONLINE.frame(rows).assign(key=pd.Series([row.key for row in rows], dtype=object)))
+    frame = frame[frame["case"] == case]
+    predicted, announced = frame["predicted"].astype(bool), frame["forecast"] == QUALITIES[0]
+    frame = frame.assign(kind=frame["forecast"].where(predicted, "present"))
+    frame = frame[predicted | announced].reset_index(drop=True)
     frame["latency_s"] = _shared_latency(frame)
     known = frame[(frame["kind"] == "perfect") & (frame["latency_s"] == 0) & frame["warm"].astype(bool)]
-    best = known.set_index([*RUN, "scenario"])["objective"]
-    best = best[~best.index.duplicated()]
-    same = best.reindex(pd.MultiIndex.from_frame(frame[[*RUN, "scenario"]])).to_numpy()
+    best = known.drop_duplicates([*GROUP, "scenario"]).set_index([*GROUP, "scenario"])["objective"]
+    same = best.reindex(pd.MultiIndex.from_frame(frame[[*GROUP, "scenario"]])).to_numpy()
     frame["over_known_percent"] = 100 * (frame["objective"].to_numpy() / same - 1)
     return frame.join(_static(frame), on=["regime", "scenario"])
 
@@ -58,11 +59,8 @@ def _static(frame: pd.DataFrame) -> pd.DataFrame:
     return found[list(names)].rename(columns=names)
 
 
-def line(rows: pd.DataFrame) -> dict[str, object]:
-    """One line of a table from the rows of several scenarios.
-
-    Means and maxima over the scenarios that were operated to their end; plans are counted over all.
-    """
+def _line(rows: pd.DataFrame) -> dict[str, Any]:
+    """Means and maxima over the scenarios that were operated to their end; plans are counted over all."""
     done = rows.dropna(subset=["objective"])
     plans = max(int(rows["plans"].sum()), 1)
     return {
@@ -87,13 +85,7 @@ def line(rows: pd.DataFrame) -> dict[str, object]:
 
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method and period, at the latency of `timing.csv`, forecasts as announced."""
-    own = frame[(frame["latency_source"] == "timing") & (frame["kind"] == QUALITIES[0])]
-    return _lines(own, LOOP)
-
-
-def operated(frame: pd.DataFrame) -> pd.DataFrame:
-    """One line per way of operating: regime, method, settings and the options of the loop."""
-    return _lines(frame, LOOP)
+    return _lines(frame[(frame["latency_source"] == "timing") & (frame["kind"] == QUALITIES[0])], LOOP)
 
 
 def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
@@ -106,18 +98,19 @@ def sweeps(frame: pd.DataFrame) -> pd.DataFrame:
     """
     frame = frame[frame["warm"].astype(bool)]
     parts = []
-    for _, every in frame.groupby(RUN, sort=False):
+    for _, every in frame.groupby(GROUP, sort=False):
         period = every.groupby("period_s")["latency_s"].nunique().idxmax()
         rows = every[every["period_s"] == period]
-        announced = rows[rows["kind"] == QUALITIES[0]]
-        if announced["latency_s"].nunique() < SWEPT:
+        if rows.loc[rows["kind"] == QUALITIES[0], "latency_s"].nunique() < SWEPT:
             continue
-        scenarios = [set(line["scenario"]) for _, line in rows.groupby(["latency_s", "kind"])]
-        asked = rows[rows["latency_source"] == "given"] if "given" in set(rows["latency_source"]) else rows
-        most = asked.groupby(["latency_s", "kind"])["scenario"].nunique().max()
-        common = set.intersection(*(some for some in scenarios if 2 * len(some) >= most))
-        kept = rows.groupby(["latency_s", "kind"])["scenario"].transform("nunique") * 2 >= most
-        parts.append(rows[kept & rows["scenario"].isin(common)])
+        counts = rows.groupby(["latency_s", "kind"])["scenario"].transform("nunique")
+        asked = rows["latency_source"] == "given"
+        kept = rows[2 * counts >= (counts[asked] if asked.any() else counts).max()]
+        lines = kept.groupby(["latency_s", "kind"]).ngroups
+        everywhere = (
+            kept.drop_duplicates(["latency_s", "kind", "scenario"])["scenario"].value_counts() == lines
+        )
+        parts.append(kept[kept["scenario"].map(everywhere).astype(bool)])
     swept = pd.concat(parts) if parts else frame.iloc[:0]
     return _lines(swept, [*LOOP, "kind"])
 
@@ -126,7 +119,7 @@ def crossed(lines: pd.DataFrame) -> pd.DataFrame:
     """Sweeps with a column of cost and of excess for each kind; one line per regime, method and latency."""
     if not len(lines):
         return lines
-    index = [*RUN, "latency_s"]
+    index = [*GROUP, "latency_s"]
     wide = lines.pivot_table(
         index=index, columns="kind", values=["increase_percent_mean", "max_excess_mhz_mean"], sort=False
     )
@@ -136,5 +129,5 @@ def crossed(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def _lines(frame: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    made = [dict(zip(by, key, strict=True)) | line(rows) for key, rows in frame.groupby(by, sort=False)]
-    return pd.DataFrame(made, columns=None if made else [*by, *line(frame)])
+    made = [dict(zip(by, key, strict=True)) | _line(rows) for key, rows in frame.groupby(by, sort=False)]
+    return line_table(made, [*by, *_line(frame)])

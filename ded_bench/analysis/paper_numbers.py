@@ -1,14 +1,19 @@
-"""A paper's numbers about a case, from `paper.json` in the case's folder."""
+"""A paper's numbers about a case, from `paper.json` in the case's folder, and its tables beside ours."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 from pydantic import Field
 
+from ded_bench.analysis.lines import GROUP, HEAD, head, is_usual, line_table, records
+from ded_bench.analysis.summary import statistics, summary
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
+from ded_bench.methods.options import DEFAULT
 from ded_bench.problem.case import Name, NonNegative, Number
 
 
@@ -70,3 +75,39 @@ def read_paper(problems: Path) -> Paper | None:
     if not paper.references:
         raise InputError(path, "regimes", "hold no method whose increase is null: that of the reference")
     return paper
+
+
+def result_lines(
+    rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper | None, reference: str
+) -> pd.DataFrame:
+    """The lines of the paper's Tables V and VI: in each regime the paper's rows first, then all others.
+
+    Args:
+        rows: of the results table with their gaps (see `summary.gaps`).
+        timing: one row per line, of one host (see `timing_summary`).
+        paper: its rows are there even if nobody ran the method yet.
+        reference: method that gaps are measured against, with its default settings.
+
+    Returns:
+        What `summary` has, `is_reference`, the time alone on a machine `solve_s` and its `timing_failures`,
+        the mean gap `increase_percent` (missing for the reference), and the paper's numbers as `paper_…`.
+    """
+    ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
+    usual = {key[:2]: key for key in ours if is_usual(key[2], key[3], key[1])}
+    theirs = paper.rows() if paper else {}
+    beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in theirs.items()}
+    times = {tuple(line[name] for name in GROUP): line for line in records(timing)}
+    lines = []
+    for key in sorted(dict.fromkeys((*beside, *ours)), key=lambda key: str(key[0])):
+        line = ours.get(key) or head(key[0], key[1:]) | statistics(rows[:0])
+        timed = times.get(key, {})
+        line["is_reference"] = (key[1], key[2]) == (reference, DEFAULT)
+        line["solve_s"], line["timing_failures"] = timed.get("solve_s", math.nan), timed.get("failures", 0)
+        line["increase_percent"] = math.nan if line["is_reference"] else line["gap_percent_mean"]
+        for name in PaperRow.model_fields:
+            number = getattr(beside.get(key), name, None)
+            line[f"paper_{name}"] = math.nan if number is None else float(number)
+        lines.append(line)
+    own = ("is_reference", "solve_s", "timing_failures", "increase_percent")
+    papers = (f"paper_{name}" for name in PaperRow.model_fields)
+    return line_table(lines, [*HEAD, *statistics(rows[:0]), *own, *papers])

@@ -9,19 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import pandas as pd
+
+from ded_bench.analysis.lines import title
 from ded_bench.analysis.paper_numbers import Paper
-from ded_bench.analysis.summary import title
+from ded_bench.methods.options import DEFAULT
 from ded_bench.results.objectives import OBJECTIVES, Objective
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 #: References of cases without a paper's numbers, the first that has objectives.
 ACCURATE = ("ded-radau", "ded-slp")
-#: Settings of every reference.
-DEFAULT = "default"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +36,9 @@ class Reference:
     shipped: int = 0
 
     @property
-    def run(self) -> tuple[str, str]:
-        """Method and settings."""
-        return self.method, DEFAULT
-
-    @property
     def title(self) -> str:
         """The reference as tables name it."""
-        return title(*self.run)
+        return title(self.method)
 
 
 def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[Objective] = ()) -> Reference:
@@ -55,7 +47,7 @@ def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[
     A shipped objective is used only for instances whose rows are of the same problem version.
 
     Args:
-        rows: of one case in a results folder (see `run.results.Results.frame`).
+        rows: of one case in a results folder (see `Results.frame`).
         paper: the paper's numbers about the case.
         shipped: objectives of the case's reference run.
     """
@@ -65,8 +57,7 @@ def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[
     for method in candidates:
         is_reference = (rows["method"] == method) & (rows["settings"] == DEFAULT)
         own = _by_instance(rows[is_reference].dropna(subset=["objective"]))
-        known = _by_instance(usable[usable["method"] == method])
-        objectives = own.combine_first(known)
+        objectives = own.combine_first(_by_instance(usable[usable["method"] == method]))
         if len(objectives):
             return Reference(method, objectives, len(objectives) - len(own))
     return Reference(candidates[0], _by_instance(rows[:0]))

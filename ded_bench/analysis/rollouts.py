@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.reference import DEFAULT
-from ded_bench.analysis.summary import title
+from ded_bench.analysis.lines import title
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods import ed
-from ded_bench.methods.knots import knot_points
+from ded_bench.methods.knots import case_knots
+from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -23,7 +23,7 @@ from ded_bench.surrogates.identify import held_out, predict
 from ded_bench.surrogates.instance_model import model_along
 from ded_bench.surrogates.koopman import Koopman
 
-#: Trajectories whose rollouts are judged together: all would fill the memory on large grids.
+#: Schedules of one method whose rollouts are judged together: all would fill the memory on large grids.
 AT_A_TIME = 10
 #: Beside the models: the table of `ded-bench rollouts`.
 ROLLOUTS = "rollouts"
@@ -38,42 +38,34 @@ class Errors(NamedTuple):
 
 def rollout_errors(case: Case, surrogate: Surrogate, data: Trajectories) -> Errors:
     """A surrogate's errors under the inputs of trajectories, over all their grid points."""
-    network, n_gen, parts = Network(case), len(case.generators), []
-    for first in range(0, len(data.kinds), AT_A_TIME):
-        part = data.take(slice(first, first + AT_A_TIME))
-        if isinstance(surrogate, Koopman):
-            predicted = predict(surrogate, network, part)
-        else:
-            predicted = _predict_along(case, surrogate, part)
-        error = predicted - part.outputs
-        omega = np.abs(error[..., :n_gen]).max(axis=(0, 2)) / (2 * np.pi)
-        parts.append((omega, np.sqrt(np.square(error[..., n_gen]).mean(axis=0))))
-    return Errors(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if isinstance(surrogate, Koopman):
+        predicted = predict(surrogate, Network(case), data)
+    else:
+        predicted = _predict_along(case, surrogate, data)
+    error, n_gen = predicted - data.outputs, len(case.generators)
+    omega = np.abs(error[..., :n_gen]).max(axis=(0, 2)) / (2 * np.pi)
+    return Errors(omega, np.sqrt(np.square(error[..., n_gen]).mean(axis=0)))
 
 
-def rollout_table(case: Case, surrogates: Sequence[Surrogate], data: Trajectories) -> pd.DataFrame:
-    """Rollout errors by model and kind of schedule: |Δω| in Hz, ΔP_s in pu."""
+def rollout_table(case: Case, surrogates: Sequence[Surrogate], *parts: Trajectories) -> pd.DataFrame:
+    """Rollout errors by kind of schedule and model: |Δω| in Hz, ΔP_s in pu."""
+    return _table(case, surrogates, parts)
+
+
+def _table(case: Case, surrogates: Sequence[Surrogate], parts: Iterable[Trajectories]) -> pd.DataFrame:
     rows = []
-    for surrogate in surrogates:
-        errors = rollout_errors(case, surrogate, data)
-        for kind in dict.fromkeys(data.kinds):
-            chosen = np.array([k == kind for k in data.kinds])
-            rows.append(
-                table_row(surrogate.kind, kind, Errors(errors.omega_hz[chosen], errors.p_slack[chosen]))
-            )
-    return pd.DataFrame(rows)
-
-
-def table_row(model: str, schedules: str, errors: Errors) -> dict[str, str | float]:
-    """One row of a table of rollout errors."""
-    return {
-        "model": model,
-        "schedules": schedules,
-        "n": len(errors.omega_hz),
-        "mean max |Δω| (Hz)": errors.omega_hz.mean(),
-        "max |Δω| (Hz)": errors.omega_hz.max(),
-        "mean RMS ΔP_s (pu)": errors.p_slack.mean(),
+    for data in parts:
+        for surrogate in surrogates:
+            errors = rollout_errors(case, surrogate, data)._asdict()
+            rows.append(pd.DataFrame({"schedules": data.kinds, "model": surrogate.kind} | errors))
+    groups = pd.concat(rows).groupby(["schedules", "model"], sort=False)
+    made = {
+        "n": groups.size(),
+        "mean max |Δω| (Hz)": groups["omega_hz"].mean(),
+        "max |Δω| (Hz)": groups["omega_hz"].max(),
+        "mean RMS ΔP_s (pu)": groups["p_slack"].mean(),
     }
+    return pd.DataFrame(made).reset_index()[["model", "schedules", *made]]
 
 
 def all_rollouts(
@@ -99,37 +91,35 @@ def all_rollouts(
     Raises:
         InputError: a kept schedule cannot be read.
     """
-    draws = held_out(case, count=drawn)
-    static = [ed.dispatch(case, instance, 1.0) for instance in draws.instances]
-    tables = [rollout_table(case, surrogates, draws)]
-    tables.append(
-        rollout_table(
-            case,
-            surrogates,
-            trajectories(case, list(draws.instances), static, ["static dispatch"] * len(static)),
-        )
-    )
-    for method in optimal:
-        for regime in case.regimes:
-            wanted = case.id, regime, method, DEFAULT
-            rows = [r for r in results.rows.values() if (r.case, r.regime, r.method, r.settings) == wanted]
-            kept = {row.instance: row for row in rows if results.has_schedule(row)}
-            there = [instance for instance in instances if instance.id in kept]
-            if there:
-                schedules = [results.schedule(kept[i.id], case, i) for i in there]
-                kind = f"{title(method)}, {regime}"
-                data = trajectories(case, there, schedules, [kind] * len(there))
-                tables.append(rollout_table(case, surrogates, data))
-    table = pd.concat(tables, ignore_index=True)
+    table = _table(case, surrogates, _parts(case, results, instances, optimal, drawn))
     write_atomically(results.paths.model_errors(ROLLOUTS), table.to_csv(index=False))
     return table
+
+
+def _parts(
+    case: Case, results: Results, instances: Sequence[Instance], optimal: Sequence[str], drawn: int
+) -> Iterator[Trajectories]:
+    """One after another, since all would fill the memory."""
+    draws = held_out(case, count=drawn)
+    yield draws
+    static = [ed.dispatch(case, instance, 1.0) for instance in draws.instances]
+    yield trajectories(case, list(draws.instances), static, ["static dispatch"] * len(static))
+    known = {instance.id: instance for instance in instances}
+    rows = [row for row in results.rows.values() if row.instance in known and row.settings == DEFAULT]
+    for method in optimal:
+        for regime in case.regimes:
+            kept = [r for r in rows if (r.method, r.regime) == (method, regime) and results.has_schedule(r)]
+            for some in (kept[i : i + AT_A_TIME] for i in range(0, len(kept), AT_A_TIME)):
+                there = [known[row.instance] for row in some]
+                schedules = [results.schedule(row, case, known[row.instance]) for row in some]
+                yield trajectories(case, there, schedules, [f"{title(method)}, {regime}"] * len(some))
 
 
 def _predict_along(case: Case, surrogate: AlongTrajectory, data: Trajectories) -> Array:
     """(ω, P_s) by the linearisation along each instance's static dispatch, as `ded-ko-knots` uses it."""
     n_gen, predicted = len(case.generators), np.empty_like(data.outputs)
     for i, instance in enumerate(data.instances):
-        points = knot_points(case.knot_times(instance.horizon_s), instance.dt_s)
+        points = case_knots(case, instance)
         p_gen = ed.dispatch(case, instance, 1.0).at(instance.grid[points])
         model = model_along(case, surrogate, instance, p_gen, points)
         predicted[:, i, :n_gen], predicted[:, i, n_gen] = model.rollout(data.inputs[:, i, :n_gen])

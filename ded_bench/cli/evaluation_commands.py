@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +73,7 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that draw figures")
+    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that score the rest")
     p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_report)
 
@@ -172,31 +171,32 @@ def _score_waiting(place: str, results: Results, workers: int) -> None:
     """Score what an interrupted run has solved but not scored, and say so; else it would count as failed."""
     from ded_bench.run.scoring import save_scores, unscored
 
+    waiting = unscored(results)
     for split in ("all", "validation"):
-        waiting = [row for row in unscored(results) if (row.split == "validation") == (split == "validation")]
-        if waiting:
-            chosen = select_split(place, split)
-            instances = {instance.id: instance for instance, _ in chosen.instances}
-            with Workers(workers) as pool:
-                known = [row for row in waiting if row.instance in instances]
-                rows = save_scores(chosen.case, known, instances, results, pool)
-            say(f"{counted(len(rows), 'row')} solved but not scored: scored now")
+        asked = [row for row in waiting if (row.split == "validation") == (split == "validation")]
+        if not asked:
+            continue
+        chosen = select_split(place, split)
+        instances = {instance.id: instance for instance, _ in chosen.instances}
+        known = [row for row in asked if row.instance in instances]
+        with Workers(workers) as pool:
+            rows = save_scores(chosen.case, known, instances, results, pool)
+        say(f"{counted(len(rows), 'row')} solved but not scored: scored now")
 
 
 def _report(a: argparse.Namespace) -> int:
-    with Workers(a.workers) if a.workers > 1 else nullcontext() as pool:
-        from ded_bench.results.rows import Results
+    from ded_bench.results.rows import Results
 
-        case = Case.load(a.case)
-        folder = a.results or default_results(case)
-        if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
-            say(f"tables and figures of {counted(rows, 'row')} in {folder}")
-        from ded_bench.report.report import write_report
-        from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
+    case = Case.load(a.case)
+    folder = a.results or default_results(case)
+    if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
+        say(f"tables and figures of {counted(rows, 'row')} in {folder}")
+    from ded_bench.report.report import write_report
+    from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
 
-        _score_waiting(a.case, Results(folder), a.workers)
-        written = write_report(case, folder, problem_folder(a.case, case), pool)
-        OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
+    _score_waiting(a.case, Results(folder), a.workers)
+    written = write_report(case, folder, problem_folder(a.case, case))
+    OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0
 

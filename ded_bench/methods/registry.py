@@ -33,6 +33,7 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
+    model: str = "koopman"  # the surrogate that it plans with unless told otherwise, if it takes any
 
     @property
     def _answering(self) -> Any:
@@ -105,7 +106,7 @@ METHODS: dict[str, Method] = {
         Method("ded", "ded_bench.methods.ded", "DED"),
         Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
         Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
-        Method("ded-rti", "ded_bench.methods.ded_rti", "DED (real-time iteration)"),
+        Method("ded-rti", "ded_bench.methods.ded_rti", "DED (real-time iteration)", model="trajectory"),
         Method("ed", "ded_bench.methods.ed", "ED"),
         Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
         Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (knots)"),

@@ -1,19 +1,22 @@
-"""Every column that the report prints, declared once: name, heading, unit, format, source of its value.
+"""Every column that pages print, declared once: name, heading, unit, format, value.
 
-A column with a `value` computes it from what a line of its table is about; any other names a column of the
+A column with a `value` computes its cells from the other cells of a line; any other names a column of the
 frame that the table prints.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pandas as pd
 
-from ded_bench.analysis.summary import HEAD
-from ded_bench.report.paper import Line
+from ded_bench.analysis.break_even import MANY
+from ded_bench.analysis.lines import HEAD, records
+
+Cells = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -25,14 +28,14 @@ class Column:
         text: what stands above it, without the unit.
         unit: printed after the text, in brackets.
         form: format of its floats.
-        value: computes a cell from a line of Tables V and VI.
+        value: computes a cell from the other cells of its line.
     """
 
     name: str
     text: str
     unit: str = ""
     form: str = ".3g"
-    value: Callable[[Line], object] | None = None
+    value: Callable[[Cells], object] | None = None
 
     @property
     def heading(self) -> str:
@@ -44,96 +47,82 @@ class Column:
         if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA:
             return "–"
         if isinstance(value, float):
-            text = format(value, self.form)
-            return text.replace("%", " %")
+            return format(value, self.form).replace("%", " %")
         return str(value)
 
 
-def tabulate(columns: Sequence[Column], lines: Sequence[Line]) -> pd.DataFrame:
-    """The frame of Table V or VI: what each line is about, then every column that has a `value`."""
-    computed = {column.name: column.value for column in columns if column.value}
-    rows = [
-        [getattr(line, name) for name in HEAD] + [value(line) for value in computed.values()]
-        for line in lines
-    ]
-    return pd.DataFrame(rows, columns=[*HEAD, *computed])
+def computed(frame: pd.DataFrame, columns: Sequence[Column]) -> pd.DataFrame:
+    """The frame with the columns that have a `value` and that it lacks."""
+    missing = [column for column in columns if column.value and column.name not in frame]
+    rows = records(frame) if missing else []
+    made = {c.name: pd.Series([c.value(row) for row in rows], frame.index) for c in missing if c.value}
+    return frame.assign(**made)
 
 
-_HEAD = (Column("regime", "Regime"), Column("title", "Method"))
-_FREQUENCY = (
-    Column("freq_violation_hz_mean", "frequency mean", "Hz"),
-    Column("freq_violation_hz_max", "frequency max", "Hz"),
-)
-_SPREAD = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
+def tabulate(columns: Sequence[Column], lines: pd.DataFrame) -> pd.DataFrame:
+    """What each line is about, then the columns, those with a `value` computed anew; nothing else."""
+    own = [column.name for column in columns if column.value]
+    made = computed(lines.drop(columns=own, errors="ignore"), columns)
+    return made[list(dict.fromkeys((*HEAD, *(column.name for column in columns))))]
 
 
-def _papers(name: str, text: str, unit: str = "") -> Column:
-    """A number of the paper, printed as it prints it."""
-    return Column(f"paper_{name}", text, unit, "g", value=lambda line: line.papers(name))
+def _against(what: str, ours: str, paper: str, failures: str = "failures") -> Column:
+    """How a number of ours stands against the paper's: ahead if it is lower.
+
+    A mean over the instances that did not fail is never ahead. Empty where either number is missing.
+    """
+
+    def verdict(line: Cells) -> str:
+        a, b = line[ours], line[paper]
+        if math.isnan(a) or math.isnan(b):
+            return ""
+        if line[failures] or a > b:
+            return "behind"
+        return "ahead" if a < b else "equal"
+
+    return Column(f"against_paper_{what}", f"{what} against the paper", value=verdict)
 
 
-def _statistic(name: str, text: str | None = None, unit: str = "", of: str = "") -> Column:
-    return Column(name, text or name, unit, value=lambda line: line.statistics[of or name])
+def _spread(name: str, text: str, unit: str = "") -> tuple[Column, ...]:
+    parts = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
+    return tuple(Column(f"{name}_{part}", f"{text} {heading}".strip(), unit) for part, heading in parts)
 
 
-def _verdict(what: str, name: str) -> Column:
-    """How the mean of a violation stands against the paper's."""
-    return Column(
-        f"against_paper_{what}",
-        f"{what} against the paper",
-        value=lambda line: line.verdict(line.statistics[f"{name}_mean"], name, line.statistics["failures"]),
-    )
+REGIME, TITLE, CASE = Column("regime", "Regime"), Column("title", "Method"), Column("case", "Grid")
+ROWS, N, FAILURES = Column("rows", "rows"), Column("n", "n"), Column("failures", "failures")
+MODEL, DATE, SEED = Column("model", "surrogate"), Column("date", "date"), Column("seed", "seed")
+PARAMETERS, DEVICE = Column("parameters", "parameters"), Column("device", "device")
+INSTANCES, SECONDS = Column("instances", "instances"), Column("seconds", "training", "s")
+_HEAD = (REGIME, TITLE)
 
-
+#: The paper's tables, of `paper_numbers.result_lines`.
 TABLE_V = (
     *_HEAD,
-    Column("increase_percent", "% increase in obj. over DED", value=lambda line: line.increase_percent),
-    _papers("increase_percent", "paper's %"),
-    Column("solve_s", "Sol. time", "s", value=lambda line: line.timing.get("solve_s", math.nan)),
-    _papers("solve_s", "paper's time", "s"),
-    _statistic("n"),
-    _statistic("failures"),
-    Column(
-        "against_paper_increase",
-        "objective against the paper",
-        value=lambda line: line.verdict(
-            line.increase_percent, "increase_percent", line.statistics["failures"]
-        ),
-    ),
-    Column(
-        "against_paper_time",
-        "time against the paper",
-        value=lambda line: line.verdict(
-            line.timing.get("solve_s", math.nan), "solve_s", line.timing.get("failures", 0)
-        ),
-    ),
+    Column("increase_percent", "% increase in obj. over DED"),
+    Column("paper_increase_percent", "paper's %", form="g"),
+    Column("solve_s", "Sol. time", "s"),
+    Column("paper_solve_s", "paper's time", "s", "g"),
+    N,
+    FAILURES,
+    _against("increase", "increase_percent", "paper_increase_percent"),
+    _against("time", "solve_s", "paper_solve_s", "timing_failures"),
 )
 TABLE_VI = (
     *_HEAD,
-    _statistic("freq_violation_hz", "freq. const. viol.", "Hz", of="freq_violation_hz_mean"),
-    _papers("freq_violation_hz", "paper's", "Hz"),
-    _statistic("ramp_violation", "ramp const. viol.", "pu", of="ramp_violation_mean"),
-    _papers("ramp_violation", "paper's", "pu"),
-    Column("n", "n", value=lambda line: line.statistics["rows"] - line.statistics["failures"]),
-    _statistic("failures"),
-    _verdict("frequency", "freq_violation_hz"),
-    _verdict("ramp", "ramp_violation"),
+    Column("freq_violation_hz", "freq. const. viol.", "Hz", value=lambda x: x["freq_violation_hz_mean"]),
+    Column("paper_freq_violation_hz", "paper's", "Hz", "g"),
+    Column("ramp_violation", "ramp const. viol.", "pu", value=lambda x: x["ramp_violation_mean"]),
+    Column("paper_ramp_violation", "paper's", "pu", "g"),
+    Column("n", "n", value=lambda x: x["rows"] - x["failures"]),
+    FAILURES,
+    _against("frequency", "freq_violation_hz_mean", "paper_freq_violation_hz"),
+    _against("ramp", "ramp_violation_mean", "paper_ramp_violation"),
 )
-#: Shorter headings for the first screen.
-_SHORT = {
-    "increase_percent": "% over DED",
-    "solve_s": "time",
-    "freq_violation_hz": "frequency",
-    "ramp_violation": "ramp",
-    "failures": "failed",
-} | dict.fromkeys(
-    ("paper_increase_percent", "paper_solve_s", "paper_freq_violation_hz", "paper_ramp_violation"), "paper's"
-)
-#: Columns of both tables on the first screen.
-FRONT_V, FRONT_VI = (
-    tuple(replace(c, text=_SHORT.get(c.name, c.text)) for c in table if not c.name.startswith("against_"))
-    for table in (TABLE_V, TABLE_VI)
-)
+
+
+def front(columns: Sequence[Column]) -> tuple[Column, ...]:
+    """Columns of Table V or VI on the first screen: without the verdicts."""
+    return tuple(column for column in columns if not column.name.startswith("against_"))
 
 
 def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ...]:
@@ -144,89 +133,59 @@ def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ..
     )
 
 
+_GAPS = _spread("gap_percent", "gap", "%")
+_FREQUENCY = _spread("freq_violation_hz", "frequency", "Hz")
 GAPS = (
-    *_HEAD,
-    Column("rows", "rows"),
-    Column("n", "n"),
-    Column("failures", "failures"),
-    Column("unpaired", "without reference"),
-    *(Column(f"gap_percent_{part}", heading) for part, heading in _SPREAD),
+    *(*_HEAD, ROWS, N, FAILURES, Column("unpaired", "without reference")),
+    *_spread("gap_percent", ""),
     Column("cost_ratio", "ratio of summed costs", form=".6f"),
 )
 RATES = (
     *_HEAD,
-    Column("rows", "rows"),
+    ROWS,
     Column("success_rate", "success (claimed)", form=".1%"),
     Column("correct_rate", "feasible (verified)", form=".1%"),
     Column("strict_rate", "strictly feasible (verified)", form=".1%"),
 )
-COVERAGE = (
-    *RATES,
-    Column("failures", "failures"),
-    Column("gap_percent_mean", "gap mean", "%"),
-    Column("gap_percent_max", "gap max", "%"),
-    *_FREQUENCY,
-)
+COVERAGE = (*RATES, FAILURES, _GAPS[0], _GAPS[-1], _FREQUENCY[0], _FREQUENCY[-1])
+MODELS = (*_HEAD, MODEL, N, FAILURES, *_GAPS, _FREQUENCY[0], _FREQUENCY[-1])
 VIOLATIONS = (
     *_HEAD,
-    *(Column(f"freq_violation_hz_{part}", f"frequency {heading}", "Hz") for part, heading in _SPREAD),
-    Column("ramp_violation_mean", "ramp mean", "pu"),
-    Column("ramp_violation_max", "ramp max"),
-    Column("bound_violation_mean", "bounds mean", "pu"),
-    Column("bound_violation_max", "bounds max"),
-    Column("initial_violation_mean", "initial mean", "pu"),
-    Column("initial_violation_max", "initial max"),
-)
-PROVENANCE = (
-    *_HEAD,
-    Column("rows", "rows"),
-    Column("code", "code"),
-    Column("score_code", "code of the scores"),
-    Column("timed_code", "code of the times"),
-    Column("model", "Koopman model"),
-    Column("policy", "policy"),
-    Column("solver_version", "solver"),
+    *_FREQUENCY,
+    *(Column(f"ramp_violation_{part}", f"ramp {part}", "pu") for part in ("mean", "max")),
+    *(Column(f"bound_violation_{part}", f"bounds {part}", "pu") for part in ("mean", "max")),
+    *(Column(f"initial_violation_{part}", f"initial {part}", "pu") for part in ("mean", "max")),
 )
 CLAIMS = (
-    *_HEAD,
-    Column("status", "status"),
-    Column("meaning", "which means"),
-    Column("rows", "rows"),
+    *(*_HEAD, Column("status", "status"), Column("meaning", "which means"), ROWS),
     Column("feasible", "feasible"),
     Column("feasible_strict", "strictly"),
     Column("infeasible", "infeasible"),
     Column("not_scored", "not scored"),
 )
-_PARTS = (("solve_s", "solve"), ("setup_s", "set-up"), ("build_s", "build"))
-_QUARTILES = tuple(
-    Column(f"{name}{part}", f"{heading}{mark}")
-    for name, heading in _PARTS
-    for part, mark in (("_q1", " 25 %"), ("", " median"), ("_q3", " 75 %"))
+PROVENANCE = (
+    *_HEAD,
+    ROWS,
+    Column("version", "ded-bench"),
+    Column("commit", "commit"),
+    Column("method_version", "method's version"),
+    Column("made_with", "surrogate and policy"),
+    Column("solver_version", "solver"),
+)
+_TIMES = (
+    Column("solve_s_q1", "solve 25 %"),
+    Column("solve_s", "solve median"),
+    Column("solve_s_q3", "solve 75 %"),
+    Column("setup_s", "set-up median"),
+    Column("build_s", "build median"),
 )
 TIMING = (
-    *_HEAD,
-    Column("instances", "instances"),
-    Column("repeats", "repeats"),
-    *_QUARTILES,
-    Column("first_build_s", "first build"),
-    Column("first_setup_s", "first set-up"),
-    Column("failures", "failures"),
+    *(*_HEAD, INSTANCES, Column("repeats", "repeats"), *_TIMES, FAILURES),
     Column("peak_memory_mib", "peak memory", "MiB"),
-    Column("load_average", "load"),
-    Column("date", "date"),
-    Column("error", "error"),
-)
-FRONT_TIMING = tuple(
-    column
-    for column in TIMING
-    if column.name.startswith("solve_s")
-    or column.name in ("regime", "title", "instances", "repeats", "setup_s", "build_s", "peak_memory_mib")
+    *(Column("load_average", "load"), DATE, Column("error", "error")),
 )
 LOADED_TIMES = (
-    *_HEAD,
-    Column("n", "n"),
-    Column("workers", "workers"),
-    *_QUARTILES,
+    *(*_HEAD, N, Column("workers", "workers"), *_TIMES),
     Column("solve_s_shifted_geometric_mean", "solve, shifted geometric mean"),
 )
 WORST = (
@@ -241,52 +200,12 @@ WORST = (
     Column("broken", "limit broken"),
     Column("excess", "× tolerance"),
 )
-STARTS = (
-    Column("regime", "Regime"),
-    Column("start", "starting point"),
-    Column("n", "n"),
-    Column("same", "the same optimum"),
-    Column("lowest_percent", "lowest change", "%"),
-    Column("highest_percent", "highest change", "%"),
-    Column("iterations", "iterations, median"),
-    Column("iterations_cold", "of the cold start"),
-)
 TRAINING = (
-    Column("policy", "Policy"),
-    Column("seconds", "seconds"),
-    Column("epochs", "epochs"),
-    Column("instances", "instances"),
+    *(Column("policy", "Policy"), SECONDS, Column("epochs", "epochs"), INSTANCES),
     Column("held_out", "held out"),
     Column("held_out_loss", "held-out loss", form=".6g"),
     Column("training_loss", "training loss", form=".6g"),
-    Column("parameters", "parameters"),
-    Column("model", "Koopman model"),
-    Column("seed", "seed"),
-    Column("device", "device"),
-    Column("torch", "torch"),
-    Column("code", "code"),
-    Column("problem", "problem"),
-)
-MODELS = (
-    Column("regime", "Regime"),
-    Column("title", "Method"),
-    Column("model", "Koopman model"),
-    Column("n", "n"),
-    Column("failures", "failures"),
-    *(Column(f"gap_percent_{part}", f"gap {heading}", "%") for part, heading in _SPREAD),
-    *_FREQUENCY,
-)
-ABLATION = (
-    Column("regime", "Regime"),
-    Column("change", "what differs"),
-    Column("n", "n"),
-    *(Column(f"gap_percent_{part}", f"gap {heading}", "%") for part, heading in _SPREAD if part != "median"),
-    *_FREQUENCY,
-    Column("seconds", "training", "s"),
-    Column("epochs", "epochs"),
-    Column("steps", "steps"),
-    Column("instances", "instances"),
-    Column("parameters", "parameters"),
+    *(PARAMETERS, MODEL, SEED, DEVICE, Column("problem", "problem")),
 )
 CERTIFICATE = (
     *_HEAD,
@@ -296,15 +215,87 @@ CERTIFICATE = (
     Column("near_reference", "within the gap"),
     Column("clopper_pearson", "Clopper–Pearson", form=".2%"),
     Column("hoeffding", "Hoeffding", form=".2%"),
-    Column("tolerance_hz", "tolerance", "Hz"),
-    Column("tolerance_pu", "tolerance", "pu"),
-    Column("gap_percent", "gap", "%"),
-    Column("reference", "gap over"),
-    Column("delta", "δ"),
-    Column("seed", "master seed"),
-    Column("artifacts", "case, policy and models"),
-    Column("host", "host"),
-    Column("date", "date"),
+    DATE,
 )
-#: What was certified, and how surely; the rest tells how.
-FRONT_CERTIFICATE = CERTIFICATE[: [column.name for column in CERTIFICATE].index("tolerance_hz")]
+
+#: The closed loop: methods at their own latency, and sweeps.
+ONLINE = (
+    *_HEAD,
+    Column("period_s", "every", "s", "g"),
+    Column("latency_s", "latency", "s", ".2g"),
+    N,
+    FAILURES,
+    Column("increase_percent_mean", "cost over hindsight", "%", ".4f"),
+    Column("increase_percent_max", "largest", "%", ".4f"),
+    Column("over_known_percent_mean", "over perfect forecast and no latency", "%", ".4f"),
+    Column("over_static_percent_mean", "over ED every second", "%", ".4f"),
+    Column("max_excess_mhz_mean", "largest excess, mean", "mHz", ".4f"),
+    Column("max_excess_mhz_max", "largest", "mHz", ".4f"),
+    Column("static_excess_mhz_mean", "ED every second there, mean", "mHz", ".4f"),
+    Column("unforeseen_mhz_mean", "moved by unforeseen loads, mean", "mHz", ".4f"),
+    Column("share_outside", "time outside", form=".2%"),
+    Column("slack_travel_pu", "slack travel", "pu", ".2f"),
+    Column("late", "plans late", form=".1%"),
+    Column("failed", "failed", form=".1%"),
+    Column("infeasible", "infeasible", form=".1%"),
+)
+#: What plans of a sweep knew.
+KIND_NAMES = {
+    "announced": "forecast as announced",
+    "perfect": "perfect forecast",
+    "worse": "announcements four times as wrong",
+    "persistence": "persistence",
+    "present": "as announced, planned from the present state",
+}
+SWEEPS = (
+    *_HEAD,
+    Column("latency_s", "latency", "s"),
+    N,
+    *(
+        Column(f"increase_percent_mean_{kind}", f"cost: {KIND_NAMES[kind]}", "%", ".4f")
+        for kind in KIND_NAMES
+    ),
+    *(
+        Column(f"max_excess_mhz_mean_{kind}", f"excess: {KIND_NAMES[kind]}", "mHz", ".4f")
+        for kind in KIND_NAMES
+    ),
+)
+
+#: Over several grids.
+GRIDS = (
+    CASE,
+    Column("buses", "buses"),
+    Column("generators", "generators"),
+    Column("loads", "loads"),
+    Column("tests", "test instances"),
+    Column("judged", "instances with rows"),
+    Column("modes_hz", "modes", "Hz"),
+    Column("damping", "least damping", form=".1%"),
+    Column("tight_hz", "tightest bound", "Hz"),
+    Column("knots", "knots"),
+    Column("reference", "gaps are to"),
+)
+SLOPES = (
+    *_HEAD,
+    Column("solve_s", "exponent of time", form=".2f"),
+    Column("solve_s_grids", "grids"),
+    Column("peak_memory_mib", "exponent of memory", form=".2f"),
+    Column("peak_memory_mib_grids", "grids"),
+)
+TRAININGS = (
+    *(CASE, Column("name", "model or policy"), SECONDS, INSTANCES),
+    *(Column("trajectories", "trajectories"), PARAMETERS, DEVICE),
+)
+BREAK_EVEN = (
+    *(CASE, *_HEAD, Column("rival", "other")),
+    Column("training_s", "training", "s"),
+    Column("paid_after", "paid after", "schedules", ".0f"),
+    Column("gap_percent_mean", "gap", "%"),
+    Column("rival_gap_percent_mean", "other's", "%"),
+    Column("correct_rate", "feasible", form=".0%"),
+    Column("rival_correct_rate", "other's", form=".0%"),
+    Column("solve_s", "one schedule", "s"),
+    Column("rival_solve_s", "other's", "s"),
+    Column("many_s", f"training and {MANY}", "s"),
+    Column("rival_many_s", "other's", "s"),
+)

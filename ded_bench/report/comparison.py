@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from ded_bench.analysis.compare import Change, Comparison, name_of
 from ded_bench.report.columns import Column
-from ded_bench.report.render import to_markdown
+from ded_bench.report.page import Table, to_markdown
 
 #: Rows that a section of the printed comparison names; the rest are counted.
 SHOWN = 10
@@ -33,14 +33,14 @@ def to_text(comparison: Comparison) -> str:
     for name, keys in (("only in A", c.only_a), ("only in B", c.only_b)):
         if keys:
             counts.append(f"{len(keys)} rows {name}")
-            lines += _section(f"{name}: {len(keys)} rows", [name_of(key) for key in keys])
+            lines += _section(f"{name}: {len(keys)} rows", map(name_of, keys))
     for column in dict.fromkeys(change.column for change in c.changes):
         found = [change for change in c.changes if change.column == column]
         counts.append(f"{len(found)} × {column}")
-        changes = [f"{name_of(change.key)}: {_arrow(change)}" for change in found]
-        lines += _section(f"{column}: {len(found)} of {c.common} common rows", changes)
+        said = (f"{name_of(change.key)}: {_arrow(change)}" for change in found)
+        lines += _section(f"{column}: {len(found)} of {c.common} common rows", said)
     if len(c.summary):
-        lines += ["", to_markdown(c.summary, PRINTED)]
+        lines += ["", to_markdown(Table(c.summary, PRINTED))]
     verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
     return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
 
@@ -54,25 +54,16 @@ def to_json(comparison: Comparison) -> str:
         | {"size": change.size if math.isfinite(change.size) else None}
         for change in c.changes
     ]
-    summary = c.summary.astype(object).where(c.summary.notna(), None)
-    return json.dumps(
-        {
-            "a": str(c.a),
-            "b": str(c.b),
-            "same": c.same,
-            "incomparable": c.incomparable,
-            "common": c.common,
-            "only_a": [key._asdict() for key in c.only_a],
-            "only_b": [key._asdict() for key in c.only_b],
-            "changes": changes,
-            "summary": summary.to_dict("records"),
-        }
-    )
+    made = {name: getattr(c, name) for name in ("a", "b", "same", "incomparable", "common")}
+    made |= {name: [key._asdict() for key in getattr(c, name)] for name in ("only_a", "only_b")}
+    rows = c.summary.astype(object).where(c.summary.notna(), None).to_dict("records")
+    return json.dumps(made | {"changes": changes, "summary": rows}, default=str)
 
 
-def _section(heading: str, items: Sequence[str]) -> list[str]:
-    rest = [f"  … and {len(items) - SHOWN} more"] if len(items) > SHOWN else []
-    return [heading, *(f"  {item}" for item in items[:SHOWN]), *rest]
+def _section(heading: str, items: Iterable[str]) -> list[str]:
+    said = [f"  {item}" for item in items]
+    rest = [f"  … and {len(said) - SHOWN} more"] if len(said) > SHOWN else []
+    return [heading, *said[:SHOWN], *rest]
 
 
 def _arrow(change: Change) -> str:

@@ -1,79 +1,40 @@
-"""What a reader of a report must know before comparing its numbers."""
+"""What a reader of a report must know before comparing its numbers, in sentences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 
 import pandas as pd
 
-from ded_bench.analysis.summary import groups, title
-from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
+from ded_bench.analysis.lines import GROUP, groups, title
+from ded_bench.methods.registry import METHODS
 from ded_bench.report.sources import Sources
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5
-#: How the tables are to be read.
-EXPLANATION = (
-    "**Objective and violations are re-simulated**: every schedule is integrated on the true swing "
-    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_ref − 1) over "
-    "the `n` instances where both have a score; violations are means of each instance's maximum over time "
-    "and generators.",
-    "**Failures** are rows without a schedule or a score. They enter no mean, and a method with failures is "
-    "never ahead of the paper.",
-    "**Against the paper**: ahead if our number is lower than the paper's, behind if it is higher. The "
-    "paper's times are from another machine, and its instances are other draws from the same ranges.",
-    "**DED's optima are local**: the problem is not convex, so a method may come out below zero; DED also "
-    "breaks the tight frequency bound slightly, since backward Euler is not exact.",
-    "**Success** is what a method claims, **feasible** what the scorer found: frequency within "
-    f"{FEASIBLE_HZ:g} Hz, power limits within {FEASIBLE_PU:g} pu (strictly: {STRICT_HZ:g} Hz and "
-    f"{STRICT_PU:g} pu).",
-    "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly instances weigh more "
-    "in it than in the mean of the gaps.",
-    "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
-    "taken while several workers shared the machine and stand in the details only.",
-)
+#: Columns that say what made a row.
+MADE_BY = ("version", "commit", "method_version", "made_with", "solver_version")
 
 
-def data_notes(sources: Sources, overview: pd.DataFrame) -> list[str]:
-    """What a reader must know before comparing numbers.
+def rows_caption(sources: Sources) -> str:
+    """Which rows the tables are about, in words."""
+    frame = sources.judged
+    if not len(frame):
+        return "no rows yet"
+    instances = frame["instance"].nunique()
+    if (frame["split"] == "test").all():
+        left = len(sources.rows) - len(frame)
+        return f"{instances} test instances" + (f"; {left} other rows left out" if left else "")
+    return f"all {instances} instances, none of them of the test split"
 
-    Args:
-        overview: the summary of the rows that the tables are about.
-    """
-    case, everything, frame, timing = sources.case, sources.rows, sources.judged, sources.timing
-    notes = []
-    versions = sorted(set(everything["problems_version"]))
-    if len(versions) > 1:
-        notes.append(
-            f"Rows of different problem versions are not comparable: {', '.join(map(named, versions))}."
-        )
-    elif sources.problems_version and versions and versions[0] != sources.problems_version:
-        notes.append(
-            f"Rows are of problem version {named(versions[0])}, but the files are {sources.problems_version}."
-        )
-    if everything["version"].nunique() > 1:
-        notes.append(
-            f"Rows of several versions of ded-bench: {', '.join(sorted(set(everything['version'])))}."
-        )
-    if strange := sorted(set(frame["regime"]) - set(case.regimes)):
-        notes.append(f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}.")
-    unscored = frame[
-        frame["objective"].isna() & (frame["error"] == "") & frame["status"].isin(("Optimal", "Policy"))
-    ]
-    if len(unscored):
-        notes.append(f"{len(unscored)} rows have a schedule but no score yet; they count as failures.")
-    notes += _reference(sources)
-    notes += _missing(sources, overview)
-    if not len(timing):
-        notes.append("Methods were not timed alone on a machine yet; run `ded-bench bench`.")
-    elif (timing["load_average"] > BUSY).any():
-        notes.append("Some methods were timed while the machine was busy (see the column load).")
-    if sources.other_times:
-        notes.append(f"Times of other cases are left out: {sources.other_times} methods.")
-    stale = sorted(set(timing["problems_version"]) - set(versions)) if versions else []
-    if stale:
-        notes.append(f"Times were taken on problem version {', '.join(map(named, stale))}.")
-    return notes
+
+def listed(values: Iterable[object]) -> str:
+    """Distinct values, the most frequent first; with their numbers, if there are several."""
+    counts = Counter(str(value) for value in values)
+    if len(counts) == 1:
+        return next(iter(counts))
+    return ", ".join(f"{value or 'unknown'} × {count}" for value, count in counts.most_common())
 
 
 def alarms(sources: Sources) -> list[str]:
@@ -86,51 +47,101 @@ def alarms(sources: Sources) -> list[str]:
         return ["No row has a score: every method failed, or nothing was scored yet (see the column error)."]
     if judged["gap_percent"].notna().any():
         return []
-    version = ", ".join(map(named, sorted(set(judged["problems_version"]))))
     return [
         f"No gap can be given: gaps are to {reference.title}, which has no scored row in this folder, and "
         "the reference run that ships holds no objective for these instances of problem version "
-        f"{version}. `{solve}` makes rows to compare with."
+        f"{_versions(judged)}. `{solve}` makes rows to compare with."
     ]
+
+
+def data_notes(sources: Sources) -> list[str]:
+    """What is missing, mixed or old."""
+    return [
+        *_problems(sources),
+        *_reference(sources),
+        *_missing(sources),
+        *_makers(sources),
+        *_times(sources),
+    ]
+
+
+def _versions(rows: pd.DataFrame) -> str:
+    return ", ".join(version or "(none given)" for version in sorted(set(rows["problems_version"])))
+
+
+def _problems(sources: Sources) -> Iterator[str]:
+    """Rows of several problem versions, of unknown regimes, or without scores."""
+    rows, judged = sources.rows, sources.judged
+    versions = set(rows["problems_version"])
+    if len(versions) > 1:
+        yield f"Rows of different problem versions are not comparable: {_versions(rows)}."
+    elif sources.problems_version and versions - {sources.problems_version}:
+        yield f"Rows are of problem version {_versions(rows)}, but the files are {sources.problems_version}."
+    if strange := sorted(set(judged["regime"]) - set(sources.case.regimes)):
+        yield f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}."
+    claimed = judged["status"].isin(("Optimal", "Policy")) & (judged["error"] == "")
+    if unscored := int((judged["objective"].isna() & claimed).sum()):
+        yield f"{unscored} rows have a schedule but no score yet; they count as failures."
 
 
 def _reference(sources: Sources) -> Iterator[str]:
     """What gaps rest on, where it is not simply rows of the reference."""
-    reference, judged = sources.reference, sources.judged
+    reference = sources.reference
     if reference.shipped:
         yield (
             f"{reference.shipped} objectives of {reference.title} are those of the reference run that ships "
             "with the case, since it was not run on these instances here."
         )
-    scored = judged[judged["objective"].notna()]
-    known = scored.loc[scored["gap_percent"].notna(), ["instance", "regime"]].drop_duplicates()
-    wanted = scored[["instance", "regime"]].drop_duplicates()
-    if len(known) and len(known) < len(wanted):
-        yield (
-            f"{reference.title}, which gaps are to, has a score on {len(known)} of {len(wanted)} pairs of "
-            "instance and regime: gaps are means over these only (column n)."
-        )
 
 
-def named(version: str) -> str:
-    """A problem version as a reader sees it."""
-    return version or "(none given)"
-
-
-def _missing(sources: Sources, overview: pd.DataFrame) -> Iterator[str]:
-    """Which rows are missing: test instances, and regimes."""
-    frame = sources.judged
+def _missing(sources: Sources) -> Iterator[str]:
+    """Test instances and regimes without rows."""
     tests = list(sources.instances)[: sources.test_count]
-    if tests and (frame["split"] == "test").all():
-        for regime, method, settings, rows in groups(frame):
-            missing = [name for name in tests if name not in set(rows["instance"])]
-            if missing:
-                named_ones = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
-                yield (
-                    f"Only {len(tests) - len(missing)} of {len(tests)} test instances were run: "
-                    f"{title(method, settings)} {regime} (without {named_ones})."
-                )
-    for name, rows in overview.groupby("title", sort=False):
-        absent = [regime for regime in sources.case.regimes if regime not in set(rows["regime"])]
-        if absent:
+    if tests and (sources.judged["split"] == "test").all():
+        for regime, key, rows in groups(sources.judged):
+            if missing := [name for name in tests if name not in set(rows["instance"])]:
+                names = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
+                run = f"Only {len(tests) - len(missing)} of {len(tests)} test instances were run"
+                yield f"{run}: {title(*key)} {regime} (without {names})."
+    for name, lines in sources.summary.groupby("title", sort=False):
+        if absent := [regime for regime in sources.case.regimes if regime not in set(lines["regime"])]:
             yield f"No rows of {name} in regime {', '.join(absent)}."
+
+
+def _makers(sources: Sources) -> Iterator[str]:
+    """Rows of one line that different versions made, and rows that today's methods would not make."""
+    made = sources.judged[sources.judged["objective"].notna()]
+    words = {"version": "versions of ded-bench", "method_version": "versions of the method"}
+    words["solver_version"] = "versions of the solver"
+    for name, what in words.items():
+        mixed = [
+            f"{title(*key)} {regime} ({listed(rows[name])})"
+            for regime, key, rows in groups(made)
+            if rows[name].nunique() > 1
+        ]
+        if mixed:
+            yield f"Rows of one line come from different {what}: {'; '.join(mixed)}."
+    today = {str(name): METHODS[str(name)].version for name in set(made["method"]) & set(METHODS)}
+    old = sorted(
+        {m for m, v in zip(made["method"], made["method_version"], strict=True) if v != today.get(m, v)}
+    )
+    if old:
+        names = ", ".join(title(method) for method in old)
+        yield f"Rows come from other versions of their methods than those installed here: {names}."
+
+
+def _times(sources: Sources) -> Iterator[str]:
+    """Times that are missing, taken on a busy machine, or of other problems or models than the rows."""
+    timing = sources.timing
+    if not len(timing):
+        yield "Methods were not timed alone on a machine yet; run `ded-bench bench`."
+        return
+    if (timing["load_average"] > BUSY).any():
+        yield "Some methods were timed while the machine was busy (see the column load)."
+    if set(timing["problems_version"]) - set(sources.rows["problems_version"]):
+        yield f"Times were taken on problem version {_versions(timing)}."
+    rows = sources.judged.drop_duplicates(GROUP).set_index(GROUP)["made_with"]
+    timed = timing.set_index(GROUP)["made_with"]
+    both = timed.index.intersection(rows.index)
+    if other := [title(*key[1:]) + f" {key[0]}" for key in both if rows[key] != timed[key]]:
+        yield f"Times were taken with another model or policy than the rows: {', '.join(other)}."

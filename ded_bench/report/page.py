@@ -1,10 +1,9 @@
-"""A report as a list of blocks, and its two renderings: Markdown, and one self-contained HTML page."""
+"""A page as a list of blocks, and its two renderings: Markdown, and one self-contained HTML file."""
 
 from __future__ import annotations
 
 import base64
 import html
-import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +11,40 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.report.columns import Column
-from ded_bench.report.render import to_html, to_markdown
-from ded_bench.report.stylesheet import STYLE
+from ded_bench.report.columns import Column, computed
+
+#: Cells with more characters may be broken into lines.
+_LONG, _WORDS = 32, ' class="words"'
+#: The first line of a regime.
+_FIRST = ' class="first"'
+STYLE = """
+body { margin: 0 auto; max-width: 78rem; padding: 0.5rem 1.25rem 4rem; background: #fff; color: #1b1f24;
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, Arial, sans-serif; }
+h1 { font-size: 1.5rem; margin: 0.25rem 0; }
+h2 { font-size: 1.3rem; margin: 2rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid #d0d7de; }
+p, ul, figcaption { max-width: 60rem; }
+nav ul { display: flex; flex-wrap: wrap; gap: 0 1rem; list-style: none; padding: 0; font-size: 0.85rem; }
+a, summary { color: #0b5cad; }
+summary { cursor: pointer; padding: 0.35rem 0; }
+details { margin: 0.6rem 0; border: 1px solid #d0d7de; border-radius: 4px; padding: 0 0.8rem; }
+code { font: 0.9em ui-monospace, Menlo, Consolas, monospace; background: #f2f4f6; overflow-wrap: anywhere; }
+figure { margin: 1rem 0; }
+figcaption { color: #57606a; font-size: 0.9rem; margin: 0.5rem 0; }
+.table figcaption { color: inherit; font-weight: 600; }
+.scroll { overflow-x: auto; }
+.note { background: #fff8e5; border-left: 4px solid #bf8700; padding: 0.25rem 1rem; }
+img { display: block; max-width: min(100%, 56rem); height: auto; }
+table { border-collapse: collapse; font-size: 0.8rem; line-height: 1.3; font-variant-numeric: tabular-nums;
+  border-top: 2px solid; border-bottom: 2px solid; }
+th { text-align: left; vertical-align: bottom; border-bottom: 1px solid; }
+th, td { padding: 0.2rem 0.5rem 0.2rem 0; }
+td { vertical-align: top; white-space: nowrap; }
+.words { white-space: normal; min-width: 14rem; }
+.number { text-align: right; }
+tr.first td { border-top: 1px solid #d0d7de; }
+@media (max-width: 40rem) { body { font-size: 15px; padding: 0.75rem 0.9rem 3rem; } }
+@media print { .scroll { overflow: visible; } figure { break-inside: avoid; } }
+"""
 
 
 @dataclass(frozen=True)
@@ -32,21 +62,15 @@ class Heading:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; `code` and **bold** as in Markdown."""
+    """A paragraph; `code` and **bold** as in Markdown. A `note` is what one must know to read on."""
 
     text: str
+    note: bool = False
 
 
 @dataclass(frozen=True)
 class Items:
     """A bullet list."""
-
-    items: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Warnings:
-    """What the reader must know before believing a number."""
 
     items: tuple[str, ...]
 
@@ -59,14 +83,30 @@ class Table:
     columns: tuple[Column, ...]
     caption: str = ""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", computed(self.frame, self.columns))
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Printed cells, row by row."""
+        values = [[c.cell(value) for value in self.frame[c.name].astype(object)] for c in self.columns]
+        return [list(row) for row in zip(*values, strict=True)]
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Whether each column holds numbers."""
+        kinds = [self.frame[c.name].dtype for c in self.columns]
+        return [
+            pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind) for kind in kinds
+        ]
+
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG, by its path relative to the results folder; beside the next one unless `wide`."""
+    """A PNG, by its path relative to the page."""
 
     path: str
     caption: str
-    wide: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,15 +117,7 @@ class Details:
     blocks: tuple[Block, ...]
 
 
-@dataclass(frozen=True)
-class SideBySide:
-    """Two columns where the screen is wide enough, else one after the other."""
-
-    left: tuple[Block, ...]
-    right: tuple[Block, ...]
-
-
-Block = Heading | Text | Items | Warnings | Table | Picture | Details | SideBySide
+Block = Heading | Text | Items | Table | Picture | Details
 
 
 def folded(summary: str, *blocks: Block) -> list[Block]:
@@ -93,96 +125,113 @@ def folded(summary: str, *blocks: Block) -> list[Block]:
     return [Details(summary, blocks)] if blocks else []
 
 
+def usual_first(table: Table, usual: pd.Series[bool]) -> list[Block]:
+    """A table of its usual lines, or of all if there are none; that of all is folded away."""
+    if not usual.any() or usual.all():
+        return [table]
+    return [Table(table.frame[usual], table.columns, table.caption), *folded("All lines", table)]
+
+
+def to_markdown(table: Table) -> str:
+    """A pipe table; numbers are right-aligned."""
+    marks = ["---:" if numeric else "---" for numeric in table.numeric]
+    lines = [[column.heading for column in table.columns], marks, *table.cells]
+    text = [
+        [cell.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;") for cell in line] for line in lines
+    ]
+    return "".join(f"| {' | '.join(line)} |\n" for line in text)
+
+
 def render_markdown(blocks: Sequence[Block]) -> str:
-    """The report as Markdown; pictures are links to the files, and no text in it is taken for HTML."""
-    return "\n".join(_markdown(block) for block in blocks)
+    """The page as Markdown; pictures are links to the files, and no text in it is taken for HTML."""
+    return "\n".join(map(_markdown, blocks))
 
 
 def _markdown(block: Block) -> str:
     match block:
-        case Details(summary, blocks):
-            inside = render_markdown(blocks)
-            return f"<details><summary>{html.escape(summary)}</summary>\n\n{inside}\n</details>\n"
-        case SideBySide(left, right):
-            return render_markdown((*left, *right))
-    return _plain_markdown(block).replace("<", "&lt;")
-
-
-def _plain_markdown(block: Block) -> str:
-    match block:
+        case Details(summary, inside):
+            head = f"<details><summary>{html.escape(summary)}</summary>"
+            return f"{head}\n\n{render_markdown(inside)}\n</details>\n"
         case Heading(text, level):
-            return f"{'#' * level} {text}\n"
-        case Text(text):
-            return f"{text}\n"
+            made = f"{'#' * level} {text}\n"
+        case Text(text, note):
+            made = f"> **Note:** {text}\n" if note else f"{text}\n"
         case Items(items):
-            return "".join(f"- {item}\n" for item in items)
-        case Warnings(items):
-            return "".join(f"> **Note:** {item}\n>\n" for item in items)
-        case Table(frame, columns, caption):
-            return (f"**{caption}**\n\n" if caption else "") + to_markdown(frame, columns)
+            made = "".join(f"- {item}\n" for item in items)
+        case Table(caption=caption):
+            made = (f"**{caption}**\n\n" if caption else "") + to_markdown(block)
         case Picture(path, caption):
-            return f"![{_plain(caption)}]({path})\n\n*{caption}*\n"
-    raise TypeError(block)
+            made = f"![{_plain(caption)}]({path})\n\n*{caption}*\n"
+    return made.replace("<", "&lt;")
 
 
 def render_html(blocks: Sequence[Block], folder: Path) -> str:
-    """The report as one page that opens from disk: style inline, pictures as data URIs, no script."""
-    title = next((block.text for block in blocks if isinstance(block, Heading)), "Report")
+    """The page as one file that opens from disk: style inline, pictures as data URIs, no script.
+
+    Args:
+        blocks: the first one is the page's title.
+        folder: where paths of pictures start.
+    """
+    headings = [block for block in blocks if isinstance(block, Heading)]
     links = "".join(
-        f'<li><a href="#{block.anchor}">{html.escape(block.text)}</a></li>'
-        for block in blocks
-        if isinstance(block, Heading) and block.level == 2
+        f'<li><a href="#{h.anchor}">{html.escape(h.text)}</a></li>' for h in headings if h.level == 2
     )
-    contents = f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    content = "\n".join((_all(blocks[:1], folder), contents, _all(blocks[1:], folder)))
+    first, *others = [_html(block, folder) for block in blocks]
+    content = "\n".join((first, f'<nav aria-label="Contents"><ul>{links}</ul></nav>', *others))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<title>{html.escape(headings[0].text)}</title>\n<style>{STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{content}\n</main>\n</body>\n</html>\n"
     )
-
-
-def _all(blocks: Sequence[Block], folder: Path) -> str:
-    """Blocks one after another; pictures that follow each other share the width of a screen."""
-    parts = []
-    for small, group in itertools.groupby(blocks, lambda b: isinstance(b, Picture) and not b.wide):
-        inside = "\n".join(_html(block, folder) for block in group)
-        parts.append(f'<div class="pictures">{inside}</div>' if small else inside)
-    return "\n".join(parts)
 
 
 def _html(block: Block, folder: Path) -> str:
     match block:
         case Heading(text, level):
             return f'<h{level} id="{block.anchor}">{html.escape(text)}</h{level}>'
-        case Text(text):
-            return f"<p>{_inline(text)}</p>"
+        case Text(text, note):
+            return (
+                f'<p class="note"><strong>Note:</strong> {_inline(text)}</p>'
+                if note
+                else f"<p>{_inline(text)}</p>"
+            )
         case Items(items):
             return "<ul>" + "".join(f"<li>{_inline(item)}</li>" for item in items) + "</ul>"
-        case Warnings(items):
-            inside = "".join(f"<p><strong>Note:</strong> {_inline(item)}</p>" for item in items)
-            return f'<div class="warnings">{inside}</div>' if items else ""
-        case Table(frame, columns, caption):
+        case Table(caption=caption):
             words = f"<figcaption>{_inline(caption)}</figcaption>" if caption else ""
-            table = to_html(frame, columns)
-            return f'<figure class="table">{words}<div class="scroll">{table}</div></figure>'
+            return f'<figure class="table">{words}<div class="scroll">{to_html(block)}</div></figure>'
         case Picture(path, caption):
             data = base64.b64encode((folder / path).read_bytes()).decode("ascii")
             image = f'<img alt="{html.escape(_plain(caption))}" src="data:image/png;base64,{data}">'
-            words = f"<figcaption>{_inline(caption)}</figcaption>"
-            return f'<figure><div class="scroll">{image}</div>{words}</figure>'
-        case Details(summary, blocks):
-            return f"<details><summary>{_inline(summary)}</summary>\n{_all(blocks, folder)}\n</details>"
-        case SideBySide(left, right):
-            parts = (_all(part, folder) for part in (left, right))
-            return f'<div class="side">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
+            return f"<figure>{image}<figcaption>{_inline(caption)}</figcaption></figure>"
+        case Details(summary, inside):
+            within = "\n".join(_html(one, folder) for one in inside)
+            return f"<details><summary>{_inline(summary)}</summary>\n{within}\n</details>"
+
+
+def to_html(table: Table) -> str:
+    """An HTML table; classes: numbers `number`, sentences `words`, the first line of a regime `first`."""
+    kinds = [' class="number"' if numeric else "" for numeric in table.numeric]
+    head = "".join(
+        f'<th scope="col"{kind}>{html.escape(column.heading)}</th>'
+        for column, kind in zip(table.columns, kinds, strict=True)
+    )
+    body, previous = [], None
+    for row in table.cells:
+        classes = [_WORDS if len(cell) > _LONG else kind for cell, kind in zip(row, kinds, strict=True)]
+        cells = "".join(
+            f"<td{kind}>{html.escape(cell)}</td>" for cell, kind in zip(row, classes, strict=True)
+        )
+        body.append(f"<tr{'' if previous in (None, row[0]) else _FIRST}>{cells}</tr>")
+        previous = row[0]
+    rows = "\n".join(body)
+    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
 
 
 def _inline(text: str) -> str:
-    escaped = html.escape(text)
-    escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
+    escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
     return re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped)
 
 

@@ -4,43 +4,36 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from ded_bench.analysis.certificate import Certificate, read_certificates
+from ded_bench.analysis.lines import judged_rows, named, newest
+from ded_bench.analysis.online_summary import online_rows
 from ded_bench.analysis.paper_numbers import Paper, read_paper
 from ded_bench.analysis.reference import Reference, choose_reference
-from ded_bench.analysis.summary import gaps, judged_rows
+from ded_bench.analysis.summary import gaps, summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import read_text
 from ded_bench.files.table import records
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.benchmark import load_manifest, load_split
+from ded_bench.problem.trajectory import Trajectory
+from ded_bench.report.page import Picture, Table
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
-from ded_bench.results.rows import Results
+from ded_bench.results.online_results import OnlineResults
+from ded_bench.results.rows import Key, Results
 from ded_bench.results.timing import TIMING, WARM_UP, read_timing, timing_summary
-from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import linear_model
-
-
-@dataclass(frozen=True, eq=False)
-class History:
-    """How a training went.
-
-    Attributes:
-        name: of the policy's file.
-        method: that was trained; empty if the policy is not there.
-        table: columns seconds and, if they were taken, training, held out, and terms of the loss.
-    """
-
-    name: str
-    method: str
-    table: pd.DataFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,42 +41,99 @@ class Sources:
     """What a report of one case is made from.
 
     Attributes:
-        reference: what gaps are measured against.
-        rows: all rows of the case in the results table with their gaps; `judged`: those that the tables are
-            about.
-        calls: the timing table; `timing`: one row per (regime, method, settings), see `timing_summary`.
-        other_times: how many more the timing table has, of other cases.
+        case: the grid.
+        results: the folder's table and schedules.
         paper: the paper's numbers, if they are about this very case.
+        reference: what gaps are measured against.
+        rows: all rows of the case that count, with their gaps; `key` is each row's in the results table.
+        judged: those of them that the tables are about.
+        calls: the timing table; `timing`: one row per line, see `timing_summary`.
         instances: those of the benchmark, test instances first, by id.
         test_count: how many of them are test instances.
         problems_version: of the benchmark's files; empty if there are none.
-        rollouts: tables of the Koopman models' errors by the name of their file.
-        notes: what could not be used, in sentences.
+        histories: of trainings by method and name of the policy's file; the method is empty if the policy is
+            not there. Columns seconds and, if they were taken, training, held out, and terms of the loss.
+        rollouts: tables of the surrogates' errors by the name of their file.
+        notes: what could not be used, in sentences; figures add theirs.
     """
 
     case: Case
     results: Results
+    paper: Paper | None
     reference: Reference
     rows: pd.DataFrame
     judged: pd.DataFrame
     calls: pd.DataFrame
     timing: pd.DataFrame
-    other_times: int
-    paper: Paper | None
     instances: dict[str, Instance]
     test_count: int
     problems_version: str
-    models: list[Koopman]
     rollouts: dict[str, pd.DataFrame]
-    histories: list[History]
+    histories: dict[tuple[str, str], pd.DataFrame]
     certificates: tuple[Certificate, ...]
     notes: list[str] = field(default_factory=list)
+    _runs: dict[Key, Trajectory | None] = field(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        """The results folder."""
+        return self.results.folder
+
+    @property
+    def tightest(self) -> str:
+        """The regime with the tightest bound."""
+        return min(self.case.regimes, key=lambda name: self.case.regimes[name].omega_hz)
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """Of the judged rows: see `summary.summary`."""
+        return summary(self.judged)
+
+    @cached_property
+    def online(self) -> pd.DataFrame:
+        """Rows of the closed loop: see `online_rows`."""
+        return online_rows(OnlineResults(self.folder), self.case.id)
+
+    def has_schedule(self, key: Key) -> bool:
+        """Whether a row can be drawn: its instance is known and its schedule is in the folder."""
+        try:
+            return key.instance in self.instances and self.results.has_schedule(self.results.rows[key])
+        except InputError as error:
+            self._note(error)
+            return False
+
+    def trajectory(self, key: Key) -> Trajectory | None:
+        """The simulated schedule of a row; None, and a note, if it is damaged or cannot be simulated."""
+        if key not in self._runs:
+            instance = self.instances[key.instance]
+            try:
+                schedule = self.results.schedule(self.results.rows[key], self.case, instance)
+                self._runs[key] = simulate(self.case, instance, schedule)
+            except (InputError, SimulationError) as error:
+                self._note(error)
+                self._runs[key] = None
+        return self._runs[key]
+
+    def _note(self, error: Exception) -> None:
+        if (text := f"Not drawn: {error}") not in self.notes:
+            self.notes.append(text)
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """What sections put on the page: all tables by name, all pictures by topic (see `figures.FIGURES`)."""
+
+    sources: Sources
+    tables: Mapping[str, Table]
+    pictures: Mapping[str, list[Picture]]
 
 
 def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     """Read a results folder and the benchmark that it is about.
 
     Args:
+        case: whose rows count.
+        folder: the results folder.
         problems: folder of the case's instances, split, manifest and the paper's numbers.
 
     Raises:
@@ -92,39 +142,34 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     paths = ResultsFolder(folder)
     if not any(path.exists() for path in paths.contents):
         raise InputError(folder, "", "holds no results" if folder.is_dir() else "is no folder")
-    results = Results(folder)
-    rows = results.frame()
-    others = sorted(set(rows["case"]) - {case.id, ""})
-    if others and len(rows[rows["case"].isin([case.id, ""])]) == 0:
-        raise InputError(
-            paths.results, "case", f"holds rows of {', '.join(others)}, not of {case.id}; give --case"
-        )
-    rows = rows[rows["case"].isin([case.id, ""])].reset_index(drop=True)
+    results, notes = Results(folder), list[str]()
+    everything = named(results.frame().assign(key=pd.Series(list(results.rows), dtype=object)))
+    ours = everything[everything["case"].isin([case.id, ""])]
+    if len(everything) and not len(ours):
+        others = ", ".join(sorted(set(everything["case"])))
+        raise InputError(paths.results, "case", f"holds rows of {others}, not of {case.id}; give --case")
+    rows, left_out = newest(ours)
+    notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
     rows = gaps(rows, reference.objectives)
-    calls = read_timing(paths.timing)
-    timings = timing_summary(calls)
-    timing = timings[timings["case"] == case.id]
-    notes: list[str] = []
+    calls = [call for call in read_timing(paths.timing) if call.case == case.id]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
-        case,
-        results,
-        reference,
-        rows,
-        judged_rows(rows),
-        TIMING.frame([call for call in calls if call.case == case.id and call.round != WARM_UP]),
-        timing,
-        len(timings) - len(timing),
-        _paper(case, problems, notes),
-        instances,
-        test_count,
-        version,
-        _models(case, paths, notes),
-        {path.name.removesuffix(".errors.csv"): _read_numbers(path) for path in paths.all_model_errors},
-        [_history(path) for path in paths.training_histories],
-        read_certificates(folder),
-        notes,
+        case=case,
+        results=results,
+        paper=_paper(case, problems, notes),
+        reference=reference,
+        rows=rows,
+        judged=judged_rows(rows),
+        calls=named(TIMING.frame([call for call in calls if call.round != WARM_UP])),
+        timing=named(timing_summary(calls)),
+        instances=instances,
+        test_count=test_count,
+        problems_version=version,
+        rollouts={p.name.removesuffix(".errors.csv"): _read_numbers(p) for p in paths.all_model_errors},
+        histories=dict(_history(path) for path in paths.training_histories),
+        certificates=read_certificates(folder),
+        notes=notes,
     )
 
 
@@ -135,8 +180,7 @@ def _benchmark(case: Case, problems: Path, notes: list[str]) -> tuple[dict[str, 
         split = load_split(problems)
         manifest = load_manifest(problems)
         for name in (*split.test, *split.train):
-            path = problems / "instances" / f"{name}.json"
-            instances[name] = Instance.load_file(path, case)[0]
+            instances[name] = Instance.load_file(problems / "instances" / f"{name}.json", case)[0]
     except InputError as error:
         notes.append(f"The problem files cannot be read: {error}")
         return instances, 0, ""
@@ -153,33 +197,15 @@ def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
     return paper
 
 
-def _models(case: Case, paths: ResultsFolder, notes: list[str]) -> list[Koopman]:
-    """The linearisation, and every model that the folder holds for this case."""
-    models = [linear_model(case)]
-    for path in paths.models:
-        try:
-            models.append(Koopman.load(path, case))
-        except InputError as error:
-            notes.append(f"Left out: {error}")
-    if len(models) == 1:
-        notes.append(
-            "The folder holds no Koopman model, so the linearisation stands in its figures; "
-            "`ded-bench train-ko` identifies one."
-        )
-    return models
-
-
-def _history(path: Path) -> History:
+def _history(path: Path) -> tuple[tuple[str, str], pd.DataFrame]:
     table = _read_numbers(path)
     if "seconds" not in table or not len(table):
         raise InputError(path, "seconds", "a column with at least one number is needed")
     name = path.name.removesuffix(".history.csv")
-    policy = path.with_name(f"{name}.safetensors")
     method = ""
-    if policy.is_file():
-        with contextlib.suppress(InputError):  # the table of trainings says what is wrong
-            method = str(read_arrays(policy)[1].get("method", ""))
-    return History(name, method, table.select_dtypes("number"))
+    with contextlib.suppress(InputError):  # the table of trainings says what is wrong with the policy
+        method = str(read_arrays(path.with_name(f"{name}.safetensors"))[1].get("method", ""))
+    return (method, name), table.select_dtypes("number")
 
 
 def _read_numbers(path: Path) -> pd.DataFrame:
@@ -192,3 +218,24 @@ def _read_numbers(path: Path) -> pd.DataFrame:
     if not header:
         raise InputError(path, "", "is empty")
     return pd.read_csv(io.StringIO(text))
+
+
+def training_table(folder: Path) -> pd.DataFrame:
+    """How each policy of a folder was trained, from their files' headers; `problem` if one is damaged."""
+    facts = [{"policy": path.stem} | training_facts(path) for path in ResultsFolder(folder).policies]
+    return pd.DataFrame(facts, columns=["policy", *TRAINING_FACTS, "problem"])
+
+
+def training_facts(path: Path) -> dict[str, Any]:
+    """What the header of a model or policy says of its training, and what is wrong with the file."""
+    try:
+        facts = read_arrays(path)[1].get("training")
+    except InputError as error:
+        return {"problem": str(error)}
+    return {"problem": ""} | (facts if isinstance(facts, dict) else {})
+
+
+TRAINING_FACTS = (
+    *("seconds", "epochs", "instances", "held_out", "held_out_loss", "training_loss"),
+    *("parameters", "model", "seed", "device"),
+)

@@ -9,14 +9,14 @@ from ded_bench.analysis.reference import choose_reference
 from ded_bench.analysis.summary import gaps
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.results.objectives import Objective
-from tests.evaluate.test_summary import frame_of, row
+from tests.analysis.test_summary import frame_of, row
 
 
 def test_the_papers_reference_where_a_case_carries_its_numbers() -> None:
     paper = read_paper(SHIPPED_CASES / "9bus")
     rows = frame_of(row("a", "ded", 100.0), row("a", "ded-radau", 99.0), row("a", "ed", 110.0))
     found = choose_reference(rows, paper)
-    assert (found.method, found.run, found.shipped) == ("ded", ("ded", "default"), 0)
+    assert (found.method, found.title, found.shipped) == ("ded", "DED", 0)
     assert gaps(rows, found.objectives)["gap_percent"].to_list() == pytest.approx([0.0, -1.0, 10.0])
     assert choose_reference(rows[:0], paper).method == "ded"
 

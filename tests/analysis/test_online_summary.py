@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
-from ded_bench.results.online_results import OnlineResults, OnlineRow
 from ded_bench.analysis.online_summary import crossed, online_rows, own_latency, sweeps
+from ded_bench.results.online_results import OnlineResults, OnlineRow
 
 
 def row(scenario: str, latency_s: float, objective: float | None, **changes) -> OnlineRow:
@@ -45,7 +45,7 @@ def results(tmp_path) -> OnlineResults:
     rows += [row(s, 0.5, 102.0, latency_source="timing", late=1, infeasible=4) for s in "ab"]
     rows += [row("c", 0.5, None, latency_source="timing", plans=0, failed=0, error="loses synchronism")]
     rows += [row("a", 0.5, 103.0, method="ed", latency_source="timing", case="elsewhere")]
-    static = {"method": "ed", "settings": "1s", "latency_source": "timing"}
+    static = {"method": "ed", "settings": "every=1", "latency_source": "timing"}
     rows += [row(s, 0.002, 102.0 + i, **static) for i, s in enumerate("ab")]
     kept = OnlineResults(tmp_path)
     kept.table.add(rows)

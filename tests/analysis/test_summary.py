@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from ded_bench.analysis.lines import GROUP, judged_rows, named
 from ded_bench.analysis.summary import (
     TIME_SHIFT_S,
-    benchmark_rows,
+    by_model,
     claims,
     coverage,
     gaps,
-    groups,
-    judged_rows,
     performance_profile,
-    scoring_rows,
     shifted_geometric_mean,
     summary,
     table_times,
     timed_rows,
-    title,
     tradeoff,
-    validation_rows,
     worst,
 )
-from ded_bench.methods.registry import METHODS
-from ded_bench.results.rows import Results, Row
+from ded_bench.results.rows import ROWS, Row
 
 DED = ("ded", "default")
-NO_TIMES = pd.DataFrame([], columns=["regime", "method", "settings", "solve_s", "failures"])
+NO_TIMES = pd.DataFrame([], columns=[*GROUP, "solve_s", "failures"])
 
 
 def row(instance: str, method: str, objective: float | None = None, **fields: object) -> Row:
@@ -56,10 +50,8 @@ def row(instance: str, method: str, objective: float | None = None, **fields: ob
 
 
 def frame_of(*rows: Row) -> pd.DataFrame:
-    """A results frame, as `Results.frame` gives it."""
-    results = Results(Path("nowhere"))
-    results.rows = {r.key: r for r in rows}
-    return results.frame()
+    """A results frame, as a report reads it."""
+    return named(ROWS.frame(rows))
 
 
 def with_gaps(frame: pd.DataFrame, reference: tuple[str, str] = DED) -> pd.DataFrame:
@@ -163,60 +155,23 @@ def test_a_time_limit_is_no_success(status: str, rate: int) -> None:
     ]
 
 
-def test_groups_follow_the_registry_with_strangers_last() -> None:
-    names = ["zebra", "aardvark", *reversed(METHODS)]
-    rows = [row("a", name, 1.0) for name in names] + [row("a", "ded", 1.0, settings="accelerated")]
-    order = [(method, settings) for _, method, settings, _ in groups(frame_of(*rows))]
-    registered = [(name, "default") for name in METHODS]
-    assert order == [
-        registered[0],
-        ("ded", "accelerated"),
-        *registered[1:],
-        ("aardvark", "default"),
-        ("zebra", "default"),
-    ]
-
-
-def test_titles_name_settings_other_than_the_default() -> None:
-    assert title("ded") == METHODS["ded"].title
-    assert title("ded", "accelerated") == f"{METHODS['ded'].title} [accelerated]"
-    assert title("mine") == "mine"
-
-
-def test_only_test_rows_count_if_there_are_any() -> None:
-    mixed = frame_of(
-        row("a", "ded", 1.0), row("b", "ded", 2.0, split="train"), row("c", "ed", 3.0, split="none")
-    )
-    assert judged_rows(mixed)["instance"].to_list() == ["a"]
-    others = mixed[mixed["split"] != "test"]
-    assert len(judged_rows(others)) == 2
-
-
-def test_validation_rows_are_never_judged() -> None:
-    rows = [row("v", "ded", 1.0, split="validation"), row("b", "ded", 2.0, split="train")]
-    assert judged_rows(frame_of(*rows))["instance"].to_list() == ["b"]
-    assert judged_rows(frame_of(rows[0])).empty
-    assert validation_rows(frame_of(*rows))["instance"].to_list() == ["v"]
-    assert scoring_rows(frame_of(*rows))["instance"].to_list() == ["b"]
-
-
 def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
     everything = frame_of(
         row("a", "ded", 1.0),
         row("b", "ded", 2.0, split="train", freq_violation_hz=3e-4, feasible=False),
         row("c", "ded", split="train"),
         row("a", "ed", 3.0),
-        row("b", "ded", 2.0, split="train", settings="start-ed"),
     )
+    everything = with_gaps(everything)
     judged = judged_rows(everything)
-    covered = coverage(summary(with_gaps(everything)), summary(with_gaps(judged)))
+    covered = coverage(everything, judged)
     assert covered[["method", "settings", "rows", "failures"]].to_numpy().tolist() == [
         ["ded", "default", 3, 1]
     ]
     assert covered["correct_rate"].item() == pytest.approx(1 / 3)
     assert covered["freq_violation_hz_max"].item() == 3e-4
-    assert not len(coverage(summary(with_gaps(judged)), summary(with_gaps(judged))))
-    assert not len(coverage(summary(with_gaps(everything[:0])), summary(with_gaps(everything[:0]))))
+    assert not len(coverage(judged, judged))
+    assert not len(coverage(everything[:0], judged[:0]))
 
 
 def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:
@@ -258,9 +213,8 @@ def test_performance_profile_by_hand() -> None:
 def test_rows_take_the_median_of_their_times_alone() -> None:
     frame = frame_of(row("a", "ded", 1.0, solve_s=99.0), row("b", "ded", 1.0), row("a", "ed", 2.0))
     cells = [("a", "ded", 1.0), ("a", "ded", 3.0), ("a", "ded", 2.0), ("b", "ded", np.nan), ("x", "ed", 1.0)]
-    calls = pd.DataFrame(cells, columns=["instance", "method", "solve_s"]).assign(
-        regime="TO", settings="default"
-    )
+    calls = pd.DataFrame(cells, columns=["instance", "method", "solve_s"])
+    calls = calls.assign(regime="TO", settings="default", model="")
     timed = timed_rows(frame, calls)
     assert timed[["instance", "method", "solve_s"]].to_numpy().tolist() == [["a", "ded", 2.0]]
     assert timed_rows(frame, calls[:0]).empty
@@ -292,7 +246,7 @@ def test_table_times_are_quartiles_and_say_how_many_workers() -> None:
 
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
     points = tradeoff(
-        with_gaps(table), pd.DataFrame([["TO", "ded-ko", "default", 0.25, 0]], columns=NO_TIMES.columns)
+        with_gaps(table), pd.DataFrame([["TO", "ded-ko", "default", "", 0.25, 0]], columns=NO_TIMES.columns)
     ).set_index("method")
     assert points.loc["ded-ko", "seconds"] == 0.25
     assert points.loc["ded-ko", "alone"]
@@ -308,9 +262,11 @@ def test_an_empty_table_has_its_columns() -> None:
     assert len(performance_profile(empty, "solve_s")) == 0
 
 
-def test_plans_for_the_ac_network_stand_in_its_table_only() -> None:
-    """They solve another problem: here their violations are no failure of theirs."""
-    settings = ["default", "default-trajectory", "ac", "swing-ac", "default-trajectory-ac"]
-    frame = pd.DataFrame({"settings": settings, "split": "test"})
-    assert judged_rows(frame)["settings"].tolist() == settings[:2]
-    assert benchmark_rows(frame)["settings"].tolist() == settings
+def test_surrogates_are_compared_where_there_are_several() -> None:
+    frame = frame_of(
+        *(row("a", "ded-ko", 1.0, model=f"{name}@1") for name in ("koopman", "linear")),
+        row("a", "ded-ko-knots", 1.0, model="koopman@1"),
+        row("a", "ded", 1.0),
+    )
+    found = by_model(summary(with_gaps(frame)))
+    assert found[["method", "model"]].to_numpy().tolist() == [["ded-ko", "koopman"], ["ded-ko", "linear"]]

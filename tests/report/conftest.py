@@ -14,7 +14,7 @@ from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.benchmark import load_split, write_benchmark
-from ded_bench.report import gallery
+from ded_bench.report import figures
 
 HORIZON = 1.0
 TEST, TRAIN = 5, 3
@@ -42,10 +42,9 @@ def problems(ninebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files of figures hold a digest of what is drawn instead of the drawing, which takes long."""
 
-    def sketch(figure: Figure, stem: Path, formats: tuple[str, ...], dpi: int) -> None:
+    def sketch(figure: Figure, path: Path) -> None:
         lines = [line for ax in figure.axes for line in ax.get_lines()]
         drawn = b"".join(np.asarray(line.get_ydata(), dtype=float).tobytes() for line in lines)
-        for form in formats:
-            write_atomically(stem.parent / f"{stem.name}.{form}", hashlib.sha256(drawn).hexdigest())
+        write_atomically(path, hashlib.sha256(drawn).hexdigest())
 
-    monkeypatch.setattr(gallery, "save_figure", sketch)
+    monkeypatch.setattr(figures, "save_figure", sketch)

@@ -1,178 +1,149 @@
-"""Figures of single instances show the data, the bounds and units, and hide nothing behind a legend."""
+"""Figures show the data and the bounds, and are drawn without a warning whatever methods are called."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import pandas as pd
 import pytest
 
-from ded_bench.surrogates.linear import linear_model
+from ded_bench.analysis.lines import GROUP, title
+from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import sample_instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.report.figures import summaries
-from ded_bench.report.figures.frequencies import frequency_figure, koopman_figure
-from ded_bench.report.figures.schedules import Worst, schedule_figure, worst_figure
-from ded_bench.report.figures.style import (
-    RAD_TO_HZ,
+from ded_bench.report.figures.history import history_figure
+from ded_bench.report.figures.panels import (
+    FEW,
     Shown,
     busiest,
-    envelope,
-    save_figure,
-    thin,
+    frequency_panels,
+    load_panel,
+    power_panels,
+    slack_panel,
+    time_figure,
 )
-from ded_bench.report.gallery import rollout
-from ded_bench.plants.simulate import Trajectory, simulate
-from tests.report.drawing import check_layout, has_level, shows
+from ded_bench.report.figures.profile import profile_figure
+from ded_bench.report.figures.schedules import challengers
+from ded_bench.report.figures.style import colour, marker, new_figure, save_figure
+from ded_bench.report.figures.tradeoff import tradeoff_figure
 
-HORIZON = 2.0
-
-
-@pytest.fixture(scope="module")
-def instance(case: Case) -> Instance:
-    return sample_instance(case, 5, 0).model_copy(update={"horizon_s": HORIZON})
-
-
-@pytest.fixture(scope="module")
-def shown(case: Case, instance: Instance) -> list[Shown]:
-    """Two methods on one instance: one holds P_0, one ramps down."""
-    start = instance.p_initial(case)
-    ends = np.array([0.0, HORIZON])
-    schedules = [Schedule(ends, np.stack([start, start - drop])) for drop in (0.0, 0.05)]
-    runs = [simulate(case, instance, schedule) for schedule in schedules]
-    return [Shown("ded", "default", runs[0]), Shown("ded-dpc-paper", "default", runs[1])]
+PAPERS = pd.DataFrame(
+    [("TO", "ded-ko", "DED-KO", 0.3, 18.8)], columns=["regime", "method", "name", "gap_percent", "seconds"]
+)
+POINT = [*GROUP, "title", "n", "correct_rate", "gap_percent", "seconds", "alone"]
 
 
-def test_schedules_with_bounds_loads_and_slack(case, instance, shown, tmp_path) -> None:
-    figure = schedule_figure(case, "heading", shown)
-    axes = [ax for ax in figure.axes if ax.get_visible()]
-    t = instance.grid
-    for j in range(len(case.generators)):
-        for s in shown:
-            assert shows(axes[j], thin(t, s.trajectory.p_gen[:, j])[1])
-        assert has_level(axes[j], case.p_min[j])
-        assert has_level(axes[j], case.p_max[j])
-    loads, slack = axes[len(case.generators) :]
-    assert all(shows(loads, thin(t, instance.p_load(case)[:, j])[1]) for j in range(len(case.loads)))
-    assert all(shows(slack, thin(t, s.trajectory.p_slack)[1]) for s in shown)
-    assert all("(pu)" in ax.get_ylabel() for ax in axes)
-    assert axes[-1].get_xlabel() == "time (s)"
-    check_layout(figure, tmp_path)
+def shows(ax: Any, values: np.ndarray) -> bool:
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()]
+    return any(len(line) == len(values) and np.allclose(line, values) for line in lines)
 
 
-@pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_frequencies_are_in_hertz_with_the_regimes_bounds(case, instance, shown, regime, tmp_path) -> None:
-    figure = frequency_figure(case, regime, "heading", shown)
-    limit = case.regimes[regime].omega_hz
-    for j, ax in enumerate(figure.axes):
-        assert has_level(ax, limit)
-        assert has_level(ax, -limit)
-        assert all(shows(ax, thin(instance.grid, s.trajectory.omega[:, j] * RAD_TO_HZ)[1]) for s in shown)
-        assert "(Hz)" in ax.get_ylabel()
-    check_layout(figure, tmp_path)
-
-
-def test_koopman_beside_swing_and_their_difference(case, instance, shown, tmp_path) -> None:
-    run = shown[1].trajectory
-    outputs = rollout(case, linear_model(case), [instance], [run])[:, 0]
-    figure = koopman_figure(case, "TO", "heading", run, outputs, "linear")
-    n_gen = len(case.generators)
-    for j, (left, right) in enumerate(np.reshape(figure.axes, (-1, 2))):
-        scale = RAD_TO_HZ if j < n_gen else 1.0
-        true = (run.omega[:, j] if j < n_gen else run.p_slack) * scale
-        assert shows(left, thin(run.t, true)[1])
-        assert shows(left, thin(run.t, outputs[:, j] * scale)[1])
-        assert shows(right, thin(run.t, outputs[:, j] * scale - true)[1])
-        assert ("(Hz)" if j < n_gen else "(pu)") in right.get_ylabel()
-    check_layout(figure, tmp_path)
-
-
-def test_rollout_starts_at_the_true_frequencies_and_stays_near(case, instance, shown) -> None:
-    runs = [s.trajectory for s in shown]
-    outputs = rollout(case, linear_model(case), [instance, instance], runs)
-    for b, run in enumerate(runs):
-        assert np.allclose(outputs[0, b, :-1], run.omega[0])
-        assert np.abs(outputs[:, b, :-1] - run.omega).max() < 0.1 * np.abs(run.omega).max()
-
-
-def test_worst_instances_side_by_side(case, instance, shown, tmp_path) -> None:
-    columns = [Worst("first", shown[1], shown[0]), Worst("second", shown[0], None)]
-    figure = worst_figure(case, "TO", "heading", columns)
-    first = figure.axes[0]
-    assert shows(first, thin(instance.grid, shown[0].trajectory.p_gen[:, 0])[1])  # DED's for comparison
-    lower = figure.axes[2]
-    assert shows(lower, thin(instance.grid, shown[0].trajectory.omega[:, 0] * RAD_TO_HZ)[1])
-    assert [ax.get_title() for ax in figure.axes[:2]] == ["first", "second"]
-    assert all(has_level(ax, case.regimes["TO"].omega_hz) for ax in figure.axes[2:])
-    check_layout(figure, tmp_path)
-
-
-def test_files_are_the_same_every_time(case, instance, shown, tmp_path) -> None:
-    for name in ("one", "two"):
-        save_figure(frequency_figure(case, "TO", "heading", shown), tmp_path / name)
-    for form in ("png", "pdf"):
-        assert (tmp_path / f"one.{form}").read_bytes() == (tmp_path / f"two.{form}").read_bytes()
-    assert (tmp_path / "one.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert (tmp_path / "one.pdf").read_bytes()[:5] == b"%PDF-"
-
-
-@pytest.mark.parametrize("name", ["$\\frac{$", "a $b$ c", "_hidden", "100 %"])
-def test_names_of_methods_are_drawn_as_they_are(shown, case, tmp_path, name) -> None:
-    """A stranger's method may be called anything; nothing of it is taken for mathematics."""
-    other = Shown(name, "default", shown[1].trajectory)
-    figure = frequency_figure(case, "TO", "heading", [shown[0], other])
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels[1].replace("\\$", "$").strip() == name
-    check_layout(figure, tmp_path)
+@pytest.mark.parametrize("name", ["9bus", "39bus", "140bus"])
+def test_trajectories_in_panels(name: str, tmp_path: Path) -> None:
+    """All generators of a small grid, those that move most of a large one, never higher than a page."""
+    case = Case.load(SHIPPED_CASES / name)
+    n_gen, n_load = len(case.generators), len(case.loads)
+    t = np.linspace(0, 2, 21)
+    waves = np.sin(np.outer(t, np.arange(1, n_gen + 1)) / 9)
+    loads = np.outer(1 + t, np.linspace(-1, -2, n_load))
+    shown = [
+        Shown(method, title(method), place, t, scale * waves, 1e-3 * scale * waves, loads, waves[:, 0])
+        for place, (method, scale) in enumerate((("ded-radau", 1.0), ("$\\frac{$", 0.5)))
+    ]
+    panels = [*power_panels(case, shown), load_panel(case, shown[0]), slack_panel(case, shown)]
+    figure = time_figure("heading", panels, 2)
+    chosen = busiest([waves], FEW)
+    assert len(chosen) == min(n_gen, FEW)
+    for ax, j in zip(figure.axes, chosen, strict=False):
+        assert shows(ax, waves[:, j])
+        assert shows(ax, 0.5 * waves[:, j])
+        assert shows(ax, np.full(2, case.p_min[j]))
+        assert case.generators[j] in ax.get_ylabel()
+    frequencies = time_figure("heading", frequency_panels(case, "TO", shown, 4), 1)
+    limit = 1e3 * case.regimes["TO"].omega_hz
+    for ax, j in zip(frequencies.axes, busiest([waves], 4), strict=True):
+        assert shows(ax, waves[:, j] / (2 * np.pi))  # mHz
+        assert shows(ax, np.full(2, limit))
+        assert shows(ax, np.full(2, -limit))
+    for drawn in (figure, frequencies):
+        assert drawn.get_size_inches()[1] <= 10
+        save_figure(drawn, tmp_path / "figure.png")
 
 
 def test_the_curves_that_move_most_are_shown_in_their_order() -> None:
-    t = np.linspace(0, 1, 11)
-    curves = np.outer(t, [0.0, 3.0, 1.0, 2.0])
-    assert busiest(curves, count=2) == [1, 3]
-    assert busiest(curves, curves * [9.0, 1.0, 1.0, 1.0] + np.outer(t, [9.0, 0, 0, 0]), count=2) == [0, 1]
-    assert busiest(curves) == [0, 1, 2, 3]
-    times, least, largest = envelope(t, curves)
-    assert (times, least, largest) == (pytest.approx(t), pytest.approx(0 * t), pytest.approx(3 * t))
+    curves = np.outer(np.linspace(0, 1, 11), [0.0, 3.0, 1.0, 2.0])
+    assert busiest([curves], 2) == [1, 3]
+    assert busiest([curves, curves[:, ::-1] * 2], 2) == [0, 2]
 
 
-@pytest.mark.parametrize("n_gen", [9, 47])
-def test_many_generators_fit_a_page(n_gen: int, tmp_path) -> None:
-    """Six powers, four frequencies under the span of all, and no figure higher than a page."""
-    name = {9: "39bus", 47: "140bus"}[n_gen]
-    case = Case.load(SHIPPED_CASES / name)
-    t = np.linspace(0, 2, 21)
-    waves = np.sin(np.outer(t, np.arange(1, n_gen + 1)) / 9)
-    loads = np.outer(1 + t, np.linspace(-1, -2, len(case.loads)))
-    run = Trajectory(t, waves, 1e-3 * waves, waves, loads, waves[:, 0], case)
-    shown = [Shown("ded-radau", "default", run), Shown("ded-slp", "default", run)]
-    outputs = np.column_stack([run.omega * 1.1, run.p_slack])
-    figures = {
-        "schedules": schedule_figure(case, "heading", shown),
-        "frequencies": frequency_figure(case, "TO", "heading", shown),
-        "koopman": koopman_figure(case, "TO", "heading", run, outputs, "linear"),
-        "worst": worst_figure(case, "TO", "heading", [Worst("first", shown[1], shown[0])]),
-        "forecasts": summaries.forecasts_figure(case, [sample_instance(case, 5, i) for i in range(2)]),
-    }
-    for figure in figures.values():
-        assert figure.get_size_inches()[1] <= 10
-        check_layout(figure, tmp_path)
-    chosen = busiest(waves)
-    axes = figures["schedules"].axes
-    for ax, j in zip(axes, chosen, strict=False):
-        assert shows(ax, waves[:, j])
-        assert case.generators[j] in ax.get_ylabel()
-    assert len(axes[len(chosen)].get_lines()) == len(case.loads)  # all of them, most in grey
-    first = figures["frequencies"].axes[0]
-    assert len(first.collections) == 2
-    assert len(figures["frequencies"].axes) == 1 + 4
+def test_trained_methods_are_shown_first_then_those_nearest_to_the_reference() -> None:
+    gaps = {"ded": 0.0, "ded-ko": 0.1, "mine": 0.2, "ded-dpc-paper": 2.0, "ded-dpc": 1.0}
+    assert challengers(pd.Series(gaps), "ded") == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]
 
 
-def test_thin_keeps_the_ends_of_short_curves() -> None:
-    t = np.arange(6001.0)
-    kept, values = thin(t, 2 * t)
-    assert len(kept) <= 1501
-    assert (values == 2 * kept).all()
-    assert kept[0] == 0
-    assert kept[-1] == 6000
-    assert len(thin(t[:100], t[:100])[0]) == 100
+def test_methods_differ_in_colour_and_marker() -> None:
+    assert len({colour(name) for name in METHODS}) == len({marker(name) for name in METHODS}) == len(METHODS)
+    assert colour("stranger") == colour("other")
+
+
+def test_tradeoff_draws_a_point_per_line_hollow_if_infeasible(tmp_path: Path) -> None:
+    points = pd.DataFrame(
+        [
+            ("NO", "ded", "default", "", "DED", 100, 1.0, 0.0, 5.0, True),
+            ("NO", "ed", "every=1", "", "ED [every=1]", 100, 0.5, -0.02, 1e-3, False),
+            ("TO", "mine$", "default", "", "mine$", 100, 1.0, 3.0, 1e-4, True),
+        ],
+        columns=POINT,
+    )
+    figure = tradeoff_figure(points, "DED", PAPERS)
+    first, second = figure.axes
+    places = [line.get_xydata().tolist() for line in first.get_lines()]
+    assert [[5.0, 0.0]] in places
+    hollow = [
+        line for line in first.get_lines() if line.get_markerfacecolor() == "white" and len(line.get_xdata())
+    ]
+    assert [line.get_xydata().tolist() for line in hollow] == [[[1e-3, -0.02]]]
+    assert [[18.8, 0.3]] in [line.get_xydata().tolist() for line in second.get_lines()]
+    assert "every=1 *" in [text.get_text() for text in first.texts]
+    save_figure(figure, tmp_path / "figure.png")
+
+
+def test_profiles_end_at_the_share_of_instances_solved(tmp_path: Path) -> None:
+    columns = [*GROUP, "title", "ratio", "fraction"]
+    rows = [("TO", "ded", "default", "", "DED", 1.0, 0.5), ("TO", "ded", "default", "", "DED", 4.0, 1.0)]
+    rows += [("TO", "ed", "default", "", "ED", 1.0, 0.25)]
+    profile = pd.DataFrame(rows, columns=columns)
+    figure = profile_figure(profile, profile)
+    times, objectives = figure.axes
+    for ax, xs in ((times, [1.0, 1.0, 4.0, 8.0]), (objectives, [1e-4, 1e-4, 300.0, 600.0])):
+        line = ax.get_lines()[0]
+        assert line.get_xdata() == pytest.approx(xs)
+        assert list(line.get_ydata()) == [0.0, 0.5, 1.0, 1.0]
+        assert ax.get_lines()[1].get_ydata()[-1] == 0.25
+    save_figure(profile_figure(profile, profile[:0]), tmp_path / "figure.png")
+
+
+def test_training_history(tmp_path: Path) -> None:
+    """In minutes; columns that were taken now and then, or not at all."""
+    history = pd.DataFrame(
+        {"epoch": [1, 2], "seconds": [60.0, 120.0], "training": [9.0, 8.0], "held out": [7.0, 6.0]}
+        | {"ramp up": [0.0, 1e-3]}
+    )
+    few = pd.DataFrame({"seconds": [1.0, 2.0, 3.0], "training": [9.0, np.nan, 7.0], "held out": [np.nan] * 3})
+    figure = history_figure({"one": history, "few": few})
+    left, right, below, _ = figure.axes
+    assert left.get_lines()[0].get_xdata().tolist() == [1.0, 2.0]
+    assert shows(left, np.array([7.0, 6.0]))
+    assert right.get_lines()[0].get_ydata()[1] == 1e-3
+    assert shows(below, np.array([9.0, 7.0]))
+    save_figure(figure, tmp_path / "figure.png")
+
+
+def test_files_are_the_same_every_time(tmp_path: Path) -> None:
+    for name in ("one.png", "two.png"):
+        with new_figure(2.0) as figure:
+            figure.subplots().plot([1.0, 2.0])
+        save_figure(figure, tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert (tmp_path / "one.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

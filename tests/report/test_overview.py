@@ -15,14 +15,11 @@ from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.problem.case import REPOSITORY
-from ded_bench.report.figures.growth import gap_figure, growth_figure
-from ded_bench.report.grids import across, payoffs, read_grid, slopes
+from ded_bench.report.figures.growth import GAP, growth_figure
+from ded_bench.report.grids import across, break_evens, read_grid, slopes
 from ded_bench.report.overview import write_overview
-from ded_bench.run.ac_scoring import AcResults, AcRow
 from ded_bench.results.rows import Results, Row
 from tests.reading import Page
-from tests.report.drawing import check_layout
 
 #: Generators of the shipped cases that the tests have rows of.
 GENERATORS = {"9bus": 2, "two-area": 3, "39bus": 9}
@@ -51,10 +48,6 @@ def results_of(folder: Path, case: str) -> Path:
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("results")
     made = [results_of(folder / case, case) for case in GENERATORS]
-    scored = AcRow("a", "TO", "ded-slp", "default", objective=101.0, case="two-area")
-    scored = dataclasses.replace(scored, freq_violation_hz=2e-3, feasible=False)
-    nothing = AcRow("b", "TO", "ded-slp", "default", error="no equilibrium", case="two-area")
-    AcResults(folder / "two-area").add([scored, nothing])
     header = {"training": {"seconds": 12.5, "trajectories": 120}}
     write_arrays(ResultsFolder(folder / "39bus").model("koopman"), {"k": np.zeros(1)}, header)
     return made
@@ -75,7 +68,6 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert gaps.loc[("TO", "DED (Radau)")].to_list() == ["–", "reference", "reference"]
     assert table("verified").loc[("TO", "DED (SLP)"), "39bus"] == "100% → 50%"
     assert table("violations").loc[("TO", "DED (SLP)"), "39bus"] == "0.001"
-    assert dict(table("ac").loc[("TO", "DED (SLP)")]) == {"two-area": "100% → 100% → 0% (1), 2 mHz"}
     fitted = table("slopes").loc[("TO", "DED (SLP)")]
     assert fitted["solve_s"] == pytest.approx(2.0)
     assert fitted["peak_memory_mib"] == pytest.approx(0.0, abs=1e-9)
@@ -83,18 +75,7 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert [(row["case"], row["name"], row["seconds"]) for row in trained] == [("39bus", "koopman", 12.5)]
     page = Page((out / "overview.html").read_text())
     assert not page.open
-    assert len(list(page.every("img"))) == 2
-    assert "In TO, time grows with the number of generators to the power of: DED (SLP) 2.0." in page.text
-
-
-def test_the_committed_page_follows_from_the_reference_runs(tmp_path: Path) -> None:
-    runs = REPOSITORY / "results"
-    write_overview([path.parent for path in runs.glob("*-reference/results.csv")], tmp_path)
-    tables = sorted((runs / "overview-reference" / "tables").glob("*.csv"))
-    assert tables
-    for table in tables:  # eigenvalues differ by round-off between machines
-        made = pd.read_csv(tmp_path / "tables" / table.name)
-        pd.testing.assert_frame_equal(pd.read_csv(table), made, rtol=1e-9, obj=table.name)
+    assert len(list(page.every("img"))) == 1
 
 
 def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Path) -> None:
@@ -105,7 +86,7 @@ def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Pat
     assert "No method was timed alone yet" in text
     assert "`9bus`: `../one`, seen from this page" in text
     assert str(tmp_path) not in text
-    assert "Too few grids were timed" in text
+    assert not (tmp_path / "out" / "tables" / "slopes.csv").exists()
 
 
 def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_path, capsys) -> None:
@@ -123,26 +104,27 @@ def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_pa
 def test_after_how_many_schedules_a_training_is_paid(tmp_path: Path) -> None:
     """10 s of training, 0.3 s instead of 0.9: after 17 schedules."""
     folder = results_of(tmp_path / "one", "39bus")
-    facts = {"objective": 101.0, "case": "39bus", "policy": "ded-dpc-shared@0"}
-    Results(folder).add([Row("a", "test", "TO", "ded-dpc-shared", "default", "Policy", **facts)])
-    write_arrays(folder / "policies" / "ded-dpc-shared-TO.safetensors", {"w": np.zeros(1)}, TRAINED)
-    (without_time,) = payoffs([read_grid(folder)]).to_dict("records")
+    facts = {"objective": 101.0, "case": "39bus", "policy": "ded-admm@0"}
+    Results(folder).add([Row("a", "test", "TO", "ded-admm", "default", "Policy", **facts)])
+    write_arrays(folder / "policies" / "ded-admm-TO.safetensors", {"w": np.zeros(1)}, TRAINED)
+    (without_time,) = break_evens([read_grid(folder)]).to_dict("records")
     assert np.isnan(without_time["paid_after"])
     times = TimingRow("r", 1, "TO", "ded-slp", "default", "a", "Optimal", solve_s=0.9, case="39bus")
-    ours = dataclasses.replace(times, method="ded-dpc-shared", solve_s=0.3)
+    ours = dataclasses.replace(times, method="ded-admm", solve_s=0.3)
     TIMING.write(folder / "timing.csv", [times, ours])
-    (line,) = payoffs([read_grid(folder)]).to_dict("records")
-    assert (line["title"], line["rival"]) == ("DED-DPC (shared weights)", "DED (SLP)")
+    (line,) = break_evens([read_grid(folder)]).to_dict("records")
+    assert (line["title"], line["rival"]) == ("DED-ADMM", "DED (SLP)")
     assert (line["many_s"], line["rival_many_s"]) == pytest.approx((310.0, 900.0))
     assert line["paid_after"] == 17
     TIMING.write(folder / "timing.csv", [times, dataclasses.replace(ours, solve_s=1.0)])
-    assert payoffs([read_grid(folder)])["paid_after"].to_list() == [np.inf]
+    assert break_evens([read_grid(folder)])["paid_after"].to_list() == [np.inf]
 
 
 def points(**values: list[float]) -> pd.DataFrame:
     """Rows of one method in one regime on three grids."""
     facts = {"case": list("abc"), "generators": [2, 4, 8], "regime": "TO", "method": "ed", "title": "ED"}
-    return pd.DataFrame(facts | {"settings": "default", "correct_rate": [1.0, 0.5, 1.0]} | values)
+    facts |= {"settings": "default", "model": "", "correct_rate": [1.0, 0.5, 1.0]}
+    return pd.DataFrame(facts | values)
 
 
 def test_exponents_of_a_power_law() -> None:
@@ -161,14 +143,13 @@ def test_a_method_without_any_cell_has_no_row() -> None:
     assert json.loads(json.dumps(row)) == {"regime": "TO", "title": "ED", "a": "–", "b": "x", "c": "–"}
 
 
-def test_figures_over_grids(tmp_path: Path) -> None:
+def test_figures_over_grids() -> None:
     """Both axes logarithmic; hollow where some schedules are infeasible."""
     table = points(solve_s=[1.0, 2.0, 4.0], gap_percent_mean=[0.0, 0.1, -1.0])
-    figure = growth_figure(table, [("solve_s", "time (s)")])
-    (ax,) = figure.axes
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    curve, hollow = ax.get_lines()
+    figure = growth_figure(table, [("solve_s", "time (s)"), GAP])
+    times, gaps = figure.axes
+    assert (times.get_xscale(), times.get_yscale(), gaps.get_yscale()) == ("log", "log", "symlog")
+    curve, hollow = times.get_lines()
     assert list(curve.get_xdata()) == [2, 4, 8]
     assert (list(hollow.get_xdata()), hollow.get_markerfacecolor()) == ([4], "white")
-    check_layout(figure, tmp_path)
-    check_layout(gap_figure(table), tmp_path)
+    assert list(gaps.get_lines()[0].get_ydata()) == [0.0, 0.1, -1.0]

@@ -1,135 +1,87 @@
-"""Figures of schedules: powers, loads and slack power over time; the worst instances of a method."""
+"""Schedules of one representative instance per regime, and frequencies under them in the tightest."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+import numpy as np
+import pandas as pd
 
-from ded_bench.analysis.summary import title
-from ded_bench.problem.trajectory import Trajectory
-from ded_bench.problem.case import Case
-from ded_bench.report.figures.style import (
-    BLACK,
-    BUS_COLOURS,
-    DASHES,
-    GREY,
-    RAD_TO_HZ,
+from ded_bench.analysis.lines import main_lines, records, titled, where
+from ded_bench.methods.registry import METHODS
+from ded_bench.report.figures.panels import (
     Shown,
-    bounds,
-    busiest,
-    draw_line,
-    envelope,
-    legend_above,
-    legend_below,
-    new_figure,
-    plain,
-    thin,
-    time_axis,
+    frequency_panels,
+    load_panel,
+    power_panels,
+    slack_panel,
+    time_figure,
 )
+from ded_bench.report.figures.style import Drawn
+from ded_bench.report.sources import Sources
 
 
-def schedule_figure(case: Case, heading: str, shown: Sequence[Shown]) -> Figure:
-    """Generator powers with bounds, loads and slack power over time (paper, Figs. NO_cmp and TO_cmp).
-
-    Of many generators and loads, those that move most are shown.
-
-    Args:
-        shown: trajectories of one instance, one per method.
-    """
-    chosen = busiest(*(s.trajectory.p_gen for s in shown))
-    panels = len(chosen) + 2
-    rows = -(-panels // 2)
-    with new_figure(7.2, 0.7 + 2.1 * rows) as figure:
-        axes = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        handles: list[Line2D] = []
-        for ax, j in zip(axes, chosen, strict=False):
-            handles += [draw_line(ax, s, s.trajectory.t, s.trajectory.p_gen[:, j]) for s in shown]
-            handles.append(bounds(ax, case.p_min[j], case.p_max[j]))
-            ax.set_ylabel(f"$P_{{{case.generators[j]}}}$ (pu)")
-        loads, slack = axes[panels - 2], axes[panels - 1]
-        _draw_loads(loads, case, shown[0].trajectory)
-        for s in shown:
-            draw_line(slack, s, s.trajectory.t, s.trajectory.p_slack)
-        slack.set_ylabel(f"slack $P_{{{case.slack}}}$ (pu)")
-        for ax in axes[panels:]:
-            ax.set_visible(False)
-        time_axis(list(axes[:panels]), 2, shown[0].trajectory.t)
-        legend_below(figure, handles)
-        figure.suptitle(heading)
-    return figure
-
-
-def _draw_loads(ax: Axes, case: Case, run: Trajectory) -> None:
-    """The loads that move most in colour, all others thin and grey."""
-    named = busiest(run.p_load)
-    others = [j for j in range(len(case.loads)) if j not in named]
-    if others:
-        ax.plot(*thin(run.t, run.p_load[:, others]), color=GREY, linewidth=0.4, alpha=0.6)
-    for place, j in enumerate(named):
-        ax.plot(
-            *thin(run.t, run.p_load[:, j]),
-            color=BUS_COLOURS[place % len(BUS_COLOURS)],
-            dashes=DASHES[place % len(DASHES)] or (None, None),
-            label=f"bus {case.loads[j]}",
+def draw(sources: Sources) -> Iterator[Drawn]:
+    """Of every regime that has a pair of schedules (paper, Figs. NO_cmp, TO_cmp, freq_cmp)."""
+    case = sources.case
+    for regime in case.regimes:
+        chosen = representative(sources, regime)
+        rows = enumerate(records(chosen))
+        shown = [one for place, row in rows if (one := shown_run(sources, row, place))]
+        if not shown:
+            continue
+        heading = f"{chosen['instance'].iloc[0]}, {regime}"
+        names = " and ".join(one.label for one in reversed(shown))
+        caption = (
+            f"{names} on {heading}: generator powers with bounds, loads, slack power. The instance's gap is "
+            "near the median of those whose schedules are kept, and its loads move most."
         )
-    ax.set_ylabel("loads (pu)")
-    legend_above(ax, 3)
+        panels = [*power_panels(case, shown), load_panel(case, shown[0]), slack_panel(case, shown)]
+        yield Drawn(f"schedule_{regime}", caption, time_figure(heading, panels, 2))
+        if regime == sources.tightest:
+            caption = f"Frequencies under {names} on {heading}; dotted: the regime's bounds."
+            panels = frequency_panels(case, regime, shown, 4)
+            yield Drawn(f"frequencies_{regime}", caption, time_figure(heading, panels, 1))
 
 
-class Worst(NamedTuple):
-    """One column of `worst_figure`: why it is there, and the runs of the method and of the reference."""
+def shown_run(sources: Sources, row: dict[Any, Any], place: int = 0) -> Shown | None:
+    """What figures show of a row; None if it cannot be simulated."""
+    run = sources.trajectory(row["key"])
+    arrays = (run.t, run.p_gen, run.omega, run.p_load, run.p_slack) if run else ()
+    return Shown(row["method"], row["title"], place, *arrays) if run else None
 
-    reason: str
-    shown: Shown
-    reference: Shown | None
 
+def representative(sources: Sources, regime: str) -> pd.DataFrame:
+    """Rows of the reference and a challenger on one instance; none without such a pair.
 
-def worst_figure(case: Case, regime: str, heading: str, columns: Sequence[Worst]) -> Figure:
-    """The worst instances of one method side by side: powers and frequencies, the reference's dashed.
-
-    Of many generators, those whose powers move most are shown; the span of all frequencies is grey.
+    Trained methods come before others, and the smaller the mean gap, the earlier. Of the instances whose
+    schedules are kept, the third with gaps nearest to the challenger's median takes part; the one whose
+    loads move most is chosen.
     """
-    chosen = busiest(*(column.shown.trajectory.p_gen for column in columns))
-    limit = case.regimes[regime].omega_hz
-    width = 2.9 * max(len(columns), 4)
-    with new_figure(width, 4.4) as figure:
-        # Margins by hand: the automatic layout takes longer than all the drawing.
-        figure.set_layout_engine(None)
-        axes = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
-        figure.subplots_adjust(0.75 / width, 0.19, 1 - 0.12 / width, 0.83, 0.1, 0.12)
-        handles: dict[str, Line2D] = {}
-        for column, (top, bottom) in zip(columns, axes.T, strict=True):
-            t, omega = column.shown.trajectory.t, column.shown.trajectory.omega * RAD_TO_HZ
-            if len(chosen) < len(case.generators):
-                bottom.fill_between(*envelope(t, omega), color=GREY, alpha=0.25, linewidth=0)
-            for place, j in enumerate(chosen):
-                paint = BUS_COLOURS[place % len(BUS_COLOURS)]
-                for level in (case.p_min[j], case.p_max[j]):
-                    top.axhline(level, color=paint, linestyle=":", linewidth=0.8)
-                (line,) = top.plot(*thin(t, column.shown.trajectory.p_gen[:, j]), color=paint)
-                handles[f"bus {case.generators[j]}"] = line
-                bottom.plot(*thin(t, omega[:, j]), color=paint)
-            if column.reference:
-                run, dashed = (
-                    column.reference.trajectory,
-                    {"color": BLACK, "dashes": (4, 2), "linewidth": 0.9},
-                )
-                name = plain(title(column.reference.method, column.reference.settings))
-                handles[name], *_ = top.plot(*thin(run.t, run.p_gen[:, chosen]), **dashed)
-                bottom.plot(*thin(run.t, run.omega[:, chosen] * RAD_TO_HZ), **dashed)
-            handles["bound"] = bounds(bottom, limit, -limit)
-            for ax in (top, bottom):
-                ax.locator_params(nbins=4)  # ticks take longer than lines
-            top.set_title(column.reason, fontsize=8)
-            bottom.set_xlabel("time (s)")
-            bottom.set_xlim(t[0], t[-1])
-        axes[0, 0].set_ylabel("generator power (pu)")
-        axes[1, 0].set_ylabel("frequency deviation (Hz)")
-        figure.align_ylabels(axes[:, 0])
-        figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(handles))
-        figure.suptitle(heading)
-    return figure
+    rows = titled(
+        main_lines(sources.judged[sources.judged["regime"] == regime].dropna(subset=["gap_percent"]))
+    )
+    gaps = rows["gap_percent"].groupby(rows["method"])
+    rows = rows.assign(distance=(rows["gap_percent"] - gaps.transform("median")).abs())
+    kept = where(rows, map(sources.has_schedule, rows["key"]))
+    reference = kept[kept["method"] == sources.reference.method]
+    for method in challengers(gaps.agg(lambda gap: gap.abs().mean()), sources.reference.method):
+        pairs = kept[(kept["method"] == method) & kept["instance"].isin(reference["instance"])]
+        if len(pairs):
+            usual = pairs.nsmallest(-(-len(pairs) // 3), "distance")["instance"]
+            chosen = max(usual, key=lambda name: _movement(sources, name))
+            both = pd.concat([reference, pairs])
+            return where(both, both["instance"] == chosen)
+    return kept.iloc[:0]
+
+
+def challengers(distance: pd.Series[float], reference: str) -> list[str]:
+    """The methods that may stand beside the reference, first choice first; `distance` is their mean gap."""
+    trained = {name for name, method in METHODS.items() if method.trainer}
+    others = (str(name) for name in distance.index if name != reference)
+    return sorted(others, key=lambda name: (name not in trained, distance[name], name))
+
+
+def _movement(sources: Sources, name: str) -> float:
+    return float(np.ptp(sources.instances[name].p_load(sources.case), axis=0).sum())

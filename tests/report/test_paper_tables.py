@@ -9,13 +9,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.paper_numbers import Paper, read_paper
+from ded_bench.analysis.paper_numbers import Paper, read_paper, result_lines
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.report.columns import TABLE_V, TABLE_VI, Column, tabulate
-from ded_bench.report.paper import paper_lines
-from tests.evaluate.test_summary import DED, NO_TIMES, frame_of, row, with_gaps
+from ded_bench.report.columns import TABLE_V, TABLE_VI, Column, tabulate, without_paper
+from tests.analysis.test_summary import NO_TIMES, frame_of, row, with_gaps
 
 FILE = SHIPPED_CASES / "9bus" / "paper.json"
 PAPER = parse_record(Paper, FILE.read_text(encoding="utf-8"), FILE)
@@ -25,7 +24,7 @@ OURS = ["ded", "ded-ko", "ded-dpc-paper", "ded-dpc"]
 
 def times(*rows: tuple[str, float, int]) -> pd.DataFrame:
     """The timing table of regime TO: method, median, failures."""
-    cells = [("TO", method, "default", seconds, failures) for method, seconds, failures in rows]
+    cells = [("TO", method, "default", "", seconds, failures) for method, seconds, failures in rows]
     return pd.DataFrame(cells, columns=NO_TIMES.columns)
 
 
@@ -36,9 +35,8 @@ def made(
     paper: Paper | None = PAPER,
 ) -> pd.DataFrame:
     """A table by regime, method and settings."""
-    return tabulate(columns, paper_lines(with_gaps(frame), timing, paper, DED)).set_index(
-        ["regime", "method", "settings"]
-    )
+    lines = result_lines(with_gaps(frame), timing, paper, "ded")
+    return tabulate(columns, lines).set_index(["regime", "method", "settings"])
 
 
 @pytest.fixture
@@ -133,7 +131,9 @@ def test_the_papers_numbers_lie_beside_its_case_only(ninebus: Case, tmp_path: Pa
     assert PAPER.case_fingerprint == ninebus.fingerprint
     assert set(PAPER.regimes) == set(ninebus.regimes)
     assert read_paper(tmp_path) is None
-    assert made(TABLE_V, frame_of(), paper=None).empty
+    columns = without_paper(TABLE_V, "DED (SLP)")
+    assert not [column for column in columns if "paper" in column.name]
+    assert made(columns, frame_of(), paper=None).empty
 
 
 @pytest.mark.parametrize(

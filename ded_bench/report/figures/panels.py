@@ -1,0 +1,139 @@
+"""Curves over time in panels: powers, loads, frequencies of trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ded_bench.problem.case import Array, Case
+from ded_bench.report.figures.style import DASHES, GREY, PALETTE, legend_below, look, new_figure, plain
+
+RAD_TO_HZ = 1 / (2 * np.pi)
+#: How many generators or loads a figure shows one by one.
+FEW = 6
+#: No printer or screen resolves more points of a curve.
+POINTS = 1500
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Values over time: (n,), or (n, m) for several that look alike."""
+
+    t: Array  # s
+    values: Array
+    label: str
+    style: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves that share axes, with dotted lines at limits."""
+
+    label: str
+    curves: list[Curve]
+    limits: Sequence[float] = ()
+    title: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Whose trajectory a figure shows, at which place, and its arrays; no method: hindsight's."""
+
+    method: str
+    label: str
+    place: int
+    t: Array  # (n,), s
+    p_gen: Array  # (n, n_gen), pu
+    omega: Array  # (n, n_gen), rad/s
+    p_load: Array  # (n, n_load), pu
+    p_slack: Array  # (n,), pu
+
+    def curve(self, values: Array) -> Curve:
+        """Values over time in the method's colour."""
+        style = look(self.method, self.place) if self.method else {"color": GREY}
+        return Curve(self.t, values, self.label, style)
+
+
+def power_panels(case: Case, shown: Sequence[Shown], count: int = FEW) -> list[Panel]:
+    """Powers with their bounds of the generators that move most, pu."""
+    return [
+        Panel(
+            f"$P_{{{case.generators[j]}}}$ (pu)",
+            [one.curve(one.p_gen[:, j]) for one in shown],
+            (case.p_min[j], case.p_max[j]),
+        )
+        for j in busiest([one.p_gen for one in shown], count)
+    ]
+
+
+def frequency_panels(case: Case, regime: str, shown: Sequence[Shown], count: int = FEW) -> list[Panel]:
+    """Frequency deviations with the regime's bounds of the generators that move most, mHz."""
+    limit = 1e3 * case.regimes[regime].omega_hz
+    return [
+        Panel(
+            f"$\\omega_{{{case.generators[j]}}}$ (mHz)",
+            [one.curve(1e3 * RAD_TO_HZ * one.omega[:, j]) for one in shown],
+            (limit, -limit),
+        )
+        for j in busiest([one.omega for one in shown], count)
+    ]
+
+
+def load_panel(case: Case, one: Shown) -> Panel:
+    """The loads that move most, pu."""
+    curves = []
+    for colour, dashes, j in zip(PALETTE, DASHES, busiest([one.p_load], FEW), strict=False):
+        style = {"color": colour, "dashes": dashes, "linewidth": 0.9}
+        curves.append(Curve(one.t, one.p_load[:, j], f"load {case.loads[j]}", style))
+    return Panel("loads (pu)", curves)
+
+
+def slack_panel(case: Case, shown: Sequence[Shown]) -> Panel:
+    """Slack power, pu."""
+    return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
+
+
+def time_figure(heading: str, panels: Sequence[Panel], columns: int, legend: bool = True) -> Figure:
+    """All panels, and one legend below."""
+    rows = -(-len(panels) // columns)
+    with new_figure(0.9 + (1.35 if columns == 1 else 1.8) * rows) as figure:
+        axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+        handles = []
+        for ax, panel in zip(axes, panels, strict=False):
+            for curve in panel.curves:
+                step = max(1, len(curve.t) // POINTS)
+                lines = ax.plot(
+                    curve.t[::step], curve.values[::step], label=plain(curve.label), **curve.style
+                )
+                handles += lines[:1]
+                ax.set_xlim(float(curve.t[0]), float(curve.t[-1]))
+            for level in panel.limits:
+                handles.append(
+                    ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
+                )
+            ax.set_ylabel(panel.label)
+            ax.set_title(plain(panel.title), fontsize=7)
+        for ax in axes[max(len(panels) - columns, 0) : len(panels)]:
+            ax.set_xlabel("time (s)")
+            ax.tick_params(labelbottom=True)
+        for ax in axes[len(panels) :]:
+            ax.set_visible(False)
+        if legend:
+            legend_below(figure, handles)
+        figure.suptitle(plain(heading))
+    return figure
+
+
+def busiest(curves: Sequence[Array], count: int) -> list[int]:
+    """The columns to show of many: those that move most, in their order; all if there are few.
+
+    Args:
+        curves: of shapes (n_points, n), such as one method's each; what counts is the largest range of any.
+        count: at most so many.
+    """
+    ranges = np.max([np.ptp(values, axis=0) for values in curves], axis=0)
+    return sorted(np.argsort(-ranges, kind="stable")[:count].tolist())

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import torch
 
+from ded_bench.analysis.lines import named
 from ded_bench.analysis.summary import claims, summary, table_times, worst
 from ded_bench.cli import commands
 from ded_bench.files.errors import InputError
@@ -52,7 +53,7 @@ from tests.damage import (
     damaged_json,
     damaged_table,
 )
-from tests.evaluate.test_summary import with_gaps
+from tests.analysis.test_summary import with_gaps
 
 #: Damaged files of each kind; together they are the 2000 and more that this module promises.
 COUNTS = {
@@ -271,7 +272,7 @@ def test_summaries_survive_what_results_may_hold(folder: Path) -> None:
             continue
         results = Results(folder)
         results.rows = rows
-        frame = with_gaps(results.frame())
+        frame = with_gaps(named(results.frame()))
         for table in (summary, table_times, claims, worst):
             table(frame)
         made += 1

@@ -192,7 +192,8 @@ class Move:
         then = json.loads((self.old / "certificate.json").read_text())["certificates"]
         for old, certificate in zip(then, read_certificates(self.old), strict=True):
             model = model_name(certificate.model)
-            settings = Settings(certificate.settings, model, search=(self.new,))
+            policy = self.new / "policies" / f"{certificate.method}-{certificate.regime}.safetensors"
+            settings = Settings(certificate.settings, model, policy, search=(self.new,))
             candidate = Candidate(certificate.method, certificate.regime, settings)
             seed = certificate.seed % 1_000_000
             fingerprint = candidate.fingerprint(self.case, seed)

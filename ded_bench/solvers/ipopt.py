@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ class CasadiIpopt:
         source = self._source
         if self._solver is None or self._limit != time_limit_s:
             self._solver, self._limit = self._make(time_limit_s), time_limit_s
-        arguments, objective_from = source.current()
+        arguments, constant = source.current()
         start = np.array([0.0 if v.value is None else v.value for v in source.columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
@@ -85,7 +85,7 @@ class CasadiIpopt:
         has_values = status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT)
         if has_values:
             assign(source.columns, result["x"].full().ravel())
-        objective = objective_from(float(result["f"])) if has_values else None
+        objective = float(result["f"]) + constant if has_values else None
         return Outcome(
             status, has_values, stats.get("iter_count"), setup, elapsed, objective, _IPOPT_VERSION, message
         )
@@ -100,8 +100,8 @@ class CasadiIpopt:
         return casadi.nlpsol("ipopt", "ipopt", self._source.nlp, options | {"ipopt": ipopt})
 
 
-#: What IPOPT is called with, and how its objective becomes the model's.
-_Current = tuple[dict[str, Array], Callable[[float], float]]
+#: What IPOPT is called with, and what its objective leaves out.
+_Current = tuple[dict[str, Array], float]
 
 
 class _Arrays:
@@ -120,7 +120,7 @@ class _Arrays:
     def current(self) -> _Current:
         numbers = self._program.numbers()
         arguments = {"lbx": numbers.lower, "ubx": numbers.upper, "p": numbers.cost}
-        return arguments, lambda f: self._program.sense * (f + numbers.constant)
+        return arguments, numbers.constant
 
 
 class _Nl:
@@ -137,11 +137,10 @@ class _Nl:
         self.nlp: dict[str, Any] = {"x": casadi.vertcat(*builder.x), "f": builder.f, "g": g}
         self.columns = tuple(info.variables)
         self.g_lower, self.g_upper = np.array(builder.g_lb), np.array(builder.g_ub)
-        self._sign = -1.0 if next(iter(info.objectives)).sense == pyo.maximize else 1.0
 
     def current(self) -> _Current:
         lower, upper = bounds(self.columns)
-        return {"lbx": lower, "ubx": upper}, lambda f: self._sign * f
+        return {"lbx": lower, "ubx": upper}, 0.0
 
 
 class IpoptExecutable:

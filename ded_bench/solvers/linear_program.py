@@ -118,7 +118,6 @@ class LinearProgram:
     linear: Array  # (n_columns,)
     bilinear: sp.csr_matrix  # (n_columns, n_columns), symmetric: objective ½ xᵀ Q x + linear·x
     constant: float
-    sense: float  # 1: the Pyomo model minimises, -1: it maximises
 
     def numbers(self) -> Numbers:
         """The current bounds of the Pyomo variables, and the costs that follow.
@@ -134,7 +133,7 @@ class LinearProgram:
         slope = self.bilinear @ data
         cost = np.where(free, self.linear + slope, 0.0)
         constant = self.constant + float(data @ (self.linear + 0.5 * slope))
-        return Numbers(lower, upper, self.sense * cost, self.sense * constant)
+        return Numbers(lower, upper, cost, constant)
 
     def free_form(self, numbers: Numbers) -> FreeForm:
         """Remove the data, and tell equalities from inequalities."""
@@ -154,7 +153,7 @@ class LinearProgram:
 
     def objective(self, numbers: Numbers, values: Array) -> float:
         """The Pyomo model's objective at values of all columns."""
-        return self.sense * (float(numbers.cost @ values) + numbers.constant)
+        return float(numbers.cost @ values) + numbers.constant
 
 
 def bounds(columns: Sequence[Any]) -> Array:
@@ -170,7 +169,7 @@ def assign(columns: Sequence[Any], values: Array) -> None:
 
 
 def read_linear(model: pyo.ConcreteModel) -> LinearProgram:
-    """Read a Pyomo model with linear constraints and one active objective.
+    """Read a Pyomo model with linear constraints and one active objective, which is minimised.
 
     Raises:
         ValueError: a constraint is not linear, or the objective is of higher degree than two.
@@ -217,7 +216,6 @@ def read_linear(model: pyo.ConcreteModel) -> LinearProgram:
         linear=linear,
         bilinear=_symmetric(pairs, repn.quadratic_coefs, n),
         constant=float(repn.constant),
-        sense=-1.0 if objective.sense == pyo.maximize else 1.0,
     )
 
 

@@ -40,17 +40,6 @@ def test_what_is_too_large_is_refused(prepare: Prepare, settings: str, refused: 
         assert "GiB" in refusal.error
 
 
-@pytest.mark.parametrize(("prepare", "settings", "refused"), PREPARED)
-def test_what_is_small_enough_is_solved(
-    prepare: Prepare, settings: str, refused: set[str], threebus: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    instance = sample_instance(threebus, 77, 0).model_copy(update={"horizon_s": 1.0})
-    solve = prepare(threebus, "NO", Settings(settings))
-    assert solve(instance).status == Status.OPTIMAL
-    monkeypatch.setattr(solution, "MAX_BYTES", 1000)
-    assert solve(instance).status == Status.FAILED
-
-
 def test_what_the_reference_runs_hold_is_allowed() -> None:
     """`ded` on two-area and 39bus, `ded-radau` on 68bus."""
     for name in ("two-area", "39bus"):

@@ -105,17 +105,6 @@ def test_known_optima_before_and_after_new_numbers(solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", LINEAR)
-def test_maximisation_keeps_its_sign(solver: str) -> None:
-    model = diet()
-    model.total.deactivate()
-    model.most = pyo.Constraint(expr=model.x + model.y <= 5)
-    model.worth = pyo.Objective(expr=model.price[0] * model.x + model.y, sense=pyo.maximize)
-    outcome = compile_model(model, solver).solve()
-    assert outcome.objective == pytest.approx(8.0, abs=1e-6)  # x = 3 at 2 each, y = 2
-    assert model.x.value == pytest.approx(3.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("solver", LINEAR)
 def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails(solver: str) -> None:
     model = diet()
     model.y.setub(0.25)

@@ -1,4 +1,4 @@
-"""Policy files: weights and a JSON header in safetensors; their names, and what a policy refuses.
+"""Policy files: weights and a JSON header in safetensors, and their names in a results folder.
 
 Who answers reads weights as arrays; torch is for training alone.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.solution import DEFAULT_MODEL, Settings
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.folder import ResultsFolder
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 SCHEMA = "ded-bench/policy/1"
+#: The surrogate on which policies train unless told otherwise; the names of their files do not say it.
+DEFAULT_MODEL = "koopman"
 #: Weights and buffers of a network by name, in the order of its state dict, float32.
 Weights = dict[str, np.ndarray]
 
@@ -39,14 +41,11 @@ class Scope:
     def check(self, instances: Sequence[Instance]) -> None:
         """Raise InputError if an instance belongs to another case or horizon."""
         for instance in instances:
+            source = f"instance {instance.id}"
             if instance.case != self.case.id:
-                raise InputError(f"instance {instance.id}", "case", f"the policy is for case {self.case.id}")
+                raise InputError(source, "case", f"the policy is for case {self.case.id}")
             if abs(instance.horizon_s - self.horizon_s) > 1e-9:
-                raise InputError(
-                    f"instance {instance.id}",
-                    "horizon_s",
-                    f"the policy is for a horizon of {self.horizon_s} s",
-                )
+                raise InputError(source, "horizon_s", f"the policy is for a horizon of {self.horizon_s} s")
 
 
 def write_policy(path: Path, method: str, scope: Scope, weights: Weights, training: dict[str, Any]) -> None:
@@ -110,12 +109,9 @@ def weights_fingerprint(weights: Weights) -> str:
     return hashlib.sha256(b"".join(value.tobytes() for value in weights.values())).hexdigest()[:12]
 
 
-def policy_file(
-    results: Path, method: str, regime: str, model: str = DEFAULT_MODEL, settings: str = "default"
-) -> Path:
-    """Where a results folder keeps a policy; other settings or another Koopman model say so in its name."""
-    suffix = "" if settings == "default" else f"-{settings}"
-    suffix += "" if model == DEFAULT_MODEL else f"-{Path(model).stem}"
+def policy_file(results: Path, method: str, regime: str, model: str = "") -> Path:
+    """Where a results folder keeps a policy: `<method>-<regime>`, and the model unless it is the default."""
+    suffix = "" if model in ("", DEFAULT_MODEL) else f"-{Path(model).stem}"
     return ResultsFolder(results).policy(f"{method}-{regime}{suffix}")
 
 
@@ -128,10 +124,9 @@ def find_policy_file(method: str, case: Case, regime: str, settings: Settings) -
     if settings.policy:
         return settings.policy
     for folder in settings.search:
-        path = policy_file(folder, method, regime, settings.model, settings.name)
+        path = policy_file(folder, method, regime, settings.model)
         if path.is_file():
             return path
     command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.id}"
-    command += "" if settings.name == "default" else f" --settings {settings.name}"
-    command += "" if settings.model == DEFAULT_MODEL else f" --model {settings.model}"
+    command += "" if settings.model in ("", DEFAULT_MODEL) else f" --model {settings.model}"
     raise InputError("--policy", "", f"no {method} policy for {regime} yet; run `{command}`")

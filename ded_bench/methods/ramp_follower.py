@@ -1,10 +1,9 @@
-"""Schedules that follow targets as fast as ramp limits allow, whatever is asked.
+"""Schedules that follow targets as fast as bounds and ramp limits allow, whatever is asked.
 
-    p_0 = P_0,   p_{j+1} = min(max(target_{j+1}, p_j - step), p_j + step)
+    p_0 = P_0,   p_{j+1} = min(max(clip(target_{j+1}), p_j - step), p_j + step)
 
-with `step` the ramp limit times the spacing of the knots. By induction p stays within the generator
-bounds if P_0 and the targets are. Between knots a schedule is linear, so no two neighbouring grid points
-differ by more than the limit.
+with `step` the ramp limit times the spacing of the knots. By induction p stays within the generator bounds if
+P_0 is. Between knots a schedule is linear, so no two neighbouring grid points differ by more than the limit.
 """
 
 from __future__ import annotations
@@ -16,23 +15,25 @@ from ded_bench.problem.compiled import compiled
 
 
 @compiled
-def track(p_gen: Array, step: Array) -> None:
+def track(p_gen: Array, low: Array, high: Array, step: Array) -> None:
     """Turn the targets of a batch into powers, in place.
 
     Args:
-        p_gen: P_0, then the targets, shape (batch, n_gen, n_knots), pu.
+        p_gen: P_0, then the targets, shape (batch, n_knots, n_gen), pu.
+        low: lower bounds, (n_gen,), pu; likewise `high`.
+        high: upper bounds.
         step: largest change between two knots, (n_gen,), pu.
     """
-    for b in range(len(p_gen)):
-        for g in range(p_gen.shape[1]):
-            p = p_gen[b, g, 0]
-            for j in range(1, p_gen.shape[2]):
-                p = min(max(p_gen[b, g, j], p - step[g]), p + step[g])
-                p_gen[b, g, j] = p
+    for b in range(p_gen.shape[0]):
+        for j in range(1, p_gen.shape[1]):
+            for g in range(p_gen.shape[2]):
+                before = p_gen[b, j - 1, g]
+                target = min(max(p_gen[b, j, g], low[g]), high[g])
+                p_gen[b, j, g] = min(max(target, before - step[g]), before + step[g])
 
 
 def follow(targets: Array, p_initial: Array, step: Array) -> Array:
-    """Follow the targets of a batch.
+    """Follow the targets of a batch, which are within the bounds.
 
     Args:
         targets: shape (batch, n_knots - 1, n_gen), pu.
@@ -43,5 +44,5 @@ def follow(targets: Array, p_initial: Array, step: Array) -> Array:
         Shape (batch, n_knots, n_gen), pu.
     """
     p_gen = np.concatenate([p_initial[:, None], targets], axis=1)
-    track(p_gen.swapaxes(1, 2), step)
+    track(p_gen, np.full_like(step, -np.inf), np.full_like(step, np.inf), step)
     return p_gen

@@ -117,7 +117,7 @@ METHODS: dict[str, Method] = {
             trainer="ded_bench.methods.dpc_paper.paper_training",
         ),
         Method(
-            "ded-dpc", "ded_bench.methods.dpc.policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
+            "ded-dpc", "ded_bench.methods.dpc.dpc_policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
         ),
         Method(
             "ded-admm",

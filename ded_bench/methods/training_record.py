@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ded_bench.files.strict import write_atomically
+from ded_bench.methods.policy_file import DEFAULT_MODEL
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.koopman import Koopman
 
 #: First columns of every history.
@@ -34,13 +36,30 @@ class TrainingOptions:
 
     seed: int = 0
     seconds: float | None = None  # end after so much training time; None: train for all epochs
+    epochs: int | None = None  # None: as many as the method's recipe says
     device: str = "cpu"  # or "cuda"
     resume: bool = False  # go on from the checkpoint, if there is one
-    code: str = ""  # hash of the sources that train, a fact that the policy's file tells
     start: Path | None = None  # policy file, perhaps of another grid, whose weights training starts from
+    model: str = ""  # surrogate to train on, by name or file, for methods that train on one
+    search: tuple[Path, ...] = ()  # folders where trained models may lie
+    version: str = ""  # of this package, and its commit: facts that the policy's file tells
+    commit: str = ""
+
+    def find_model(self, case: Case) -> Koopman:
+        """The surrogate to train on.
+
+        Raises:
+            InputError: there is no such model yet (names the command that makes it), or it does not fit.
+        """
+        return find_model(case, self.model or DEFAULT_MODEL, self.search)
+
+    def facts(self) -> dict[str, Any]:
+        """What every policy's file tells of how it was trained."""
+        kept = ("seed", "device", "version", "commit")
+        return {name: getattr(self, name) for name in kept}
 
 
-class TrainedPolicy(Protocol):
+class Trained(Protocol):
     """What a training returns, after it has written the policy's file."""
 
     @property
@@ -49,28 +68,19 @@ class TrainedPolicy(Protocol):
 
 
 class Trainer(Protocol):
-    """`train` of a method's training module."""
+    """`train` of a method's training module, which says `TAKES_START = True` if it knows `options.start`."""
 
     def __call__(
-        self,
-        case: Case,
-        regime: str,
-        instances: Sequence[Instance],
-        model: Koopman,
-        out: Path,
-        options: TrainingOptions,
-        /,
-        **setting: Any,
-    ) -> TrainedPolicy:
-        """Train a policy on a Koopman model; write it to `out`, and its history beside it.
+        self, case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
+    ) -> Trained:
+        """Train a policy; write it to `out`, and its history beside it.
 
         Args:
             instances: of the case, all on one time grid.
-            setting: options that the method's setting names, and perhaps `epochs`.
 
         Raises:
-            InputError: the checkpoint to go on from belongs to another training, or the weights to
-                start from do not fit.
+            InputError: the surrogate is missing, the checkpoint to go on from belongs to another training,
+                or the weights to start from do not fit.
         """
 
 

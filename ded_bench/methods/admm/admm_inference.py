@@ -1,6 +1,6 @@
-"""The unrolled ADMM of the shared policy without torch, whose overhead would dominate a single answer.
+"""The ADMM of `ded-admm` without torch, whose overhead would dominate a single answer.
 
-The linear program along the path of a problem is
+The linear program along a trajectory of a problem is
 
     min Σ c P + c_s |P_s|   with P, P⁺ - P and ω within limits, all affine in P.
 
@@ -13,15 +13,12 @@ far from convergence: how they weigh what they minimise is learned, and the only
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from ded_bench.methods.admm.grid_response import FINE
-from ded_bench.methods.admm.iteration_kernels import answer
-from ded_bench.methods.admm.iteration_records import Given, Limits
-from ded_bench.methods.admm.mode_kernels import mean_modes
-from ded_bench.methods.admm.path_model import Linear, Outset, PathModel
+from ded_bench.methods.admm.admm_kernels import AdmmLimits, AdmmProblems, iterate
+from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
+from ded_bench.methods.admm.problems import POINTS
+from ded_bench.methods.admm.quadratic_kernels import mean_modes
 from ded_bench.problem.case import Array
 
 #: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
@@ -41,8 +38,6 @@ SETTINGS = {
 PENALTIES = 4
 #: Largest relaxation and tightening.
 MOST = {"relaxation": 2.0, "tightening": 0.1}
-
-
 #: Iterations, equally far apart, whose weights are learned; those of others lie between.
 NODES = 4
 
@@ -76,72 +71,68 @@ def settings_of(weights: Array, iterations: int) -> Array:
     return found
 
 
-def limits_of(model: PathModel) -> Limits:
-    """Limits of a model's case, and what makes them comparable."""
-    case, response = model.case, model.response
-    by_bound = np.diag(response.stiffness) * model.bound * model.spacing
-    unit = float(np.exp(np.log(np.minimum(model.ramp, by_bound)).mean()))
-    return Limits(
+def limits_of(grid: ModalGrid, bound: float) -> AdmmLimits:
+    """Limits of a grid's case for a bound on |ω|, rad/s, and what makes them comparable."""
+    case = grid.case
+    by_bound = np.diag(grid.stiffness) * bound * grid.spacing
+    unit = float(np.exp(np.log(np.minimum(grid.ramp, by_bound)).mean()))
+    largest = float(np.maximum(np.abs(case.p_min), np.abs(case.p_max)).sum())
+    return AdmmLimits(
         low=case.p_min,
         high=case.p_max,
-        step=model.ramp,
-        bound=model.bound,
-        mass=model.mass,
+        step=grid.ramp,
+        bound=bound,
+        mass=grid.mass,
         unit=unit,
-        price=unit
-        / ((len(response.knots) - 1) * float(np.maximum(np.abs(case.p_min), np.abs(case.p_max)).sum())),
-        gain=response.gain.astype(np.float32),
-        shape=response.shape.astype(np.float32),
+        price=unit / ((len(grid.knots) - 1) * largest),
+        gain=grid.gain.astype(np.float32),
+        shape=grid.shape.astype(np.float32),
     )
 
 
-def given_of(model: PathModel, outset: Outset, linear: Linear) -> Given:
-    """What compiled iterations know of problems."""
-    taken = model.response.stiffness.sum(axis=0), linear.stiffness.sum(axis=2)
-    nominal, changes = (part @ model.response.shape.T for part in taken)
-    into, maps, outputs = mean_modes_of(model, linear)
-    return Given(
-        cost=outset.problems.cost / outset.scale[:, None],
-        offset=linear.offset.astype(np.float32),
-        slack=linear.slack.astype(np.float32),
-        leverage=(nominal + model.between @ changes).astype(np.float32),
-        change=linear.change.astype(np.float32),
-        state=outset.state.astype(np.float32),
-        mean_modes=into,
-        mean_maps=maps,
-        mean_outputs=outputs,
-    )
-
-
-def mean_modes_of(model: PathModel, linear: Linear) -> tuple[Array, Array, Array]:
-    """Modes of the mean stiffness along paths, in which powers weigh by inertia.
+def mean_modes_of(grid: ModalGrid, linear: ModalLinearisation) -> tuple[Array, Array, Array]:
+    """Modes of the mean stiffness along trajectories, in which powers weigh by inertia.
 
     Returns:
-        Powers by column (batch, n_gen, n_modes), `interval_maps` (batch, fine + 1, 2, 4, n_modes), and
+        Powers by column (batch, n_gen, n_modes), `interval_maps` (batch, POINTS + 1, 2, 4, n_modes), and
         `outputs` of `modal_change` (batch, 2, n_modes).
     """
-    response, n = model.response, len(model.mass)
-    mean = response.stiffness + np.tensordot(linear.stiffness, model.shares, axes=(1, 0))
-    into, maps, outputs = (np.empty((len(mean), *shape)) for shape in ((n, n), (FINE + 1, 2, 4, n), (2, n)))
-    inertia, h = float(response.network.m.mean()), float(response.fine[1])
-    mean_modes(mean, model.mass, inertia, response.rate, h, into, maps, outputs)
+    n = len(grid.mass)
+    mean = grid.stiffness + np.tensordot(linear.stiffness, grid.shares, axes=(1, 0))
+    into, maps, outputs = (np.empty((len(mean), *shape)) for shape in ((n, n), (POINTS + 1, 2, 4, n), (2, n)))
+    inertia, h = float(grid.network.m.mean()), float(grid.points[1])
+    mean_modes(mean, grid.mass, inertia, grid.rate, h, into, maps, outputs)
     return into, maps, outputs
 
 
 class CompiledIterations:
-    """The same function as `UnrolledIterations`, with its state dict as arrays; powers in float64."""
+    """The same function as `TorchIterations`, with its weights as an array; powers in float64."""
 
-    def __init__(self, model: PathModel, weights: Mapping[str, np.ndarray], iterations: int) -> None:
-        self._model, self._limits, modes = model, limits_of(model), model.modes
-        self._settings = settings_of(weights["nodes"], iterations)
-        self._settings[:, :PENALTIES] *= self._limits.price
+    def __init__(self, grid: ModalGrid, bound: float, nodes: np.ndarray, iterations: int) -> None:
+        """Iterations for a bound on |ω|, rad/s."""
+        self._grid, self._limits, modes = grid, limits_of(grid, bound), grid.modes
+        self.settings = settings_of(nodes, iterations)
+        self.settings[:, :PENALTIES] *= self._limits.price
         self._modes = modes._replace(
             step=modes.step.astype(np.float32), damping=modes.damping.astype(np.float32)
         )
 
-    def __call__(self, outset: Outset, linear: Linear, start: Array) -> Array:
+    def __call__(self, start: Start, linear: ModalLinearisation, schedule: Array) -> Array:
         """Powers at the knots, from first ones, both (batch, n_knots, n_gen), pu."""
-        powers = start.copy()
-        given = given_of(self._model, outset, linear)
-        answer(powers, given, self._limits, self._modes, self._settings)
+        grid, powers = self._grid, schedule.copy()
+        taken = grid.stiffness.sum(axis=0), linear.stiffness.sum(axis=2)
+        nominal, changes = (part @ grid.shape.T for part in taken)
+        into, maps, outputs = mean_modes_of(grid, linear)
+        given = AdmmProblems(
+            cost=start.problems.cost / start.scale[:, None],
+            offset=linear.offset.astype(np.float32),
+            slack=linear.slack.astype(np.float32),
+            slack_of_mode=(nominal + grid.between @ changes).astype(np.float32),
+            change=linear.change.astype(np.float32),
+            state=start.state.astype(np.float32),
+            mean_modes=into,
+            mean_maps=maps,
+            mean_outputs=outputs,
+        )
+        iterate(powers, given, self._limits, self._modes, self.settings)
         return powers

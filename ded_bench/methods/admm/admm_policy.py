@@ -1,145 +1,130 @@
-"""DED-DPC with shared weights (`ded-dpc-shared`): a few iterations of ADMM whose settings are learned.
+"""Learned ADMM (`ded-admm`): a few iterations whose penalties and step sizes are learned; see `admm_inference`.
 
 The weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
-and P_0 hold for any weights. See `unrolled_inference` for the iterations.
+and P_0 hold for any weights. More iterations, along the trajectory of the answer, improve it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
-from ded_bench.methods.admm.drawn_problems import Problems
-from ded_bench.methods.admm.grid_response import GridResponse
-from ded_bench.methods.admm.path_model import Linear, Outset, PathModel
+from ded_bench.methods.admm.modal_grid import ModalGrid
+from ded_bench.methods.admm.problems import Problems
 from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.policy_file import (
-    Scope,
-    Weights,
-    checked_weights,
-    find_policy_file,
-    read_policy,
-    weights_fingerprint,
-    weights_of,
-    write_policy,
-)
-from ded_bench.methods.policy_solver import method
+from ded_bench.methods.options import option, read_options
+from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import PowerFlowError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
-if TYPE_CHECKING:
-    from ded_bench.methods.admm.admm_iterations import UnrolledIterations
-
-METHOD = "ded-dpc-shared"
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}}
+VERSION = 1
 #: Instances answered at a time.
 CHUNK = 50
+#: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
+#: linearised grid errs (docs/model.md).
+MARGIN = 0.01
+#: Weights that were learned for fewer iterations take long steps and do not serve many: the policy answers
+#: with them, and goes on with those where training starts.
+LEARNED_FOR = 10
 
 
-@dataclass(frozen=True, eq=False)
-class SharedPolicy:
-    """Learned settings of the iterations with all that is needed to apply them."""
+@dataclass(frozen=True)
+class Options:
+    """Parameters of `ded-admm`."""
 
-    scope: Scope
-    weights: Weights
-    training: dict[str, Any]  # facts of the training; `iterations` and `margin` shape answers
+    iterations: int = option(0, "iterations beyond the policy's own", lowest=0)
 
-    @staticmethod
-    def of(scope: Scope, unrolled: UnrolledIterations, training: dict[str, Any]) -> SharedPolicy:
-        """The policy that was trained in torch."""
-        facts = training | {"iterations": len(unrolled.start)}
-        return SharedPolicy(scope, weights_of(unrolled), facts)
+
+class AdmmPolicy(TrainedPolicy):
+    """Learned settings of iterations; `training` has their number, and perhaps a `margin` of the bound."""
+
+    method = "ded-admm"
 
     @functools.cached_property
-    def model(self) -> PathModel:
+    def grid(self) -> ModalGrid:
         """The grid as the policy sees it; its bound is tighter by the margin."""
-        case = self.scope.case
-        response = GridResponse.make(case, case.knot_times(self.scope.horizon_s))
-        bound = case.omega_bound(self.scope.regime) * (1.0 - float(self.training.get("margin", 0.0)))
-        return PathModel(case, bound, response)
-
-    @property
-    def knots(self) -> Array:
-        """Knot times, shape (n_knots,), s."""
-        return self.model.response.knots
+        case, margin = self.scope.case, float(self.training.get("margin", 0.0))
+        return ModalGrid(case, case.omega_bound(self.scope.regime) * (1.0 - margin), self.scope.horizon_s)
 
     @functools.cached_property
     def _compiled(self) -> CompiledIterations:
-        return CompiledIterations(self.model, self.weights, self.training["iterations"])
+        return CompiledIterations(
+            self.grid, self.grid.bound, self.weights["nodes"], self.training["iterations"]
+        )
 
-    def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
-        """Schedules of one instance or several, on the knots.
+    def further(self, iterations: int) -> CompiledIterations:
+        """So many iterations to go on with."""
+        few, nodes = self.training["iterations"] < LEARNED_FOR, self.weights["nodes"]
+        bound = (1.0 - MARGIN) * self.scope.case.omega_bound(self.scope.regime)
+        return CompiledIterations(self.grid, bound, np.zeros_like(nodes) if few else nodes, iterations)
 
-        Raises:
-            InputError: an instance belongs to another case or horizon, or its loads cannot be served.
-        """
-        batch = [instances] if isinstance(instances, Instance) else list(instances)
-        return [Schedule(self.knots, p) for p in self.powers(self.problems(batch))] if batch else []
+    def answers(self, instances: Sequence[Instance]) -> Array:
+        """See `TrainedPolicy.answers`."""
+        parts = (instances[i : i + CHUNK] for i in range(0, len(instances), CHUNK))
+        return np.concatenate([self.powers(self.problems(part)) for part in parts])
 
     def problems(self, instances: Sequence[Instance]) -> Problems:
-        """Instances as arrays; raises as a call does."""
+        """Instances as arrays; InputError if the policy is not for them, or they cannot be served."""
         self.scope.check(instances)
         try:
-            return Problems.of(self.scope.case, instances, self.model.response.fine)
+            return Problems.of(self.scope.case, instances, self.grid.points)
         except PowerFlowError as error:
             raise InputError(f"instance {instances[0].id}", "initial", str(error)) from None
 
-    def powers(self, problems: Problems) -> Array:
-        """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
-        if len(problems) > CHUNK:
-            starts = range(0, len(problems), CHUNK)
-            return np.concatenate([self.powers(problems[i : i + CHUNK]) for i in starts])
-        outset = self.model.outset(problems)
-        return self.answer(outset, self.model.linearise(outset, self.model.start_path(outset)))
+    def powers(self, problems: Problems, further: CompiledIterations | None = None) -> Array:
+        """Generator powers at the knots, shape (batch, n_knots, n_gen), pu.
 
-    def answer(self, outset: Outset, linear: Linear) -> Array:
-        """As `powers`, where the grid along the path of the first schedule is known."""
-        return self._compiled(outset, linear, outset.start)
-
-    def save(self, path: Path) -> None:
-        """Write weights and header."""
-        write_policy(path, METHOD, self.scope, self.weights, self.training)
+        Args:
+            problems: to answer.
+            further: go on with these, on the grid linearised along the trajectory of the policy's answer.
+        """
+        grid = self.grid
+        start = grid.start(problems)
+        linear = grid.along_first(start)
+        answer = self._compiled(start, linear, start.schedule)
+        if further is None:
+            return answer
+        return further(start, grid.along(start, grid.respond(answer, start, linear)[0]), answer)
 
     @staticmethod
-    def load(path: str | Path, case: Case, regime: str) -> SharedPolicy:
-        """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
-        arrays, scope, training = read_policy(path, METHOD, case, regime)
-        iterations = training.get("iterations")
+    def shapes(
+        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[int, ...]]:
+        """See `TrainedPolicy.shapes`."""
+        iterations, margin = training.get("iterations"), training.get("margin", 0.0)
         if not (isinstance(iterations, int) and 0 < iterations < 1000):
-            raise InputError(path, "training", "number of iterations is missing or mistyped")
-        return SharedPolicy(scope, checked_weights(arrays, weight_shapes(), path), training)
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change when any weight does."""
-        return weights_fingerprint(self.weights)
-
-
-def find_policy(case: Case, regime: str, settings: Settings) -> SharedPolicy:
-    """Load the policy that settings and folders to search name.
-
-    Raises:
-        InputError: there is none yet (names the command that trains one), or it does not fit.
-    """
-    return SharedPolicy.load(find_policy_file(METHOD, case, regime, settings), case, regime)
+            raise ValueError("number of iterations is missing or mistyped")
+        if not (isinstance(margin, int | float) and 0.0 <= margin < 1.0):
+            raise ValueError("margin is no fraction")
+        return weight_shapes()
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The policy that `prepare` would use."""
-    path = find_policy_file(METHOD, case, regime, settings)
-    return (Artifact("policy", METHOD, SharedPolicy.load(path, case, regime).fingerprint, path),)
+    return (AdmmPolicy.artifact(case, regime, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return the policy as a method."""
-    return method(find_policy(case, regime, settings))
+    """Return the policy as a method.
+
+    Raises:
+        InputError: there is no policy (names the command that trains one), or it does not fit.
+    """
+    policy = AdmmPolicy.find(case, regime, settings)
+    iterations = read_options(Options, settings.options).iterations
+    further = policy.further(iterations) if iterations else None
+
+    def answer(instance: Instance) -> Schedule:
+        return Schedule(policy.knots, policy.powers(policy.problems([instance]), further)[0])
+
+    return as_solver(policy.scope, answer, iterations or None)

@@ -1,38 +1,36 @@
-"""Train the shared policy on problems drawn afresh for every step; no solution is needed."""
+"""Train `ded-admm` on problems drawn afresh for every step; no solution is needed, and no surrogate."""
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import math
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
+from torch import Tensor
 
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import weight_shapes
-from ded_bench.methods.admm.admm_iterations import UnrolledIterations
-from ded_bench.methods.admm.admm_loss import MARGIN, ScheduleLoss
-from ded_bench.methods.admm.admm_margin import with_margin
-from ded_bench.methods.admm.admm_policy import METHOD, SharedPolicy
-from ded_bench.methods.admm.drawn_problems import Problems, draw
-from ded_bench.methods.admm.grid_response import GridResponse
-from ded_bench.methods.admm.iteration_records import PRICE
-from ded_bench.methods.admm.path_model import Outset, PathModel
-from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint
-from ded_bench.methods.training_device import reading_checkpoint, repeatable, save_checkpoint
-from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+from ded_bench.methods.admm.admm_kernels import PRICE
+from ded_bench.methods.admm.admm_policy import AdmmPolicy
+from ded_bench.methods.admm.modal_grid import ModalGrid, Start
+from ded_bench.methods.admm.problems import Problems, draw
+from ded_bench.methods.admm.torch_iterations import ScheduleLoss, TorchIterations
+from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint, weights_of
+from ded_bench.methods.training_record import TrainingOptions
+from ded_bench.methods.training_run import TrainingRun, repeatable
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
-from ded_bench.surrogates.koopman import Koopman
+from ded_bench.problem.schedule import Schedule
 
+#: Weights fit every grid: training may start from another's.
+TAKES_START = True
 #: Iterations of an answer: the fewest, and times generators on small grids, where they take less time. Where
 #: the bound on |ω| is loose, schedules are shaped by ramps, and a few iterations go almost as far.
 TIGHT, LOOSE = (14, 60), (3, 30)
@@ -42,97 +40,60 @@ RAMPING = 0.1
 STEPS, EPOCHS = 100, 8
 #: Problems of a step: so many that generators times knots of all are near the first number.
 ROWS, SMALLEST_BATCH = 4000, 8
-LEARNING_RATE, CLIP_NORM = 0.1, 1.0
-#: Fractions of the training: warm-up of the learning rate, then a cosine down to `LAST` of it.
-WARM_UP, LAST = 0.02, 1e-3
-AVERAGE = 0.998  # of the weights, exponentially
+LEARNING_RATE = 0.1
+#: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
+MARGIN = 0.015
 #: Penalty, as a part of an instance's cost, of which half counts: a few instances have no feasible schedule,
 #: and would else be all that is learned from.
 HOPELESS = 0.1
 #: Most instances on which weights are compared.
 HELD_OUT = 100
-PROGRESS = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
-
-
-@dataclass(frozen=True)
-class Variant:
-    """What a training may choose."""
-
-    iterations: int | None = None  # see `iterations_of`
-    rate: float = LEARNING_RATE
-    price: float = PRICE  # of the penalty
-
-
-def iterations_of(model: PathModel) -> int:
-    """Iterations of an answer, by the size of a case and how tight its bound is."""
-    rates = model.ramp / (np.diag(model.response.stiffness) * model.spacing)
-    fewest, rounds = LOOSE if np.median(rates) < RAMPING * model.bound else TIGHT
-    return max(fewest, rounds // len(rates))
-
-
-def batch_of(case: Case) -> int:
-    """Problems of a step, by the size of a case."""
-    return max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
+#: Margins of the answering policy that are tried by simulation, as fractions of the bound, in this order.
+MARGINS = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.2, 0.25)
+#: The first that keeps so large a part of the instances within the scorer's tolerance is taken.
+WANTED = 0.98
+#: So many margins after the best so far, none better, end the search.
+PATIENCE = 3
+#: Most instances that are simulated with each margin.
+SIMULATED = 50
 
 
 @repeatable()
 def train(
-    case: Case,
-    regime: str,
-    instances: Sequence[Instance],
-    model: Koopman,
-    out: Path,
-    options: TrainingOptions,
-    /,
-    *,
-    epochs: int = EPOCHS,
-    **variant: Any,
-) -> SharedPolicy:
-    """Train a policy; see `training_record.Trainer`. The grid itself is the model: `model` is not used.
+    case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
+) -> AdmmPolicy:
+    """Train a policy; see `training_record.Trainer`.
 
     Args:
-        instances: choose the best weights, and are never trained on.
-        variant: fields of `Variant`.
+        instances: choose the best weights and the margin, and are never trained on.
     """
-    chosen = Variant(**variant)
-    del model
-    if options.device != "cpu":
-        raise InputError("--device", options.device, f"{METHOD} is trained on the CPU")
     horizon = instances[0].horizon_s
-    response = GridResponse.make(case, case.knot_times(horizon))
-    path_model = PathModel(case, case.omega_bound(regime), response)
-    unrolled = UnrolledIterations(path_model, chosen.iterations or iterations_of(path_model))
+    grid = ModalGrid(case, case.omega_bound(regime), horizon)
+    network = TorchIterations(grid, iterations_of(grid))
     start = read_start(options.start) if options.start else None
     if start is not None:
-        unrolled.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
-    check = path_model.outset(Problems.of(case, instances[:HELD_OUT], response.fine))
-    run = _Run(unrolled, options.seed, chosen, batch_of(case), checkpoint_file(out))
-    if options.resume and run.checkpoint.is_file():
-        run.load()
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
+    check = grid.start(Problems.of(case, instances[:HELD_OUT], grid.points))
+    run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
-        run.go(check, epochs, options.seconds, f"{METHOD} {regime}")
-    unrolled.load_state_dict(run.best_weights)
-    training = {
-        "seed": options.seed,
-        "epochs": run.epoch,
-        "steps": run.step,
+        facts = run.train(options, EPOCHS, f"{AdmmPolicy.method} {regime}")
+    facts |= {
         "batch": run.batch,
-        "seconds": run.spent,
-        "cpu_seconds": run.busy,
         "instances": run.step * run.batch,
         "held_out": len(check.served),
-        "held_out_loss": run.best,
-        "parameters": sum(p.numel() for p in unrolled.parameters()),
-        "price": chosen.price,
         "start": weights_fingerprint(start) if start is not None else "",
-        "torch": torch.__version__,
-        "code": options.code,
-        "device": options.device,
+        "iterations": len(network.start),
     }
-    policy = with_margin(SharedPolicy.of(Scope(case, regime, horizon), unrolled, training), instances)
+    policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights_of(network), facts), instances)
     policy.save(out)
-    write_history(out, run.history)
     return policy
+
+
+def iterations_of(grid: ModalGrid) -> int:
+    """Iterations of an answer, by the size of a case and how tight its bound is."""
+    rates = grid.ramp / (np.diag(grid.stiffness) * grid.spacing)
+    fewest, rounds = LOOSE if np.median(rates) < RAMPING * grid.bound else TIGHT
+    return max(fewest, rounds // len(rates))
 
 
 def read_start(path: Path) -> Weights:
@@ -142,103 +103,74 @@ def read_start(path: Path) -> Weights:
         InputError: the file is wrong, or a policy of another method.
     """
     arrays, header = read_arrays(path)
-    if header.get("method") != METHOD:
-        raise InputError(path, "method", f"is no {METHOD} policy")
+    if header.get("method") != AdmmPolicy.method:
+        raise InputError(path, "method", f"is no {AdmmPolicy.method} policy")
     return checked_weights(arrays, weight_shapes(), path)
 
 
-class _Run:
-    """The state of one training: iterations, average of their weights, optimiser, progress."""
+class _AdmmTraining(TrainingRun):
+    def __init__(self, network: TorchIterations, check: Start, seed: int, out: Path) -> None:
+        optimiser = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99))
+        super().__init__(network, optimiser, seed, out)
+        case = network.grid.case
+        self.grid, self.check, self.seed = network.grid, check, seed
+        self.batch = max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
+        self.judge = ScheduleLoss(network.grid)
 
-    def __init__(
-        self, unrolled: UnrolledIterations, seed: int, chosen: Variant, batch: int, checkpoint: Path
-    ) -> None:
-        self.unrolled, self.seed, self.batch, self.checkpoint = unrolled, seed, batch, checkpoint
-        self.rate, self.price = chosen.rate, chosen.price
-        self.loss = ScheduleLoss(unrolled.model)
-        self.average = copy.deepcopy(unrolled)
-        self.optimiser = torch.optim.Adam(unrolled.parameters(), lr=chosen.rate, betas=(0.9, 0.99))
-        self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
-        self.best, self.best_weights = math.inf, copy.deepcopy(unrolled.state_dict())
-        self.history: list[dict[str, float]] = []
+    def batches(self) -> Sequence[int]:
+        """Seeds of the steps: a training that goes on draws what it would have drawn."""
+        return range(self.step, self.step + STEPS)
 
-    def go(self, check: Outset, epochs: int, seconds: float | None, title: str) -> None:
-        """Train until the epochs are done or the time is over."""
-        started, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
-        progress = self.epoch / epochs
-        with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
-            while progress < 1.0:
-                for i in range(1, STEPS + 1):
-                    self._update(progress)
-                    self.spent, self.busy = time.perf_counter() - started, time.process_time() - busy
-                    progress = (self.epoch + i / STEPS) / epochs
-                    if seconds is not None and (progress := max(progress, self.spent / seconds)) >= 1.0:
-                        break
-                self.epoch += 1
-                bar.update()
-                row = self._validate(check)
-                bar.set_postfix_str(f"cost {row['cost']:.5f}, excess {row['max excess']:.1e}")
-                self._save()
+    def loss(self, step: int, progress: float) -> Tensor | None:
+        """Cost and priced penalty of fresh draws."""
+        generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, step]))
+        start = self.grid.start(draw(self.grid.case, self.grid.bound, self.grid.points, self.batch, generator))
+        judged = self.judge(start, self.network(start), MARGIN)
+        used = torch.as_tensor(start.served)
+        penalty = PRICE * judged.penalty
+        return (judged.cost + penalty / (1.0 + penalty / HOPELESS))[used].mean() if used.any() else None
 
-    def _update(self, progress: float) -> None:
-        falling = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.rate * falling * min(1.0, 0.05 + progress / WARM_UP)
-        model = self.unrolled.model
-        # a generator of its own for every step: a training that goes on draws what it would have drawn
-        generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, self.step]))
-        outset = model.outset(draw(model.case, model.bound, model.response.fine, self.batch, generator))
-        judged = self.loss(outset, self.unrolled(outset), MARGIN)
-        self.step += 1
-        used = torch.as_tensor(outset.served)
-        if not used.any():
-            return
-        self.optimiser.zero_grad(set_to_none=True)
-        penalty = self.price * judged.penalty
-        torch.autograd.backward((judged.cost + penalty / (1.0 + penalty / HOPELESS))[used].mean())
-        norm = torch.nn.utils.clip_grad_norm_(self.unrolled.parameters(), CLIP_NORM)
-        if not torch.isfinite(norm):
-            return
-        self.optimiser.step()
-        keep = min(AVERAGE, 1.0 - 1.0 / (1.0 + self.step / 10.0))
-        with torch.no_grad():
-            torch._foreach_lerp_(
-                list(self.average.parameters()), list(self.unrolled.parameters()), 1.0 - keep
-            )
-
-    def _validate(self, check: Outset) -> dict[str, float]:
-        with torch.no_grad():
-            outcome = self.average(check)
-            tight, own = (self.loss(check, outcome, margin) for margin in (MARGIN, 0.0))
-        value = float((tight.cost + self.price * tight.penalty).mean())
-        hertz = own.excess * self.loss.model.bound / (2 * math.pi)
-        row = {
-            "epoch": self.epoch,
-            "step": self.step,
-            "seconds": self.spent,
-            "held out": value,
+    def look(self) -> dict[str, float]:
+        """Loss of the average, its cost, and what it exceeds, Hz."""
+        answer = self.average(self.check)
+        tight, own = (self.judge(self.check, answer, margin) for margin in (MARGIN, 0.0))
+        hertz = own.excess * self.grid.bound / (2 * math.pi)
+        return {
+            "held out": float((tight.cost + PRICE * tight.penalty).mean()),
             "cost": float(own.cost.mean()),
-            "mean excess": float(hertz.mean()),  # Hz, as the next
+            "mean excess": float(hertz.mean()),
             "max excess": float(hertz.max()),
         }
-        self.history.append(row)
-        if value < self.best:
-            self.best, self.best_weights = value, copy.deepcopy(self.average.state_dict())
-        return row
 
-    def _save(self) -> None:
-        state: dict[str, Any] = {name: getattr(self, name) for name in PROGRESS}
-        state |= {name: getattr(self, name).state_dict() for name in ("unrolled", "average", "optimiser")}
-        save_checkpoint(self.checkpoint, state)
 
-    def load(self) -> None:
-        """Go on from the checkpoint.
+def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy:
+    """The policy with the least margin that makes enough of its schedules feasible on the true system.
 
-        Raises:
-            InputError: it is no checkpoint, or one of another training.
-        """
-        with reading_checkpoint(self.checkpoint, "cpu") as state:
-            for name in ("unrolled", "average", "optimiser"):
-                getattr(self, name).load_state_dict(state[name])
-            for name in PROGRESS:
-                setattr(self, name, state[name])
+    Where no margin does, the one with most feasible schedules of those tried, and of several the least.
+
+    Args:
+        policy: trained; its margin so far counts for nothing.
+        instances: not those that it will be judged on. Those that cannot be scored count as infeasible.
+    """
+    found: list[tuple[float, AdmmPolicy]] = []
+    for margin in MARGINS:
+        tried = dataclasses.replace(policy, training=policy.training | {"margin": margin})
+        share = _feasible_share(tried, instances[:SIMULATED])
+        facts = tried.training | {"margin_feasible": share, "margin_instances": len(instances[:SIMULATED])}
+        found.append((share, dataclasses.replace(tried, training=facts)))
+        best = max(found, key=lambda pair: pair[0])
+        if share >= WANTED or len(found) - found.index(best) > PATIENCE:
+            break
+    return best[1]
+
+
+def _feasible_share(policy: AdmmPolicy, instances: Sequence[Instance]) -> float:
+    pairs = zip(instances, policy(instances), strict=True)
+    return sum(_feasible(policy.scope, *pair) for pair in pairs) / len(instances)
+
+
+def _feasible(scope: Scope, instance: Instance, schedule: Schedule) -> bool:
+    try:
+        return score(scope.case, instance, schedule, scope.regime).feasible
+    except SimulationError:
+        return False

@@ -9,14 +9,15 @@ so that bounds, ramps and P_0 hold after any number of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.methods.dpc.kernels import OmegaModel, predict
 from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled
 from ded_bench.surrogates.condensed import CondensedRollout
 from ded_bench.surrogates.linear import linear_model
 
@@ -31,6 +32,15 @@ AIM = 0.003
 DAMPING = 0.1
 #: Most steps; on validation instances one to four, hardly ever more than ten.
 STEPS = 30
+
+
+class OmegaModel(NamedTuple):
+    """What ω does under powers and loads linear between points; deviations from rest advance by `advance`."""
+
+    advance: Array  # (n_psi, n_psi), over one point; ω is the first n_gen of the deviations
+    of_delta: Array  # (n_psi, n_gen), per rad of δθ at t = 0
+    of_power: Array  # (n_psi, n_gen), per pu that a power changes from one point to the next
+    of_load: Array  # (n_psi, n_load), likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +75,7 @@ class BoundKeeper:
         step = case.ramp * (knots[1] - knots[0])
         return BoundKeeper(case, model, float(points[1]), limit, of_power, damping, step)
 
-    def __call__(self, inputs: Inputs, p_gen: Array) -> Array:
+    def __call__(self, inputs: StackedInstances, p_gen: Array) -> Array:
         """Schedules that keep the bound, as far as the linearised grid tells and the limits let them.
 
         Args:
@@ -77,9 +87,8 @@ class BoundKeeper:
         """
         by_generator = np.ascontiguousarray(p_gen.swapaxes(1, 2))
         omega = np.empty((*by_generator.shape[:2], len(self.limit)))
-        if not predict(
-            inputs.load, inputs.state, by_generator, self.model, self.limit, self.spacing_s, omega
-        ):
+        state = np.concatenate([inputs.delta, inputs.omega], axis=1)
+        if not predict(inputs.load, state, by_generator, self.model, self.limit, self.spacing_s, omega):
             return p_gen
         kept = p_gen.copy()
         for b in np.flatnonzero((np.abs(omega) > self.limit).any(axis=(1, 2))):
@@ -112,3 +121,69 @@ class BoundKeeper:
 
     def _excess(self, omega: Array) -> float:
         return float((np.maximum(np.abs(omega) - self.limit, 0.0) ** 2).sum())
+
+
+@compiled
+def predict(
+    load: Array, state: Array, p_gen: Array, model: OmegaModel, limit: Array, spacing: float, omega: Array
+) -> bool:
+    """What the linearised grid does to ω under schedules.
+
+    Args:
+        load: segments of a batch, see `StackedInstances`.
+        state: (δθ, ω) at t = 0, (batch, 2 n_gen), rad and rad/s.
+        p_gen: (batch, n_gen, n_knots), pu.
+        model: the linearised grid.
+        limit: of |ω| at the points, (n_points,), rad/s; a whole number of points makes an interval of knots.
+        spacing: of the points, s.
+        omega: receives ω at the points, (batch, n_gen, n_points), rad/s.
+
+    Returns:
+        Whether any |ω| exceeds its limit.
+    """
+    n_psi, n_gen = model.of_power.shape
+    n_points, parts, exceeds = len(limit), (len(limit) - 1) // (p_gen.shape[2] - 1), False
+    pushes, psi, power = np.empty((n_points, n_psi)), np.empty(n_psi), np.empty(n_psi)
+    for b in range(len(p_gen)):
+        _load_pushes(load[b], model.of_load, spacing, pushes)
+        for i in range(n_psi):
+            psi[i] = state[b, n_gen + i] if i < n_gen else 0.0
+            for g in range(n_gen):
+                psi[i] += model.of_delta[i, g] * state[b, g]
+        for k in range(n_points):
+            if k and (k - 1) % parts == 0:
+                j = (k - 1) // parts
+                power[:] = 0.0
+                for g in range(n_gen):
+                    change = (p_gen[b, g, j + 1] - p_gen[b, g, j]) / parts
+                    for i in range(n_psi):
+                        power[i] += model.of_power[i, g] * change
+            if k:
+                push = pushes[k]
+                for i in range(n_psi):
+                    push[i] += power[i]
+                    for m in range(n_psi):
+                        push[i] += model.advance[i, m] * psi[m]
+                psi[:] = push
+            for g in range(n_gen):
+                omega[b, g, k] = psi[g]
+                exceeds |= abs(psi[g]) > limit[k]
+    return exceeds
+
+
+@compiled
+def _load_pushes(load: Array, of_load: Array, spacing: float, pushes: Array) -> None:
+    """What changes of an instance's loads from one point to the next add to the state, (n_points, n_psi)."""
+    pushes[:] = 0.0
+    for i in range(len(load)):
+        segments, following = load[i], 0
+        before = segments[0, 1]
+        for k in range(len(pushes)):
+            t = k * spacing
+            while following < len(segments) and segments[following, 0] <= t:
+                following += 1
+            value = segments[following - 1, 1] + segments[following - 1, 2] * (t - segments[following - 1, 0])
+            if value != before:
+                for n in range(len(of_load)):
+                    pushes[k, n] += of_load[n, i] * (value - before)
+                before = value

@@ -7,17 +7,33 @@ one product of matrices. Normalisation of the inputs is part of the first one.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.dpc.inputs import Channels, n_channels
-from ded_bench.methods.dpc.kernels import NetworkInputs, PowerLimits, StageWeights, correct
-from ded_bench.methods.dpc.response import Response
+from ded_bench.methods.dpc.channels import Array32, Channels, Response, n_channels
 from ded_bench.methods.ramp_follower import track
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled
 
 #: Width of the layer that constants of an instance pass through.
 EMBEDDING = 64
+
+
+class StageWeights(NamedTuple):
+    """Weights of all stages, each with the stage as its first axis."""
+
+    mean: Array32  # of the inputs, which stands beyond the first and the last knot
+    enter: Array32
+    enter_bias: Array32
+    embed: Array32
+    embed_bias: Array32
+    first: Array32
+    spread: Array32
+    mix: Array32
+    mix_bias: Array32
+    last: Array32
+    last_bias: Array32
 
 
 class CompiledStages:
@@ -32,35 +48,33 @@ class CompiledStages:
         self._weights = StageWeights(
             *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
         )
-        self._limits = PowerLimits(case.p_min, case.p_max)
-        self._step = case.ramp * (response.knots[1] - response.knots[0])
+        self._limits = case.p_min, case.p_max, case.ramp * (response.knots[1] - response.knots[0])
         self._of_power, self._dilations = response.of_power, np.array(dilations)
 
     def __call__(self, channels: Channels) -> Array:
         """Powers at the knots, (batch, n_knots, n_gen), pu."""
         p_gen = channels.start.swapaxes(1, 2).copy()
-        seen = NetworkInputs(
-            channels.constants.astype(np.float32),
-            channels.sequence.swapaxes(1, 2),
-            channels.free_response.swapaxes(1, 2),
-        )
+        constants = channels.constants.astype(np.float32)
+        sequence, free = channels.sequence.swapaxes(1, 2), channels.free_response.swapaxes(1, 2)
         for stage in range(len(self._weights.mean)):
-            correct(p_gen, stage, seen, self._of_power, self._limits, self._dilations, self._weights)
-            track(p_gen, self._step)
+            add_corrections(
+                p_gen, stage, constants, sequence, free, self._of_power, self._dilations, self._weights
+            )
+            track(p_gen.swapaxes(1, 2), *self._limits)
         return p_gen.swapaxes(1, 2)
 
 
-def weight_shapes(
-    case: Case, n_outputs: int, stages: int, width: int, n_blocks: int
-) -> dict[str, tuple[int, ...]]:
+def weight_shapes(case: Case, stages: int, width: int, n_blocks: int) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a StagedNetwork's weights, in the order of its state dict.
 
     Args:
-        n_outputs: of the response, per knot.
+        case: gives the number of channels.
+        stages: of the network; likewise `width`.
+        width: channels of the hidden layers.
         n_blocks: how many dilations there are.
     """
     n_gen, (n_sequence, n_constants) = len(case.generators), n_channels(case)
-    n_seen = n_gen + n_outputs + n_sequence
+    n_seen = n_gen + 2 * (n_gen + 1) + n_sequence
     stage: dict[str, tuple[int, ...]] = {
         "sequence_mean": (n_seen,),
         "sequence_scale": (n_seen,),
@@ -111,5 +125,115 @@ def _matrices(state: Mapping[str, np.ndarray], n_blocks: int, half: Array) -> St
 
 
 def _windows(weight: np.ndarray) -> np.ndarray:
-    """A convolution's weight (out, in, 3) as a matrix for `kernels._gather`, (out, 3 in)."""
+    """A convolution's weight (out, in, 3) as a matrix for `_gather`, (out, 3 in)."""
     return weight.transpose(0, 2, 1).reshape(len(weight), -1)
+
+
+@compiled
+def add_corrections(
+    p_gen: Array,
+    s: int,
+    constants: Array32,
+    sequence: Array,
+    free_response: Array32,
+    of_power: Array32,
+    dilations: Array,
+    weights: StageWeights,
+) -> None:
+    """Add the corrections of one stage to the schedules of a batch, which then are targets.
+
+    Args:
+        p_gen: (batch, n_gen, n_knots), pu; receives the targets, beside P_0.
+        s: the stage.
+        constants: see `Channels`, (batch, n_constants).
+        sequence: likewise, (batch, n_sequence, n_knots).
+        free_response: likewise, (batch, n_outputs, n_knots).
+        of_power: see `Response`.
+        dilations: of the convolutions of each stage.
+        weights: of all stages.
+    """
+    mean, enter, enter_bias, embed, embed_bias, first, spread, mix, mix_bias, last, last_bias = weights
+    _, n_gen, n = p_gen.shape
+    width, n_in = first.shape[1], mean.shape[1]
+    n_seen, margin = n_gen + free_response.shape[1], dilations.max()
+    p32, forced = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
+    inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
+    input_columns, columns = np.empty((3 * n_in, n), np.float32), np.empty((3 * width, n), np.float32)
+    inner, change = np.empty((width, n), np.float32), np.empty((width, n), np.float32)
+    embedded, bias = np.empty(enter.shape[1], np.float32), np.empty(embed.shape[1], np.float32)
+    corrections = np.empty((n_gen, n), np.float32)
+    for b in range(len(p_gen)):
+        np.dot(enter[s], constants[b], embedded)
+        for i in range(len(embedded)):
+            embedded[i] = max(embedded[i] + enter_bias[s, i], np.float32(0.0))
+        np.dot(embed[s], embedded, bias)
+        for i in range(len(bias)):
+            bias[i] += embed_bias[s, i]
+        # what the stage sees: the schedule so far, its response, the instance
+        for i in range(n_in):
+            inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
+        for g in range(n_gen):
+            _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
+            _copy(p_gen[b, g], inputs[g, 1 : n + 1])
+        np.dot(p32, of_power, forced)
+        for i in range(n_gen, n_seen):
+            row, output = inputs[i, 1 : n + 1], i - n_gen
+            free, due = free_response[b, output], forced[output * n :]
+            for j in range(n):
+                row[j] = free[j] + due[j]
+        for i in range(n_seen, n_in):
+            _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
+        # its corrections
+        _gather(inputs, 1, input_columns)
+        np.dot(first[s], input_columns, change)
+        for o in range(width):
+            row = hidden[o, margin : margin + n]
+            for j in range(n):
+                row[j] = change[o, j] + bias[o]
+        for i in range(len(dilations)):
+            _gather(hidden, dilations[i], columns)
+            np.dot(spread[s, i], columns, inner)
+            _add_and_rectify(inner, bias[(1 + i) * width : (2 + i) * width])
+            np.dot(mix[s, i], inner, change)
+            for o in range(width):
+                row = hidden[o, margin : margin + n]
+                for j in range(n):
+                    row[j] += change[o, j] + mix_bias[s, i, o]
+        for o in range(width):
+            row = hidden[o, margin : margin + n]
+            for j in range(n):
+                inner[o, j] = max(row[j], np.float32(0.0))
+        np.dot(last[s], inner, corrections)
+        for g in range(n_gen):
+            for j in range(1, n):
+                p_gen[b, g, j] = p_gen[b, g, j] + corrections[g, j] + last_bias[s, g]
+
+
+# Loops run over views of one row: of elements by two indices Numba makes no vector instructions.
+
+
+@compiled
+def _copy(values: Array | Array32, out: Array32) -> None:
+    """From one row to another; in float32."""
+    for j in range(len(out)):
+        out[j] = values[j]
+
+
+@compiled
+def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
+    """What a convolution sees at each knot: those `dilation` before, themselves, those after."""
+    n_channels, n = len(padded), columns.shape[1]
+    first = (padded.shape[1] - n) // 2 - dilation
+    for tap in range(3):
+        at = first + tap * dilation
+        for i in range(n_channels):
+            _copy(padded[i, at : at + n], columns[tap * n_channels + i])
+
+
+@compiled
+def _add_and_rectify(values: Array32, bias: Array32) -> None:
+    """ReLU(values + bias), in place."""
+    for o in range(len(values)):
+        row, own = values[o], bias[o]
+        for j in range(len(row)):
+            row[j] = max(row[j] + own, np.float32(0.0))

@@ -8,7 +8,6 @@ every layer. Here it is for training, in torch; `inference` is the same function
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -16,37 +15,38 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from ded_bench.methods.dpc.differentiable_follower import Clip, Follow
+from ded_bench.methods.dpc.channels import Channels, Response, n_channels
 from ded_bench.methods.dpc.inference import EMBEDDING
-from ded_bench.methods.dpc.inputs import Channels, n_channels, sequence_groups
-from ded_bench.methods.dpc.response import Response
+from ded_bench.methods.torch_follower import follow_within
 from ded_bench.problem.case import Array, Case
 
 STAGES, WIDTH = 2, 24
 #: With windows of three these dilations reach 16 knots to either side, in each stage.
 DILATIONS = (1, 2, 4, 8)
-#: Channels divided by this are no input any more.
-HIDDEN_SCALE = 1e30
 
 
 class StagedNetwork(nn.Module):
     """Schedules from channels: corrected and followed once per stage; differentiable."""
 
-    def __init__(self, case: Case, response: Response, stages: int, width: int, dilations: tuple[int, ...]):
+    def __init__(
+        self,
+        case: Case,
+        response: Response,
+        stages: int = STAGES,
+        width: int = WIDTH,
+        dilations: tuple[int, ...] = DILATIONS,
+    ) -> None:
         super().__init__()
-        n_gen = len(case.generators)
-        n_seen = n_gen + response.n_outputs
+        n_gen, n_knots = len(case.generators), len(response.knots)
         n_sequence, n_constants = n_channels(case)
+        n_seen = n_gen + response.n_outputs + n_sequence
         self.stages = nn.ModuleList(
-            ResidualNetwork(n_seen + n_sequence, n_constants, n_gen, width, dilations) for _ in range(stages)
+            ResidualNetwork(n_seen, n_constants, n_gen, width, dilations) for _ in range(stages)
         )
-        self.groups = {"response": slice(n_gen, n_seen)}
-        for name, part in sequence_groups(case).items():
-            self.groups[name] = slice(n_seen + part.start, n_seen + part.stop)
-        self.response, self.dilations = response, dilations
+        self.response = response
+        #: Facts that the policy's file needs.
         self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
         step = case.ramp * (response.knots[1] - response.knots[0])
-        n_knots = len(response.knots)
         by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
         of_power = by_knot.reshape(n_knots * n_gen, -1)
         buffers = {"of_power": of_power, "low": case.p_min, "high": case.p_max, "step": step}
@@ -65,20 +65,14 @@ class StagedNetwork(nn.Module):
         for stage in self.stages:
             cast(ResidualNetwork, stage).normalise(sequence, channels.constants)
 
-    def hide(self, groups: Sequence[str]) -> None:
-        """Scale groups of channels to nothing: `response`, or one of `inputs.sequence_groups`."""
-        for stage in self.stages:
-            for name in groups:
-                cast(ResidualNetwork, stage).sequence_scale[self.groups[name]] = HIDDEN_SCALE
-
     def forward(self, start: Tensor, free: Tensor, sequence: Tensor, constants: Tensor) -> Tensor:
         """Powers at the knots, (batch, n_knots, n_gen), pu, from `Channels` in float32."""
         p_gen, half = start, 0.5 * (self.high - self.low)
         for stage in self.stages:
             seen = free + (p_gen.flatten(1) @ self.of_power).view_as(free)
             corrections = stage(torch.cat([p_gen, seen, sequence], dim=2), constants)
-            targets = Clip.apply((p_gen + half * corrections)[:, 1:], self.low, self.high)  # type: ignore[no-untyped-call]
-            p_gen = Follow.apply(targets, start[:, 0], self.step)  # type: ignore[no-untyped-call]
+            targets = (p_gen + half * corrections)[:, 1:]
+            p_gen = follow_within(targets, start[:, 0], self.low, self.high, self.step)
         return p_gen
 
 
@@ -91,7 +85,7 @@ class ResidualNetwork(nn.Module):
 
     def __init__(self, n_sequence: int, n_constants: int, n_gen: int, width: int, dilations: tuple[int, ...]):
         super().__init__()
-        self.width, self.dilations = width, dilations
+        self.width = width
         self.first = nn.Conv2d(n_sequence, width, (1, 3), padding=(0, 1))
         self.embed = nn.Sequential(
             nn.Linear(n_constants, EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, width * (1 + len(dilations)))

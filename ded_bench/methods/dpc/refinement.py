@@ -17,16 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.dpc.coarse_rollout import coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.inputs import Inputs
 from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.condensed import CondensedRollout, free_response
 from ded_bench.surrogates.koopman import Koopman
 
 Array32 = NDArray[np.float32]
-STEPS = 200
+#: Spacing of the points at which P_s and ω are taken, s. Frequencies are below 0.25 Hz.
 SPACING_S = 0.2
 #: Penalty weights of the split: P_s (pu), ω (in units of its bound), ramps and powers (pu).
 WEIGHTS = {"p_slack": 0.1, "omega": 0.003, "ramp": 1.0, "power": 1.0}
@@ -36,7 +35,6 @@ DUAL_STEP = 1.6
 MARGIN = 0.01
 #: How much worse an answer counts per relative unit of its largest excess of |ω|, relative to its cost.
 EXCESS_PRICE = 1.0
-CHUNK = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +102,7 @@ class Refiner:
             bound,
         )
 
-    def __call__(self, inputs: Inputs, p_gen: Array, steps: int = STEPS) -> Array:
+    def __call__(self, inputs: StackedInstances, p_gen: Array, steps: int) -> Array:
         """Improve schedules.
 
         Args:
@@ -115,10 +113,6 @@ class Refiner:
         Returns:
             As `p_gen`; an instance whose steps led to nothing better keeps what it had.
         """
-        parts = [slice(start, start + CHUNK) for start in range(0, len(inputs), CHUNK)]
-        return np.concatenate([self._refine(inputs[part], p_gen[part], steps) for part in parts])
-
-    def _refine(self, inputs: Inputs, p_gen: Array, steps: int) -> Array:
         batch, n_knots, n_gen = p_gen.shape
         n, n_rows = self.n_slack, len(self.rows)
         free = coarse_free_response(self.network, self.model, inputs, self.grid, self.stride)
@@ -154,7 +148,7 @@ class Refiner:
         better = self._merit(inputs, fixed, refined) < self._merit(inputs, fixed, p_gen)
         return np.where(better[:, None, None], refined, p_gen)
 
-    def _merit(self, inputs: Inputs, fixed: Array32, p_gen: Array) -> Array:
+    def _merit(self, inputs: StackedInstances, fixed: Array32, p_gen: Array) -> Array:
         """Cost, raised in proportion to the largest excess of |ω| over its bound, shape (batch,)."""
         batch, _, n_gen = p_gen.shape
         n = self.n_slack
@@ -165,3 +159,22 @@ class Refiner:
         generators = (np.einsum("bkg,k->bg", p_gen, self.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
         cost = generators + inputs.cost[:, 0] * (np.abs(p_slack) @ self.quadrature_weights)
         return np.asarray(cost * (1.0 + EXCESS_PRICE * np.maximum(omega - (1.0 - 0.5 * MARGIN), 0.0)))
+
+
+def coarse_stride(dt_s: float, steps: int, spacing_s: float) -> int:
+    """Largest divisor of the number of steps that keeps to a spacing."""
+    most = max(1, round(spacing_s / dt_s))
+    return next(s for s in range(most, 0, -1) if steps % s == 0)
+
+
+def coarse_free_response(
+    network: Network, model: Koopman, inputs: StackedInstances, grid: Array, stride: int
+) -> Array32:
+    """`condensed.free_response` of instances, (batch, n_gen + 1, n_coarse), float32."""
+    p_load = inputs.p_load(grid)
+    theta = network.power_flow(inputs.p_initial, p_load[:, 0])
+    if inputs.delta.any():
+        theta[:, network.generators] += inputs.delta
+        theta, _ = network.solve_loads(theta, network.load_injections(p_load[:, 0]))
+    psi = model.observables(network, theta, inputs.omega, p_load[:, 0])
+    return free_response(model, psi, p_load, stride).astype(np.float32)

@@ -1,17 +1,57 @@
-"""The paper's network without torch, whose overhead would be most of the time of a single answer."""
+"""The paper's network without torch, whose overhead would be most of the time of a single answer.
+
+It sees ζ = (loads, c, x_0, P_0) of an instance.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.problem.case import Array
+from ded_bench.plants.lossless.network import Network
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
 
 #: Output channels of the hidden layers, and the window of each layer (paper, section on the implementation).
 FILTERS, WINDOWS = 30, (5, 10, 5)
 ZERO = np.float32(0.0)
+
+
+def n_channels(case: Case) -> int:
+    """Number of channels: loads, costs with the slack's, x_0 = (θ without the slack's, P_s, ω), P_0."""
+    return len(case.loads) + (1 + len(case.generators)) + len(case.buses) + 2 * len(case.generators)
+
+
+def channels(network: Network, instances: Sequence[Instance], knots: Array) -> Array:
+    """ζ as channels over the knots, constants repeated, in the units of the files.
+
+    Args:
+        network: of the instances' case.
+        knots: times, (n_knots,), s.
+
+    Returns:
+        Shape (batch, n_channels, n_knots): pu, cost per pu, rad, pu, rad/s, pu.
+
+    Raises:
+        PowerFlowError: an instance has no angles at t = 0.
+    """
+    case = network.case
+    theta = np.stack([network.initial_angles(instance) for instance in instances])
+    constant = np.concatenate(
+        [
+            [[i.cost_slack(case), *i.cost_gen(case)] for i in instances],
+            theta[:, network.unknown],
+            network.injections(theta)[:, [network.slack]],
+            [i.omega_initial(case) for i in instances],
+            [i.p_initial(case) for i in instances],
+        ],
+        axis=1,
+    )
+    repeated = np.broadcast_to(constant[:, :, None], (*constant.shape, len(knots)))
+    p_load = np.stack([i.p_load(case, knots) for i in instances])
+    return np.concatenate([p_load.transpose(0, 2, 1), repeated], axis=1)
 
 
 def weight_shapes(n_channels: int, n_gen: int) -> dict[str, tuple[int, ...]]:
@@ -37,7 +77,7 @@ class NumpyPaperNetwork:
         self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
 
     def __call__(self, channels: Array) -> Array:
-        """See `paper_network.PaperNetwork.forward`."""
+        """See `PaperNetwork.forward`."""
         h = (channels.astype(np.float32) - self._mean) * self._scale
         for i, (window, weight, bias) in enumerate(self._layers):
             if i:

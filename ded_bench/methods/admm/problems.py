@@ -1,54 +1,49 @@
-"""Problems as arrays, drawn for training without files: the benchmark's kind, and those of a closed loop."""
+"""Problems on the time grid: of instances, and drawn for training without files.
+
+Those drawn are of the benchmark's kind, or like those of a closed loop.
+"""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.admm.start_kernels import sample_paths
-from ded_bench.plants.lossless.network import Network
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
+from ded_bench.problem.instance import Instance
 
+#: Points of the time grid per interval between knots.
+POINTS = 4
 #: Which part of drawn problems is of the closed loop's kind.
 OPERATING = 0.25
 #: Their fluctuation: standard deviation as a part of the nominal load, and decay, s.
 FLUCTUATION, DECAY_S = 5e-4, 20.0
 
 
-#: A segment that no path reaches: it starts later than any horizon ends, s.
-NEVER = [1e30, 0.0, 0.0]
-
-
 @dataclass(frozen=True, eq=False)
 class Problems:
-    """Instances of one case, at fine points."""
+    """Problems of one case; like `StackedInstances`, but for the loads."""
 
-    load: Array  # (batch, n_fine, n_load), pu
+    load: Array  # on the time grid, (batch, n_points, n_load), pu
     cost: Array  # (slack, generators), (batch, 1 + n_gen)
     p_initial: Array  # P_0, (batch, n_gen), pu
     delta: Array  # θ(0) less the equilibrium of P_0 and the initial loads, (batch, n_gen), rad
     omega: Array  # ω(0), (batch, n_gen), rad/s
 
     @staticmethod
-    def of(case: Case, instances: Sequence[Instance], fine: Array) -> Problems:
-        """Stack instances.
+    def of(case: Case, instances: Sequence[Instance], points: Array) -> Problems:
+        """Sample instances on a time grid, (n_points,), s.
 
         Raises:
             PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
         """
-        machines = (case.slack, *case.generators)
-        return Problems(
-            load=sampled(case, instances, fine),
-            cost=np.array([[i.cost[bus] for bus in machines] for i in instances]),
-            p_initial=np.array([i.p_initial(case) for i in instances]),
-            delta=np.array([_deviation(case, i) for i in instances]),
-            omega=np.array([i.omega_initial(case) for i in instances]),
-        )
+        given = StackedInstances.of(case, instances)
+        load = sampled(given.load, points)
+        return Problems(load, given.cost, given.p_initial, given.delta, given.omega)
 
     def __len__(self) -> int:
         return len(self.load)
@@ -57,54 +52,19 @@ class Problems:
         return Problems(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def _deviation(case: Case, instance: Instance) -> Array:
-    theta = instance.theta_initial(case)
-    if theta is None:
-        return np.zeros(len(case.generators))
-    network = Network(case)
-    p_load = instance.p_load(case, np.zeros(1))[0]
-    equilibrium = network.power_flow(instance.p_initial(case), p_load)
-    return np.asarray(theta - equilibrium[network.generators])
+def time_grid(knots: Array) -> Array:
+    """The knots and equidistant points between them, (n_points,), s."""
+    return np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
 
 
-def averaged(values: Array, every: int) -> Array:
-    """Means weighted by the hat function of every so many-th point.
-
-    Args:
-        values: (batch, n, n_columns); both ends are kept as they are.
-        every: how many points make one.
-    """
-    hat = np.minimum(np.arange(1, 2 * every), np.arange(1, 2 * every)[::-1]) / every**2
-    found, last = values[:, ::every].copy(), values.shape[1] - every
-    found[:, 1:-1] = 0.0
-    for k, weight in enumerate(hat, start=1):
-        found[:, 1:-1] += weight * values[:, k : last + k - every : every]
-    return found
-
-
-def segments_of(load: LoadRamp | LoadPoints) -> list[float]:
-    """(start, value there, slope) of each linear piece of a load's path, one after another."""
-    if isinstance(load, LoadRamp):
-        initial, start, duration, rate = load.initial, load.start, load.duration, load.rate
-        return [0.0, initial, 0.0, start, initial, rate, start + duration, initial + rate * duration, 0.0]
-    path: list[float] = []
-    for (t, p), (t_next, p_next) in itertools.pairwise(load.points):
-        path += [t, p, (p_next - p) / (t_next - t)]
-    return path
-
-
-def sampled(case: Case, instances: Sequence[Instance], fine: Array) -> Array:
-    """Loads of instances at the fine points, (batch, n_fine, n_load), pu."""
-    paths = [segments_of(i.load[bus]) for i in instances for bus in case.loads]
-    longest = max(map(len, paths), default=0)
-    flat = [number for path in paths for number in path + NEVER * ((longest - len(path)) // 3)]
-    segments = np.array(flat).reshape(len(instances), len(case.loads), longest // 3, 3)
-    values = np.empty((len(instances), len(fine), len(case.loads)))
-    sample_paths(segments, float(fine[1]), values)
+def sampled(segments: Array, points: Array) -> Array:
+    """Loads on a time grid, (batch, n_points, n_load), pu; see `load_segments`."""
+    values = np.empty((len(segments), len(points), segments.shape[1]))
+    sample_loads(segments, float(points[1]), values)
     return values
 
 
-def draw(case: Case, bound: float, fine: Array, count: int, generator: np.random.Generator) -> Problems:
+def draw(case: Case, bound: float, points: Array, count: int, generator: np.random.Generator) -> Problems:
     """Draw problems.
 
     The benchmark's kind is the sampler's (`problem.sampling`). The closed loop's kind has a second ramp in
@@ -114,19 +74,19 @@ def draw(case: Case, bound: float, fine: Array, count: int, generator: np.random
     Args:
         case: gives the ranges.
         bound: of |ω|, rad/s.
-        fine: fine points, (n_fine,), s.
+        points: the time grid, (n_points,), s.
         count: how many.
         generator: of random numbers.
     """
     n_gen, ranges = len(case.generators), case.sampling
     operating = generator.random(count) < OPERATING
     cost = _uniform(generator, ranges.cost, (count, 1 + n_gen))
-    load = _ramps(case, fine, count, generator)
+    load = _ramps(case, points, count, generator)
     chosen = np.flatnonzero(operating)
-    more = _ramps(case, fine, len(chosen), generator)
+    more = _ramps(case, points, len(chosen), generator)
     load[chosen] += more - more[:, :1]
     noise = generator.standard_normal((len(chosen), 1, len(case.loads))) * FLUCTUATION * case.load_nominal
-    load[chosen] += noise * (np.exp(-fine / DECAY_S) - 1.0)[None, :, None]
+    load[chosen] += noise * (np.exp(-points / DECAY_S) - 1.0)[None, :, None]
     p_opt = merit_order(case, cost[:, 1:], cost[:, 0], load[:, 0])
     perturbation = _uniform(generator, ranges.perturbation, (count, n_gen))
     perturbation *= np.where(operating, generator.random(count), 1.0)[:, None]
@@ -138,8 +98,8 @@ def draw(case: Case, bound: float, fine: Array, count: int, generator: np.random
     return Problems(load, cost, p_opt - 0.5 * (p_opt - case.p_nominal) * perturbation, delta, omega)
 
 
-def _ramps(case: Case, fine: Array, count: int, generator: np.random.Generator) -> Array:
-    """Loads that ramp once, (count, n_fine, n_load), pu; in case/2 none changes its sign."""
+def _ramps(case: Case, points: Array, count: int, generator: np.random.Generator) -> Array:
+    """Loads that ramp once, (count, n_points, n_load), pu; in case/2 none changes its sign."""
     ranges, shape = case.sampling, (count, len(case.loads))
     draws = [_ramp(case, shape, generator)]
     if case.schema_ != "ded-bench/case/1":
@@ -158,10 +118,7 @@ def _ramps(case: Case, fine: Array, count: int, generator: np.random.Generator) 
         (start, initial, rate),
         (start + duration, initial + rate * duration, none),
     )
-    segments = np.stack([np.stack(piece, axis=-1) for piece in pieces], axis=2)
-    values = np.empty((count, len(fine), shape[1]))
-    sample_paths(segments, float(fine[1]), values)
-    return values
+    return sampled(np.stack([np.stack(piece, axis=-1) for piece in pieces], axis=2), points)
 
 
 def _ramp(case: Case, shape: tuple[int, int], generator: np.random.Generator) -> tuple[Array, ...]:
@@ -177,3 +134,29 @@ def _ramp(case: Case, shape: tuple[int, int], generator: np.random.Generator) ->
 
 def _uniform(generator: np.random.Generator, ends: tuple[float, float], shape: tuple[int, ...]) -> Array:
     return np.asarray(generator.uniform(ends[0], ends[1], shape))
+
+
+@compiled
+def sample_loads(segments: Array, spacing: float, values: Array) -> None:
+    """Loads on the time grid; around a kink as means weighted by hat functions, which keep the area.
+
+    Args:
+        segments: see `load_segments`, (batch, n_load, n_segments, 3).
+        spacing: of the time grid, s.
+        values: receives the loads, (batch, n_points, n_load), pu.
+    """
+    for b in range(len(values)):
+        for i in range(values.shape[2]):
+            path, last = segments[b, i], len(segments[b, i]) - 1
+            at = 0
+            for k in range(values.shape[1]):
+                while at < last and path[at + 1, 0] <= k * spacing:
+                    at += 1
+                values[b, k, i] = path[at, 1] + path[at, 2] * (k * spacing - path[at, 0])
+            for s in range(1, len(path)):
+                start, bend = path[s, 0], path[s, 2] - path[s - 1, 2]
+                before = int(start / spacing) if start < spacing * values.shape[1] else values.shape[1]
+                for k in range(max(before, 1), min(before + 2, values.shape[1] - 1)):
+                    u = (k * spacing - start) / spacing
+                    mean = (max(u + 1.0, 0.0) ** 3 - 2.0 * max(u, 0.0) ** 3) / 6.0
+                    values[b, k, i] += bend * spacing * (mean - max(u, 0.0))

@@ -1,16 +1,18 @@
-"""The network along a path, compiled: power flow at t = 0, electrical power, stiffness, inputs of the modes.
+"""The network along a trajectory, compiled: power flow, electrical power, stiffness, inputs of the modes.
 
-Numba's cache on disk notices that a function's own file changed, not that a function which it calls did.
+Power flow and Kron reduction eliminate buses. A bus whose lines have weights w_i is a star; without it there is
+a mesh of lines of weights w_i w_j / Σ w. Buses of few lines go first (minimum degree), so that networks of
+hundreds of buses stay sparse.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.admm.elimination import Elimination
-from ded_bench.methods.admm.iteration_records import Indices
+from ded_bench.methods.admm.modal_kernels import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
@@ -27,6 +29,63 @@ class Lines(NamedTuple):
     coupling: Array  # (n_line,), pu
     generators: Indices  # buses, (n_gen,)
     loads: Indices  # buses, (n_load,)
+
+
+class Elimination(NamedTuple):
+    """A plan of elimination. An edge is named by its place in `neighbours`; each has one place."""
+
+    buses: Indices  # in their order, (n,)
+    first: Indices  # place of each bus's first edge, and one past the last, (n + 1,)
+    kept: Indices  # place of its first edge to a bus that is kept; these come last, (n,)
+    neighbours: Indices  # where edges lead, (n_edges,)
+    fill: Indices  # edge of each mesh line, for pairs of edges the first of which leads to no kept bus
+    of_line: Indices  # edge of each line, -1 between two kept buses, (n_line,)
+
+
+def plan_elimination(ends: Indices, n_bus: int, kept: Iterable[int]) -> Elimination:
+    """Order all buses but those that are kept, and say what lines that makes.
+
+    Args:
+        ends: of the lines, (n_line, 2).
+        n_bus: how many buses there are.
+        kept: those that stay.
+    """
+    linked: list[set[int]] = [set() for _ in range(n_bus)]
+    for near, far in ends.tolist():
+        linked[near].add(far)
+        linked[far].add(near)
+    stay = set(kept)
+    left, buses, stars = set(range(n_bus)) - stay, [], []
+    while left:
+        bus = min(left, key=lambda one: (len(linked[one]), one))
+        left.remove(bus)
+        star = sorted(linked[bus], key=lambda one: (one in stay, one))
+        buses.append(bus)
+        stars.append(star)
+        for one in star:
+            linked[one].remove(bus)
+            linked[one].update(other for other in star if other != one)
+    first = np.cumsum([0, *map(len, stars)])
+    place = {
+        frozenset((bus, one)): start + i
+        for bus, star, start in zip(buses, stars, first.tolist(), strict=False)
+        for i, one in enumerate(star)
+    }
+    inner = [sum(one not in stay for one in star) for star in stars]
+    fill = [
+        place[frozenset((star[i], other))]
+        for star, n in zip(stars, inner, strict=True)
+        for i in range(n)
+        for other in star[i + 1 :]
+    ]
+    return Elimination(
+        buses=np.array(buses, dtype=np.int64),
+        first=first,
+        kept=first[:-1] + np.array(inner, dtype=np.int64),
+        neighbours=np.array([one for star in stars for one in star], dtype=np.int64),
+        fill=np.array(fill, dtype=np.int64),
+        of_line=np.array([place.get(frozenset(line), -1) for line in ends.tolist()], dtype=np.int64),
+    )
 
 
 @compiled
@@ -55,27 +114,27 @@ def start_angles(lines: Lines, plan: Elimination, nominal: Array, wanted: Array,
 
 
 @compiled
-def follow_path(
+def follow_trajectory(
     lines: Lines,
     plan: Elimination,
-    path: Array,
+    angles: Array,
     p_load: Array,
     theta: Array,
-    instants: Indices,
+    taken: Indices,
     f: Array,
     stiffness: Array,
 ) -> bool:
-    """Electrical power of the generators along a path of their angles, and its derivative.
+    """Electrical power of the generators along a trajectory of their angles, and its derivative.
 
     Args:
         lines: the network.
         plan: eliminates all buses but generators and slack.
-        path: angles of the generators at the knots, (n_knots, n_gen), rad.
-        p_load: load injections there, (n_knots, n_load), pu.
+        angles: of the generators at the power flows, (n_flows, n_gen), rad.
+        p_load: load injections there, (n_flows, n_load), pu.
         theta: angles of all buses near the first ones, (n_bus,), rad.
-        instants: at which knots the derivative is taken; the first knot is one, (n_instants,).
-        f: receives electrical powers of the generators, (n_knots, n_gen), pu.
-        stiffness: receives ∂f/∂θ of the generators, (n_instants, n_gen, n_gen), pu/rad.
+        taken: at which power flows the derivative is taken; the first is one, (n_stiffness,).
+        f: receives electrical powers of the generators, (n_flows, n_gen), pu.
+        stiffness: receives ∂f/∂θ of the generators, (n_stiffness, n_gen, n_gen), pu/rad.
 
     Returns:
         Whether there is a solution all along.
@@ -84,9 +143,9 @@ def follow_path(
     angle, injection, wanted, off = theta.copy(), np.empty(n_bus), np.zeros(n_bus), np.empty(n_bus)
     before, change, at, known = theta.copy(), np.zeros(n_bus), 0, False
     weights, totals = np.empty(len(plan.neighbours)), np.empty(n)
-    for k in range(len(path)):
-        for g in range(path.shape[1]):
-            angle[lines.generators[g]] = path[k, g]
+    for k in range(len(angles)):
+        for g in range(angles.shape[1]):
+            angle[lines.generators[g]] = angles[k, g]
         for i in range(len(lines.loads)):
             wanted[lines.loads[i]] = p_load[k, i]
         for i in range(n):
@@ -99,9 +158,9 @@ def follow_path(
             bus = plan.buses[i]
             change[bus] = angle[bus] - before[bus] if k > 0 else 0.0
             before[bus] = angle[bus]
-        for g in range(path.shape[1]):
+        for g in range(angles.shape[1]):
             f[k, g] = injection[lines.generators[g]]
-        if at < len(instants) and instants[at] == k:
+        if at < len(taken) and taken[at] == k:
             if not _factorise(lines, plan, angle, weights, totals):
                 return False
             _reduce(lines, plan, angle, weights, totals, stiffness[at])
@@ -249,8 +308,8 @@ def _reduce(
 
 
 @compiled
-def path_inputs(
-    path: Array,
+def modal_inputs(
+    x: Array,
     f: Array,
     change: Array,
     taken: Array,
@@ -260,40 +319,40 @@ def path_inputs(
     modal: Array,
     slack: Array,
 ) -> None:
-    """What is not P in the modes' inputs, once the power flow along the paths is known.
+    """What is not P in the modes' inputs, once the power flow along the trajectories is known.
 
-    What f says that neither S nor ΔS do is linear between the stations, where the flow was solved.
+    What f says that neither S nor ΔS do is linear between two power flows.
 
     Args:
-        path: x at the stations, (batch, n_stations, n_gen), rad.
+        x: angles of the trajectory at the power flows, (batch, n_flows, n_gen), rad.
         f: electrical powers there, likewise, pu.
-        change: ΔS at the instants, (batch, n_instants, n_gen, n_gen), pu/rad.
-        taken: T (L - L_0) at the fine points, (batch, n_fine, n_gen), pu.
-        load: there, (batch, n_fine, n_load), pu.
-        constants: S (n_gen, n_gen), pu/rad, linear interpolation from instants to fine points
-            (n_fine, n_instants), `gain` and `shape` of `GridResponse`.
-        offset: receives the inputs, (batch, n_fine, n_modes).
-        modal: receives ΔS of the modes, (batch, n_instants, n_modes, n_modes), 1/s².
-        slack: receives P_s at x = 0, (batch, n_fine), pu.
+        change: ΔS, (batch, n_stiffness, n_gen, n_gen), pu/rad.
+        taken: T (L - L_0) on the time grid, (batch, n_points, n_gen), pu.
+        load: there, (batch, n_points, n_load), pu.
+        constants: S (n_gen, n_gen), pu/rad, linear interpolation of ΔS on the time grid
+            (n_points, n_stiffness), `gain` and `shape` of `ModalGrid`.
+        offset: receives the inputs, (batch, n_points, n_modes).
+        modal: receives ΔS of the modes, (batch, n_stiffness, n_modes, n_modes), 1/s².
+        slack: receives P_s at x = 0, (batch, n_points), pu.
     """
     stiffness, between, gain, shape = constants
-    n_stations, n_fine = path.shape[1], taken.shape[1]
-    points = (n_fine - 1) // (n_stations - 1)
-    for b in range(len(path)):
-        rest, whole = f[b] - np.dot(path[b], stiffness), taken[b].copy()
+    n_flows, n_points = x.shape[1], taken.shape[1]
+    points = (n_points - 1) // (n_flows - 1)
+    for b in range(len(x)):
+        rest, whole = f[b] - np.dot(x[b], stiffness), taken[b].copy()
         for s in range(len(change[b])):
-            moved = np.dot(path[b], change[b, s])
-            for k in range(n_stations):
+            moved = np.dot(x[b], change[b, s])
+            for k in range(n_flows):
                 rest[k] -= between[k * points, s] * moved[k]
             modal[b, s] = np.dot(np.dot(gain.T, change[b, s]), shape.T)
-        for k in range(n_stations):
+        for k in range(n_flows):
             rest[k] -= taken[b, k * points]
-        for k in range(n_fine):
-            station = min(k // points, n_stations - 2)
-            later = (k - station * points) / points
+        for k in range(n_points):
+            flow = min(k // points, n_flows - 2)
+            later = (k - flow * points) / points
             total = 0.0
             for g in range(whole.shape[1]):
-                whole[k, g] += (1.0 - later) * rest[station, g] + later * rest[station + 1, g]
+                whole[k, g] += (1.0 - later) * rest[flow, g] + later * rest[flow + 1, g]
                 total += whole[k, g]
             for i in range(load.shape[2]):
                 total += load[b, k, i]

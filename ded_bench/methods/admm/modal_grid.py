@@ -1,0 +1,232 @@
+"""The grid in modal coordinates: linearised along a trajectory, and what it answers to generator power.
+
+With x the generators' angles relative to those at t = 0 and the same damping rate γ for all of them,
+
+    M ẍ + γ M ẋ + (S + ΔS(t)) x = P - P_0 - T (L - L_0) - r(t)
+
+where S and T are the reduced stiffness and load share of the nominal point, ΔS is what stiffness changes along
+a trajectory, and r is all that is not in them. In modal coordinates x = q shape each mode is an oscillator of
+its own, which is advanced exactly from one point of the time grid to the next under an input that is linear
+between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.methods.admm.dispatch_kernels import ramp_limited_schedules
+from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
+from ded_bench.methods.admm.network_kernels import (
+    Lines,
+    follow_trajectory,
+    modal_inputs,
+    plan_elimination,
+    start_angles,
+)
+from ded_bench.methods.admm.problems import POINTS, Problems, time_grid
+from ded_bench.plants.lossless.network import Network
+from ded_bench.problem.case import Array, Case
+
+#: Damping rates that differ by less than this part are the same in all but the digits of the data.
+ROUND_OFF = 1e-6
+#: Knots at which the stiffness along a trajectory is taken; linear between them.
+STIFFNESS_KNOTS = 5
+#: Longest time from one power flow along a trajectory to the next, s, but for knots farther apart.
+FLOWS_S = 0.8
+#: Part of the bound on |ω| at which angles move in the first schedule.
+FIRST_RATE = 0.9
+#: Costs are relative to the ramp-limited dispatch, but an instance is not worth more than this mean cost per
+#: pair of generators.
+SMALLEST_COST = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What is known of problems before any decision."""
+
+    problems: Problems
+    served: NDArray[np.bool_]  # whether there is a power flow, (batch,)
+    theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
+    state: Array  # modes at t = 0: q, q̇, (batch, 2, n_modes)
+    taken: Array  # T (L - L_0) on the time grid, (batch, n_points, n_gen), pu
+    scale: Array  # what costs are relative to: mean cost of the ramp-limited dispatch, (batch,)
+    schedule: Array  # first schedule, (batch, n_knots, n_gen), pu
+
+
+@dataclass(frozen=True, eq=False)
+class ModalLinearisation:
+    """The grid linearised along a trajectory: what is not P in the modes' inputs, and changes of stiffness."""
+
+    offset: Array  # -T (L - L_0) - r + ΔS x of the trajectory, less P_0, (batch, n_points, n_modes)
+    change: Array  # ΔS of the modes, (batch, n_stiffness, n_modes, n_modes), 1/s²
+    slack: Array  # P_s at x = 0, (batch, n_points), pu
+    stiffness: Array  # ΔS, (batch, n_stiffness, n_gen, n_gen), pu/rad
+
+
+class ModalGrid:
+    """The grid of one case, for one bound on |ω| (rad/s) and one horizon."""
+
+    def __init__(self, case: Case, bound: float, horizon_s: float) -> None:
+        self.case, self.bound, self.network = case, bound, Network(case)
+        self.knots = knots = case.knot_times(horizon_s)
+        self.points = time_grid(knots)  # (n_points,), s
+        self.spacing = float(knots[1] - knots[0])
+        self.ramp = case.ramp * self.spacing
+        self._linearise_nominal()
+        #: Knots from one power flow along a trajectory to the next; those where stiffness is taken.
+        self.every = largest_divisor(len(knots) - 1, FLOWS_S / self.spacing)
+        n_flows = (len(knots) - 1) // self.every + 1
+        taken = np.linspace(0, n_flows - 1, min(STIFFNESS_KNOTS, n_flows)).round().astype(np.int64)
+        self.stiffness_knots = self.every * taken
+        #: Linear interpolation from there to the time grid, and shares of a mean over time.
+        at = knots[self.stiffness_knots]
+        self.between = np.stack([np.interp(self.points, at, row) for row in np.eye(len(at))], axis=1)
+        self.shares = np.trapezoid(self.between, self.points, axis=0) / self.points[-1]
+        half = 0.5 * float(self.points[1])
+        self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * POINTS)
+        network = self.network
+        self.lines = Lines(network.ends, network.coupling, network.generators, network.loads)
+        slack, machines = [network.slack], [network.slack, *network.generators.tolist()]
+        self._to_slack, self._to_machines = (
+            plan_elimination(network.ends, network.n_bus, kept) for kept in (slack, machines)
+        )
+
+    def _linearise_nominal(self) -> None:
+        self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)
+        linear = self.network.linearise(self.theta)
+        root = np.sqrt(linear.m)
+        squares, u = np.linalg.eigh(linear.stiffness / np.outer(root, root))
+        self.rate = float(linear.d.sum() / linear.m.sum())  # γ, 1/s
+        other = linear.d / linear.m - self.rate
+        other[np.abs(other) < ROUND_OFF * self.rate] = 0.0
+        self.stiffness = linear.stiffness  # S, (n_gen, n_gen), pu/rad
+        self.compliance = np.asarray(np.linalg.inv(linear.stiffness))
+        self.share = linear.share  # T, (n_gen, n_load)
+        self.mass = linear.m / linear.m.mean()
+        self.gain = u / root[:, None]  # powers into modes, (n_gen, n_modes): v = p @ gain
+        self.shape = (u / root[:, None]).T.copy()  # modes into angles, (n_modes, n_gen): x = q @ shape
+        self._inverse = np.linalg.inv(self.shape)
+        maps = oscillators(squares, self.rate, float(self.points[1]))
+        self._step = np.ascontiguousarray(np.moveaxis(maps, 0, 2))
+        self._damping = u.T @ np.diag(other) @ u  # of the modes, less γ, (n_modes, n_modes), 1/s
+
+    def start(self, problems: Problems) -> Start:
+        """Angles at t = 0 and the first schedule."""
+        network, batch = self.network, len(problems)
+        theta, served = np.empty((batch, network.n_bus)), np.empty(batch, bool)
+        wanted = np.zeros((batch, network.n_bus))
+        wanted[:, network.generators] = problems.p_initial
+        wanted[:, network.loads] = problems.load[:, 0]
+        for b in range(batch):
+            served[b] = start_angles(self.lines, self._to_slack, self.theta, wanted[b], theta[b])
+        taken = (problems.load - problems.load[:, :1]) @ self.share.T
+        state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
+        n_gen = len(self.gain)
+        mean_cost, schedule = np.empty(batch), np.empty((batch, len(self.knots), n_gen))
+        ramp_limited_schedules(
+            (problems.load, problems.cost, problems.p_initial),
+            taken,
+            (self.compliance, self.stiffness),
+            (self.case.p_min, self.case.p_max, self.ramp),
+            FIRST_RATE * self.bound * self.spacing,
+            mean_cost,
+            schedule,
+        )
+        scale = np.maximum(mean_cost, SMALLEST_COST * max(1.0, n_gen / 2))
+        return Start(problems, served, theta, state, taken, scale, schedule)
+
+    def along_first(self, start: Start) -> ModalLinearisation:
+        """The grid linearised along the steady angles of the first schedules."""
+        powers = start.schedule[:, :: self.every] - start.problems.p_initial[:, None]
+        return self.linearise(start, (powers - start.taken[:, :: self.every * POINTS]) @ self.compliance)
+
+    def along(self, start: Start, x: Array) -> ModalLinearisation:
+        """The grid linearised along trajectories of x on the time grid, (batch, n_points, n_gen), rad.
+
+        What swings faster than the time from one power flow to the next is averaged out.
+        """
+        return self.linearise(start, averaged(x, self.every * POINTS))
+
+    def linearise(self, start: Start, slow: Array) -> ModalLinearisation:
+        """The grid linearised along slow trajectories of x.
+
+        What the power flow says that neither S nor ΔS do is taken as linear between two power flows.
+
+        Args:
+            start: of the problems; those without a power flow all along are `served` no more.
+            slow: x at every `every`-th knot, (batch, n_flows, n_gen), rad.
+        """
+        problems, points = start.problems, self.every * POINTS
+        batch, n_flows, n_gen = slow.shape
+        f = np.empty((batch, n_flows, n_gen))
+        stiffness = np.empty((batch, len(self.stiffness_knots), n_gen, n_gen))
+        loads = np.ascontiguousarray(problems.load[:, ::points])
+        generators, at = self.network.generators, self.stiffness_knots // self.every
+        network = self.lines, self._to_machines
+        for b in range(batch):
+            if start.served[b]:
+                angles = start.theta[b, generators] + slow[b]
+                start.served[b] = follow_trajectory(
+                    *network, angles, loads[b], start.theta[b], at, f[b], stiffness[b]
+                )
+        if not start.served.all():
+            bad = np.logical_not(start.served)
+            f[bad], stiffness[bad] = problems.p_initial[bad][:, None], self.stiffness
+            slow = np.where(bad[:, None, None], 0.0, slow)
+        change = stiffness - self.stiffness
+        offset, modal = np.empty((batch, len(self.points), n_gen)), np.empty_like(change)
+        slack = np.empty(offset.shape[:2])
+        constants = self.stiffness, self.between, self.gain, self.shape
+        modal_inputs(slow, f, change, start.taken, problems.load, constants, offset, modal, slack)
+        return ModalLinearisation(offset, modal, slack, change)
+
+    def respond(self, powers: Array, start: Start, linear: ModalLinearisation) -> tuple[Array, Array, Array]:
+        """What the linearised grid does under powers at the knots, (batch, n_knots, n_gen), pu.
+
+        Returns:
+            On the time grid: x (batch, n_points, n_gen), rad, ω likewise, rad/s, P_s (batch, n_points), pu.
+        """
+        v = linear_between(powers @ self.gain, POINTS) + linear.offset
+        q, speed = np.empty_like(v), np.empty_like(v)
+        q[:, 0], speed[:, 0] = start.state[:, 0], start.state[:, 1]
+        swing(self.modes, linear.change, v, q, speed)
+        x, omega = q @ self.shape, speed @ self.shape
+        p_slack = linear.slack - (self.slack_stiffness(linear) * x).sum(axis=2)
+        return x, omega, p_slack
+
+    def slack_stiffness(self, linear: ModalLinearisation) -> Array:
+        """Σ_g of S + ΔS on the time grid, (batch, n_points, n_gen), pu/rad."""
+        return np.asarray(self.stiffness.sum(axis=0) + self.between @ linear.stiffness.sum(axis=2))
+
+
+def linear_between(values: Array, points: int) -> Array:
+    """Linear between rows, (batch, n, n_columns) to (batch, points (n - 1) + 1, n_columns)."""
+    batch, n, n_columns = values.shape
+    found = np.empty((batch, points * (n - 1) + 1, n_columns))
+    for i in range(points):
+        found[:, i:-1:points] = values[:, :-1] * (1 - i / points) + values[:, 1:] * (i / points)
+    found[:, -1] = values[:, -1]
+    return found
+
+
+def averaged(values: Array, every: int) -> Array:
+    """Means weighted by the hat function of every so many-th point.
+
+    Args:
+        values: (batch, n, n_columns); both ends are kept as they are.
+        every: how many points make one.
+    """
+    hat = np.minimum(np.arange(1, 2 * every), np.arange(1, 2 * every)[::-1]) / every**2
+    found, last = values[:, ::every].copy(), values.shape[1] - every
+    found[:, 1:-1] = 0.0
+    for k, weight in enumerate(hat, start=1):
+        found[:, 1:-1] += weight * values[:, k : last + k - every : every]
+    return found
+
+
+def largest_divisor(count: int, most: float) -> int:
+    """The largest divisor of a number that is at most so large; 1 if none is."""
+    return max(n for n in range(1, max(int(most + 1e-9), 1) + 1) if count % n == 0)

@@ -1,0 +1,119 @@
+"""DED-DPC (`ded-dpc`): a network looks at what a schedule would do and corrects it, in stages.
+
+Where the result would still exceed the bound on |ω|, the least change that mends it follows. Bounds, ramps
+and P_0 hold for any weights. First-order steps may refine the answer.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.dpc.bound_keeper import BoundKeeper
+from ded_bench.methods.dpc.channels import Channels, Response
+from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
+from ded_bench.methods.dpc.refinement import Refiner
+from ded_bench.methods.options import option, read_options
+from ded_bench.methods.policy_file import DEFAULT_MODEL, Scope
+from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.surrogates.find import find_model
+
+VERSION = 1
+#: Instances answered at a time.
+CHUNK = 50
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of `ded-dpc`."""
+
+    refine: int = option(0, "first-order steps that refine the answer; 0: the network's alone", lowest=0)
+
+
+class DispatchPolicy(TrainedPolicy):
+    """A trained network; `training` has its `stages`, `width` and `dilations`."""
+
+    method = "ded-dpc"
+
+    @functools.cached_property
+    def response(self) -> Response:
+        """What the network looks at."""
+        return Response.make(self.scope.case, self.knots)
+
+    @functools.cached_property
+    def _compiled(self) -> CompiledStages:
+        return CompiledStages(self.scope.case, self.response, self.weights, tuple(self.training["dilations"]))
+
+    @functools.cached_property
+    def _keeper(self) -> BoundKeeper:
+        return BoundKeeper.make(self.scope.case, self.scope.regime, self.knots)
+
+    def answers(self, instances: Sequence[Instance]) -> Array:
+        """See `TrainedPolicy.answers`."""
+        return self.powers(StackedInstances.of(self.scope.case, instances))
+
+    def powers(self, inputs: StackedInstances) -> Array:
+        """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
+        parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
+        return np.concatenate([self._keeper(part, self.network_powers(part)) for part in parts])
+
+    def network_powers(self, inputs: StackedInstances) -> Array:
+        """What the network alone answers, as `powers`."""
+        return self._compiled(Channels.of(self.scope.case, inputs, self.response))
+
+    @staticmethod
+    def shapes(
+        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[int, ...]]:
+        """See `TrainedPolicy.shapes`."""
+        case = scope.case
+        stages, width, dilations = (training.get(name) for name in ("stages", "width", "dilations"))
+        if not (isinstance(stages, int) and isinstance(width, int) and isinstance(dilations, list)):
+            raise ValueError("lacks the network's stages, width and dilations")
+        if not all(isinstance(d, int) and 0 < d < case.n_knots for d in dilations):
+            raise ValueError("has dilations that are no numbers of knots")
+        layers = {name for name in arrays if ".mix." in name and name.endswith(".bias")}
+        widths = {arrays[name].shape for name in layers} | {(width,)}
+        if len(layers) != stages * len(dilations) or len(widths) != 1 or not layers:
+            raise ValueError("has another width or depth than the weights")
+        return weight_shapes(case, stages, width, len(dilations))
+
+
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy that `prepare` would use, and the model of the steps that refine its answers."""
+    policy = DispatchPolicy.artifact(case, regime, settings)
+    refined = read_options(Options, settings.options).refine > 0
+    return (policy, model_artifact(case, settings, DEFAULT_MODEL)) if refined else (policy,)
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return the policy as a method; condensing and factorising are done once per time grid.
+
+    Raises:
+        InputError: there is no policy or model (names the command that makes one), or it does not fit.
+    """
+    policy, steps = DispatchPolicy.find(case, regime, settings), read_options(Options, settings.options).refine
+    if not steps:
+        return as_solver(policy.scope, lambda instance: policy(instance)[0])
+    model = find_model(case, settings.model or DEFAULT_MODEL, settings.search)
+    refiners: dict[tuple[float, int], Refiner] = {}
+
+    def answer(instance: Instance) -> Schedule:
+        policy.scope.check([instance])
+        grid = instance.dt_s, instance.steps
+        if grid not in refiners:
+            refiners[grid] = Refiner.make(case, model, regime, instance.grid, policy.knots)
+        inputs = StackedInstances.of(case, [instance])
+        return Schedule(policy.knots, refiners[grid](inputs, policy.powers(inputs), steps)[0])
+
+    return as_solver(policy.scope, answer, steps)

@@ -1,0 +1,181 @@
+"""The loop of every training in torch: steps, looks at the loss, checkpoints; results that repeat."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import copy
+import io
+import math
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import write_atomically
+from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+
+#: Fractions of a training: warm-up of the learning rate, then a cosine down to `LAST` of it.
+WARM_UP, LAST = 0.02, 1e-3
+CLIP_NORM = 1.0  # of gradients
+AVERAGE = 0.998  # of the weights, exponentially
+#: Most looks at the loss.
+LOOKS = 40
+
+
+class TrainingRun(abc.ABC):
+    """The state of one training: network, moving average of its weights, optimiser, progress.
+
+    A method says what an epoch is made of, the loss of a step, and how good the average is.
+    """
+
+    #: What a checkpoint holds beside the states of network, average, optimiser and generator.
+    progress = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
+    clip_norm, average_decay, looks = CLIP_NORM, AVERAGE, LOOKS
+
+    def __init__(
+        self, network: nn.Module, optimiser: torch.optim.Optimizer, seed: int, out: Path
+    ) -> None:
+        self.network, self.optimiser, self.generator = network, optimiser, torch.Generator().manual_seed(seed)
+        self.rates = [float(group["lr"]) for group in optimiser.param_groups]
+        self.out, self.average = out, copy.deepcopy(network)
+        self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
+        self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
+        self.history: list[dict[str, float]] = []
+
+    @abc.abstractmethod
+    def batches(self) -> Sequence[Any]:
+        """What the steps of the next epoch are taken on."""
+
+    @abc.abstractmethod
+    def loss(self, batch: Any, progress: float) -> Tensor | None:
+        """The loss of a step, a number; None if there is nothing to learn from. `progress` goes to 1."""
+
+    @abc.abstractmethod
+    def look(self) -> dict[str, float]:
+        """How good `average` is: columns of the history, with `held out`, or `training` to keep the last."""
+
+    def rate(self, whole: float, progress: float) -> float:
+        """The learning rate, from the optimiser's own."""
+        falling = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
+        return whole * falling * min(1.0, 0.05 + progress / WARM_UP)
+
+    def train(self, options: TrainingOptions, epochs: int, title: str) -> dict[str, Any]:
+        """Train, from the checkpoint if asked; the network then has the weights to keep.
+
+        Args:
+            options: of the training.
+            epochs: how many, unless the options say so.
+            title: of the progress bar.
+
+        Returns:
+            Facts for the policy's file.
+
+        Raises:
+            InputError: the checkpoint is none, or one of another training.
+        """
+        if options.resume and checkpoint_file(self.out).is_file():
+            self.load(options.device)
+        self._go(options.epochs or epochs, options.seconds, title)
+        self.network.load_state_dict(self.best_weights)
+        write_history(self.out, self.history)
+        return options.facts() | {
+            "epochs": self.epoch,
+            "steps": self.step,
+            "seconds": self.spent,
+            "cpu_seconds": self.busy,
+            "held_out_loss" if "held out" in self.history[-1] else "training_loss": self.best,
+            "parameters": sum(p.numel() for p in self.network.parameters()),
+            "torch": torch.__version__,
+        }
+
+    def _go(self, epochs: int, seconds: float | None, title: str) -> None:
+        started, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
+        progress = self.epoch / epochs
+        with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
+            while progress < 1.0:
+                batches = self.batches()
+                for i, batch in enumerate(batches, start=1):
+                    self._take_step(batch, progress)
+                    self.spent, self.busy = time.perf_counter() - started, time.process_time() - busy
+                    progress = (self.epoch + i / len(batches)) / epochs
+                    if seconds is not None and (progress := max(progress, self.spent / seconds)) >= 1.0:
+                        break
+                self.epoch += 1
+                bar.update()
+                if progress >= 1.0 or self.epoch % max(1, epochs // self.looks) == 0:
+                    bar.set_postfix_str(f"loss {self._look():.6g}")
+                    self.save()
+
+    def _take_step(self, batch: Any, progress: float) -> None:
+        for group, whole in zip(self.optimiser.param_groups, self.rates, strict=True):
+            group["lr"] = self.rate(whole, progress)
+        loss = self.loss(batch, progress)
+        self.step += 1
+        if loss is None:
+            return
+        self.optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.clip_norm, foreach=True)
+        if not torch.isfinite(norm):
+            return
+        self.optimiser.step()
+        keep = min(self.average_decay, 1.0 - 1.0 / (1.0 + self.step / 10.0))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - keep)
+
+    def _look(self) -> float:
+        with torch.no_grad():
+            row = {"epoch": self.epoch, "step": self.step, "seconds": self.spent} | self.look()
+        self.history.append(row)
+        found = row.get("held out", row.get("training", math.nan))
+        if "held out" not in row or found < self.best:
+            self.best, self.best_weights = found, copy.deepcopy(self.average.state_dict())
+        return found
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        state: dict[str, Any] = {name: getattr(self, name) for name in self.progress}
+        state |= {name: getattr(self, name).state_dict() for name in ("network", "average", "optimiser")}
+        buffer = io.BytesIO()
+        torch.save(state | {"generator": self.generator.get_state()}, buffer)
+        write_atomically(checkpoint_file(self.out), buffer.getvalue())
+
+    def load(self, device: str) -> None:
+        """Go on from the checkpoint, which is read without trust.
+
+        Raises:
+            InputError: it is no checkpoint, or one of another training.
+        """
+        path = checkpoint_file(self.out)
+        try:
+            state = torch.load(path, weights_only=True, map_location=device)
+            for name in ("network", "average", "optimiser"):
+                getattr(self, name).load_state_dict(state[name])
+            for name in self.progress:
+                setattr(self, name, state[name])
+            self.generator.set_state(state["generator"].cpu())
+        except Exception:  # of pickle, zipfile and torch alike
+            problem = "is no checkpoint of this training; remove it, or train without --resume"
+            raise InputError(path, "", problem) from None
+
+
+@contextlib.contextmanager
+def repeatable() -> Iterator[None]:
+    """Train so that results repeat: on one thread, from which these networks lose nothing.
+
+    A GPU convolves in single precision, as the CPU does (cuDNN's default keeps ten bits), and the same
+    way every time.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+            yield
+    finally:
+        torch.set_num_threads(threads)

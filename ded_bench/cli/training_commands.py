@@ -7,7 +7,7 @@ import contextlib
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ded_bench.cli.arguments import (
     CASE_HELP,
@@ -24,40 +24,19 @@ from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import trainable
-from ded_bench.problem.ac_case import TRUTHS, AcCase
 from ded_bench.problem.benchmark import problem_folder, select_split
 from ded_bench.problem.case import Case
 from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.surrogates.find import TRAINED
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-#: Kind of model that only AC trajectories are identified with.
-SWING = "swing"
-#: The method whose weights fit every grid: training can start from another's, and takes no Koopman model.
-FITS_EVERY_GRID = "ded-dpc-shared"
-
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "train-ko", "identify the Koopman model from simulated trajectories")
-    p.add_argument(
-        "--kind",
-        choices=(*TRAINED, SWING),
-        default=TRAINED[0],
-        help="ours, the paper's recipe, or nonlinear swing equations (--truth ac)",
-    )
+    p.add_argument("--kind", choices=TRAINED, default=TRAINED[0], help="ours, or the paper's recipe")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
-    p.add_argument(
-        "--truth", choices=TRUTHS, default=TRUTHS[0], help="network; ac: model koopman-ac or swing-ac"
-    )
-    p.add_argument("--noise", type=positive_number, metavar="HZ", help="of measured frequencies (--truth ac)")
-    p.add_argument(
-        "--degree", type=positive, metavar="D", help=f"of the polynomials (--kind {SWING}; default: 4)"
-    )
     p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
@@ -67,7 +46,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--model", default="koopman", help=MODEL_HELP)
+    p.add_argument("--model", default="", help=f"to train on: {MODEL_HELP}; default: {TRAINED[0]}")
     p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     budget = p.add_mutually_exclusive_group()
     budget.add_argument("--seconds", type=positive_number, metavar="S", help="train for so long")
@@ -87,59 +66,34 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--results", type=Path, help="results folder: gives models and optimal schedules")
     p.add_argument("--limit", type=positive, default=10, help="how many test instances' optimal schedules")
     p.add_argument("--draws", type=positive, default=30, metavar="N", help="drawn schedules, of all kinds")
-    p.add_argument("--exchange", type=positive, metavar="N", help="bound of all lifted models, on N pairs")
     p.set_defaults(run=_rollouts)
 
 
 def _train_ko(a: argparse.Namespace) -> int:
     from ded_bench.surrogates.find import model_file
 
-    case, is_ac = Case.load(a.case), a.truth == "ac"
-    if a.noise and not is_ac:
-        raise InputError("--noise", f"{a.noise:g}", "is for --truth ac")
-    if a.degree and a.kind != SWING:
-        raise InputError("--degree", str(a.degree), f"is for --kind {SWING}")
-    if a.kind == (TRAINED[1] if is_ac else SWING):
-        raise InputError("--kind", a.kind, f"is not for --truth {a.truth}")
-    out = a.out or model_file(a.results or default_results(case), f"{a.kind}-ac" if is_ac else a.kind)
+    case = Case.load(a.case)
+    out = a.out or model_file(a.results or default_results(case), a.kind)
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
-    if a.kind == TRAINED[1]:
-        with _needing_torch():
-            _find_torch()
+    is_paper = a.kind == TRAINED[1]
+    if is_paper:
+        _find_torch()
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
-    if is_ac:
-        return _train_ko_ac(a, case, out)
     from ded_bench.analysis.rollouts import rollout_table
     from ded_bench.surrogates.identify import held_out, identify
     from ded_bench.surrogates.linear import nominal_model
 
-    if a.kind == "koopman":
-        model = identify(case, a.seed, a.count)
-    else:
+    if is_paper:
         with _needing_torch():
             from ded_bench.surrogates.koopman_paper import identify_paper
         model = identify_paper(case, a.seed, a.count)
+    else:
+        model = identify(case, a.seed, a.count)
     model.save(out)
-    return _told(out, rollout_table(case, [nominal_model(case), model], held_out(case, a.seed)))
-
-
-def _train_ko_ac(a: argparse.Namespace, case: Case, out: Path) -> int:
-    from ded_bench.evaluate.ac_rollouts import ac_rollout_table
-    from ded_bench.koopman.identify_ac import identify_ac
-    from ded_bench.koopman.identify_swing import DEGREE, identify_swing
-
-    data = AcCase.of(case)
-    drawn = case, data, a.seed, a.count, a.noise or 0.0
-    model = identify_swing(*drawn, a.degree or DEGREE) if a.kind == SWING else identify_ac(*drawn)
-    model.save(out)
-    return _told(out, ac_rollout_table(case, data, model, a.seed))
-
-
-def _told(out: Path, table: pd.DataFrame) -> int:
-    """Write and print a new model's errors."""
+    table = rollout_table(case, [nominal_model(case), model], held_out(case, a.seed))
     write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))
     print(table.to_string(index=False, float_format="{:.3g}".format))
     print(f"wrote {out}")
@@ -156,61 +110,67 @@ def _train_dpc(a: argparse.Namespace) -> int:
     case.check_regimes(regimes)
     methods = [get_method(name) for name in a.method or trainable()]
     jobs = [(method.name, regime) for method in methods for regime in regimes]
-    if a.start and {name for name, _ in jobs} != {FITS_EVERY_GRID}:
-        raise InputError("--start", str(a.start), f"is for {FITS_EVERY_GRID} alone")
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method and regime with --out")
     for method in methods:
         if not method.trainer:
             _ = method.train  # says that it is not trained
     if any(method.trainer.startswith("ded_bench.") for method in methods):
-        with _needing_torch():
-            _find_torch()
+        _find_torch()
+    for method in methods if a.start else ():
+        if not method.takes_start:
+            raise InputError("--start", str(a.start), f"{method.name} does not start from other weights")
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
     if min(a.workers, len(jobs)) == 1:
         for job in jobs:
-            print(train_one(a, *job), flush=True)
+            print(_train_one(a, *job), flush=True)
         return 0
     failures = 0
     with Workers(min(a.workers, len(jobs))) as pool:
-        for job, said in pool.imap(((train_one, (a, *job)) for job in jobs), jobs):
+        for job, said in pool.imap(((_train_one, (a, *job)) for job in jobs), jobs):
             told = said if isinstance(said, str) else f"{' '.join(job)}: {reason_of(said)}"
             failures += not isinstance(said, str)
             print(told, flush=True)
     return 1 if failures else 0
 
 
-def train_one(a: argparse.Namespace, name: str, regime: str) -> str:
+def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     """Train one policy as the command's options say; returns what to tell."""
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
-    from ded_bench.run.code import code_of
-    from ded_bench.surrogates.find import find_model
+    from ded_bench.run.environment import version
 
-    method, case = get_method(name), Case.load(a.case)
-    setting: dict[str, Any] = {"epochs": a.epochs} if a.epochs else {}
+    case = Case.load(a.case)
     results = a.results or default_results(case)
     out: Path = a.out or policy_file(results, name, regime, a.model)
     if out.exists() and not (a.force or a.resume):
         return f"{out} is there already (--force trains anew)"
     with _needing_torch():
-        train = method.train
-    name_of_model = "linear" if name == FITS_EVERY_GRID else a.model  # which every case has
-    model = find_model(case, name_of_model, search_folders(case, results))
+        train = get_method(name).train
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)
-    code = code_of(method.trainer) if method.trainer.startswith("ded_bench.") else ""
-    options = TrainingOptions(a.seed, a.seconds, a.device, a.resume, code, a.start)
-    facts = train(case, regime, instances, model, out, options, **setting).training
+    options = TrainingOptions(
+        seed=a.seed,
+        seconds=a.seconds,
+        epochs=a.epochs,
+        device=a.device,
+        resume=a.resume,
+        start=a.start,
+        model=a.model,
+        search=search_folders(case, results),
+        version=version(),
+    )
+    facts = train(case, regime, instances, out, options).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
 
 
 def _find_torch() -> None:
-    """Fail as an import would, without the seconds that one takes."""
-    if importlib.util.find_spec("torch") is None:
-        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+    """Fail as an import of torch would, without the seconds that one takes."""
+    with _needing_torch():
+        if importlib.util.find_spec("torch") is None:
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
 
 @contextlib.contextmanager
@@ -226,7 +186,7 @@ def _needing_torch() -> Iterator[None]:
 
 def _rollouts(a: argparse.Namespace) -> int:
     from ded_bench.results.rows import Results
-    from ded_bench.surrogates.find import MODELS, TRAJECTORY_AC, find_surrogate
+    from ded_bench.surrogates.find import MODELS, find_surrogate
 
     chosen = select_split(a.case, limit=a.limit)
     case = chosen.case
@@ -235,22 +195,16 @@ def _rollouts(a: argparse.Namespace) -> int:
     from ded_bench.analysis.paper_numbers import read_paper
     from ded_bench.analysis.reference import choose_reference
     from ded_bench.analysis.rollouts import all_rollouts
-    from ded_bench.evaluate.lifted_bound import EXCHANGED, exchange_table
 
     surrogates = []
     for name in MODELS:
-        if name != TRAJECTORY_AC:  # it stands for another network than the one simulated here
-            try:
-                surrogates.append(find_surrogate(case, name, search_folders(case, results.folder)))
-            except InputError as error:
-                say(f"left out: {error}")
+        try:
+            surrogates.append(find_surrogate(case, name, search_folders(case, results.folder)))
+        except InputError as error:
+            say(f"left out: {error}")
     reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
     optimal = dict.fromkeys((reference.method, "ded-slp"))
     instances = [instance for instance, _ in chosen.instances]
     table = all_rollouts(case, results, instances, surrogates, tuple(optimal), a.draws)
-    if a.exchange:
-        exchanged = exchange_table(case, surrogates, a.exchange)
-        write_atomically(results.paths.model_errors(EXCHANGED), exchanged.to_csv(index=False))
-        print(exchanged.to_string(index=False, float_format="{:.3g}".format), end="\n\n")
     print(table.to_string(index=False, float_format="{:.3g}".format))
     return 0

@@ -99,6 +99,11 @@ class Method:
         trainer: Trainer = importlib.import_module(self.trainer).train
         return trainer
 
+    @property
+    def takes_start(self) -> bool:
+        """Whether its training can start from the weights of another policy."""
+        return bool(getattr(importlib.import_module(self.trainer), "TAKES_START", False))
+
 
 METHODS: dict[str, Method] = {
     method.name: method

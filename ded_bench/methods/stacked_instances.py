@@ -66,7 +66,7 @@ def load_segments(case: Case, instances: Sequence[Instance]) -> Array:
     """Linear pieces of the loads: (start in s, injection there in pu, slope in pu/s) of one after another.
 
     Returns:
-        Shape (batch, n_load, n_segments, 3). Rows of fewer segments are filled with such that start at `NEVER`.
+        Shape (batch, n_load, n_segments, 3); rows of fewer segments are filled with `NEVER`.
     """
     paths = [_segments(i.load[bus]) for i in instances for bus in case.loads]
     longest = max(map(len, paths), default=0)

@@ -110,9 +110,7 @@ class TrainedPolicy(abc.ABC):
         return Artifact("policy", cls.method, cls.load(path, case, regime).fingerprint, path)
 
 
-def as_solver(
-    scope: Scope, answer: Callable[[Instance], Schedule], iterations: int | None = None
-) -> Solver:
+def as_solver(scope: Scope, answer: Callable[[Instance], Schedule], iterations: int | None = None) -> Solver:
     """Return a policy as a method; `solve_s` is all from the instance to the powers at the knots.
 
     What the first answer costs (compilation, libraries, tables) is paid here, by a draw of policy training,

@@ -35,12 +35,10 @@ class TrainingRun(abc.ABC):
     """
 
     #: What a checkpoint holds beside the states of network, average, optimiser and generator.
-    progress = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
+    progress: tuple[str, ...] = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
     clip_norm, average_decay, looks = CLIP_NORM, AVERAGE, LOOKS
 
-    def __init__(
-        self, network: nn.Module, optimiser: torch.optim.Optimizer, seed: int, out: Path
-    ) -> None:
+    def __init__(self, network: nn.Module, optimiser: torch.optim.Optimizer, seed: int, out: Path) -> None:
         self.network, self.optimiser, self.generator = network, optimiser, torch.Generator().manual_seed(seed)
         self.rates = [float(group["lr"]) for group in optimiser.param_groups]
         self.out, self.average = out, copy.deepcopy(network)

@@ -168,7 +168,9 @@ def _project_response(
 
 
 @compiled
-def _improve(p: Array, gradient: Array, given: AdmmProblems, b: int, limits: AdmmLimits, setting: Array) -> None:
+def _improve(
+    p: Array, gradient: Array, given: AdmmProblems, b: int, limits: AdmmLimits, setting: Array
+) -> None:
     """Minimise the quadratic model around a schedule, in the modes of the mean stiffness."""
     points = (given.offset.shape[1] - 1) // (len(p) - 1)
     per_unit = 1.0 / limits.unit**2
@@ -205,7 +207,13 @@ def _loss(
 
 @compiled
 def _respond(
-    powers: Array, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes, omega: Array32, p_slack: Array32
+    powers: Array,
+    given: AdmmProblems,
+    b: int,
+    limits: AdmmLimits,
+    modes: Modes,
+    omega: Array32,
+    p_slack: Array32,
 ) -> None:
     """What a schedule does: ω (n_points, n_gen) and P_s (n_points,); see `ModalGrid.respond`."""
     (n, n_gen), n_points = powers.shape, len(p_slack)

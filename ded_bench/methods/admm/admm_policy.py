@@ -1,4 +1,4 @@
-"""Learned ADMM (`ded-admm`): a few iterations whose penalties and step sizes are learned; see `admm_inference`.
+"""Learned ADMM (`ded-admm`): a few iterations whose penalties are learned; see `admm_inference`.
 
 The weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
 and P_0 hold for any weights. More iterations, along the trajectory of the answer, improve it.

@@ -4,8 +4,8 @@ With x the generators' angles relative to those at t = 0 and the same damping ra
 
     M ẍ + γ M ẋ + (S + ΔS(t)) x = P - P_0 - T (L - L_0) - r(t)
 
-where S and T are the reduced stiffness and load share of the nominal point, ΔS is what stiffness changes along
-a trajectory, and r is all that is not in them. In modal coordinates x = q shape each mode is an oscillator of
+where S and T are the reduced stiffness and load share of the nominal point, ΔS is what stiffness changes
+along a trajectory, and r is all that is not in them. In modal coordinates x = q shape each mode is an oscillator of
 its own, which is advanced exactly from one point of the time grid to the next under an input that is linear
 between them.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,8 @@ Array32 = NDArray[np.float32]
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int_]
 
+#: For parts of a loop that a call would slow down.
+inlined = numba.njit(inline="always")
 #: Grid points for which C is held: it changes over many seconds.
 HELD = 4
 
@@ -110,13 +113,15 @@ def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> 
                 kicked[i] = speed[b, k, i] - kick[i]
 
 
-@compiled
+@inlined
 def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Floats) -> None:
     """Half a kick by C, for the grid points from k on: C in the middle of them."""
     middle, part = k + 0.5 * (HELD - 1), 0
     while part + 2 < len(modes.stiffness_points) and middle > modes.stiffness_points[part + 1]:
         part += 1
-    later = (middle - modes.stiffness_points[part]) / (modes.stiffness_points[part + 1] - modes.stiffness_points[part])
+    later = (middle - modes.stiffness_points[part]) / (
+        modes.stiffness_points[part + 1] - modes.stiffness_points[part]
+    )
     shares[1] = modes.half * min(later, 1.0)
     shares[0] = modes.half - shares[1]
     for j in range(len(held)):
@@ -124,7 +129,7 @@ def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Fl
             held[j, i] = shares[0] * change[b, part, j, i] + shares[1] * change[b, part + 1, j, i]
 
 
-@compiled
+@inlined
 def _add_product(matrix: Floats, rows: Floats, b: int, k: int, found: Floats) -> None:
     """Add a symmetric matrix times one of the rows, four columns at a time."""
     n = len(found)

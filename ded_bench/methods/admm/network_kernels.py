@@ -1,7 +1,7 @@
 """The network along a trajectory, compiled: power flow, electrical power, stiffness, inputs of the modes.
 
-Power flow and Kron reduction eliminate buses. A bus whose lines have weights w_i is a star; without it there is
-a mesh of lines of weights w_i w_j / Σ w. Buses of few lines go first (minimum degree), so that networks of
+Power flow and Kron reduction eliminate buses. A bus whose lines have weights w_i is a star; without it there
+is a mesh of lines of weights w_i w_j / Σ w. Buses of few lines go first (minimum degree), so that networks of
 hundreds of buses stay sparse.
 """
 

@@ -8,11 +8,9 @@ from ded_bench.methods.admm.modal_kernels import oscillators
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
-#: `modal_change` treats so many modes at once, each in a column of an array of constant shape, without which
-#: loops over modes are not vectorised. First rows of: maps to q and q̇; the quadratic form of an interval and
-#: the value function, upper triangles; the linear part of the latter; the gradient; gains; and (q, q̇, v).
+#: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in one
+#: array of constant shape.
 LANES = 8
-MAP, STAGE, VALUE, LINEAR, FORCE, GAIN, STATE, ROWS = 0, 8, 18, 24, 27, 28, 32, 35
 
 
 @compiled
@@ -76,79 +74,79 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
         change: receives v, likewise; 0 at the first knot.
     """
     n, n_modes = gradient.shape
-    s = np.empty((ROWS, LANES))
+    s = np.empty((35, LANES))
+    to_q, to_speed = s[0:4], s[4:8]  # (q, q̇, v, v⁺) of a knot to (q⁺, q̇⁺) of the next
+    stage = s[8:18]  # weights of an interval, upper triangle of a 4 × 4 matrix, row by row
+    value, linear = s[18:24], s[24:27]  # cost to go, in (q, q̇, v): upper triangle of 3 × 3, linear part
+    gain, pull, state = s[27:31], s[31], s[32:35]  # v⁺ = -gain[:3] (q, q̇, v) - gain[3]; gradient; (q, q̇, v)
     gains = np.empty((n - 1, 4, LANES))
     for first in range(0, n_modes, LANES):
         used = min(LANES, n_modes - first)
         s[:] = 0.0
         for m in range(used):
-            _load_mode(maps, outputs, weights, first + m, m, s)
-        s[STAGE + 7] += weights[1]
-        s[STAGE + 8] -= weights[1]
-        s[STAGE + 9] += weights[1] + weights[0]
+            mode, at = first + m, 0
+            for r in range(4):
+                to_q[r, m], to_speed[r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
+                for c in range(r, 4):
+                    for i in range(1, len(maps)):
+                        stage[at, m] += (
+                            weights[2] * outputs[0, mode] * maps[i, 1, r, mode] * maps[i, 1, c, mode]
+                        )
+                        stage[at, m] += (
+                            weights[3] * outputs[1, mode] * maps[i, 0, r, mode] * maps[i, 0, c, mode]
+                        )
+                    at += 1
+        stage[7] += weights[1]
+        stage[8] -= weights[1]
+        stage[9] += weights[1] + weights[0]
         for k in range(n - 2, -1, -1):
             for m in range(used):
-                s[FORCE, m] = gradient[k + 1, first + m]
+                pull[m] = gradient[k + 1, first + m]
             for m in range(LANES):
-                a0, a1, a2, a3 = s[MAP, m], s[MAP + 1, m], s[MAP + 2, m], s[MAP + 3, m]
-                b0, b1, b2, b3 = s[MAP + 4, m], s[MAP + 5, m], s[MAP + 6, m], s[MAP + 7, m]
-                v00, v01, v02 = s[VALUE, m], s[VALUE + 1, m], s[VALUE + 2, m]
-                v11, v12, v22 = s[VALUE + 3, m], s[VALUE + 4, m], s[VALUE + 5, m]
-                l0, l1, l2 = s[LINEAR, m], s[LINEAR + 1, m], s[LINEAR + 2, m]
+                a0, a1, a2, a3 = to_q[0, m], to_q[1, m], to_q[2, m], to_q[3, m]
+                b0, b1, b2, b3 = to_speed[0, m], to_speed[1, m], to_speed[2, m], to_speed[3, m]
+                v00, v01, v02 = value[0, m], value[1, m], value[2, m]
+                v11, v12, v22 = value[3, m], value[4, m], value[5, m]
+                l0, l1, l2 = linear[0, m], linear[1, m], linear[2, m]
                 # rows of q and q̇ of the value after the interval, times the map to (q⁺, q̇⁺, v⁺)
                 q0, s0 = v00 * a0 + v01 * b0, v01 * a0 + v11 * b0
                 q1, s1 = v00 * a1 + v01 * b1, v01 * a1 + v11 * b1
                 q2, s2 = v00 * a2 + v01 * b2, v01 * a2 + v11 * b2
                 q3, s3 = v00 * a3 + v01 * b3 + v02, v01 * a3 + v11 * b3 + v12
-                own = np.divide(1.0, s[STAGE + 9, m] + a3 * q3 + b3 * s3 + v02 * a3 + v12 * b3 + v22)
-                u0 = s[STAGE + 3, m] + a0 * q3 + b0 * s3
-                u1 = s[STAGE + 6, m] + a1 * q3 + b1 * s3
-                u2 = s[STAGE + 8, m] + a2 * q3 + b2 * s3
+                own = np.divide(1.0, stage[9, m] + a3 * q3 + b3 * s3 + v02 * a3 + v12 * b3 + v22)
+                u0 = stage[3, m] + a0 * q3 + b0 * s3
+                u1 = stage[6, m] + a1 * q3 + b1 * s3
+                u2 = stage[8, m] + a2 * q3 + b2 * s3
                 g0, g1, g2 = u0 * own, u1 * own, u2 * own
-                force = a3 * l0 + b3 * l1 + l2 + s[FORCE, m]
-                s[GAIN, m], s[GAIN + 1, m], s[GAIN + 2, m], s[GAIN + 3, m] = g0, g1, g2, force * own
-                s[VALUE, m] = s[STAGE, m] + a0 * q0 + b0 * s0 - u0 * g0
-                s[VALUE + 1, m] = s[STAGE + 1, m] + a0 * q1 + b0 * s1 - u0 * g1
-                s[VALUE + 2, m] = s[STAGE + 2, m] + a0 * q2 + b0 * s2 - u0 * g2
-                s[VALUE + 3, m] = s[STAGE + 4, m] + a1 * q1 + b1 * s1 - u1 * g1
-                s[VALUE + 4, m] = s[STAGE + 5, m] + a1 * q2 + b1 * s2 - u1 * g2
-                s[VALUE + 5, m] = s[STAGE + 7, m] + a2 * q2 + b2 * s2 - u2 * g2
-                s[LINEAR, m] = a0 * l0 + b0 * l1 - g0 * force
-                s[LINEAR + 1, m] = a1 * l0 + b1 * l1 - g1 * force
-                s[LINEAR + 2, m] = a2 * l0 + b2 * l1 - g2 * force
+                force = a3 * l0 + b3 * l1 + l2 + pull[m]
+                gain[0, m], gain[1, m], gain[2, m], gain[3, m] = g0, g1, g2, force * own
+                value[0, m] = stage[0, m] + a0 * q0 + b0 * s0 - u0 * g0
+                value[1, m] = stage[1, m] + a0 * q1 + b0 * s1 - u0 * g1
+                value[2, m] = stage[2, m] + a0 * q2 + b0 * s2 - u0 * g2
+                value[3, m] = stage[4, m] + a1 * q1 + b1 * s1 - u1 * g1
+                value[4, m] = stage[5, m] + a1 * q2 + b1 * s2 - u1 * g2
+                value[5, m] = stage[7, m] + a2 * q2 + b2 * s2 - u2 * g2
+                linear[0, m] = a0 * l0 + b0 * l1 - g0 * force
+                linear[1, m] = a1 * l0 + b1 * l1 - g1 * force
+                linear[2, m] = a2 * l0 + b2 * l1 - g2 * force
             for r in range(4):
                 for m in range(LANES):
-                    gains[k, r, m] = s[GAIN + r, m]
+                    gains[k, r, m] = gain[r, m]
         change[0, first : first + used] = 0.0
         for k in range(n - 1):
             for r in range(4):
                 for m in range(LANES):
-                    s[GAIN + r, m] = gains[k, r, m]
+                    gain[r, m] = gains[k, r, m]
             for m in range(LANES):
-                q, speed, before = s[STATE, m], s[STATE + 1, m], s[STATE + 2, m]
-                v = -(s[GAIN, m] * q + s[GAIN + 1, m] * speed + s[GAIN + 2, m] * before) - s[GAIN + 3, m]
-                s[STATE, m] = (
-                    s[MAP, m] * q + s[MAP + 1, m] * speed + s[MAP + 2, m] * before + s[MAP + 3, m] * v
+                q, speed, before = state[0, m], state[1, m], state[2, m]
+                v = -(gain[0, m] * q + gain[1, m] * speed + gain[2, m] * before) - gain[3, m]
+                state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
+                state[1, m] = (
+                    to_speed[0, m] * q + to_speed[1, m] * speed + to_speed[2, m] * before + to_speed[3, m] * v
                 )
-                s[STATE + 1, m] = (
-                    s[MAP + 4, m] * q + s[MAP + 5, m] * speed + s[MAP + 6, m] * before + s[MAP + 7, m] * v
-                )
-                s[STATE + 2, m] = v
+                state[2, m] = v
             for m in range(used):
-                change[k + 1, first + m] = s[STATE + 2, m]
-
-
-@compiled
-def _load_mode(maps: Array, outputs: Array, weights: Array, mode: int, m: int, s: Array) -> None:
-    """Write one mode's map over an interval, and what ω and P_s weigh there, to a lane of `modal_change`."""
-    at = STAGE
-    for r in range(4):
-        s[MAP + r, m], s[MAP + 4 + r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
-        for c in range(r, 4):
-            for i in range(1, len(maps)):
-                s[at, m] += weights[2] * outputs[0, mode] * maps[i, 1, r, mode] * maps[i, 1, c, mode]
-                s[at, m] += weights[3] * outputs[1, mode] * maps[i, 0, r, mode] * maps[i, 0, c, mode]
-            at += 1
+                change[k + 1, first + m] = state[2, m]
 
 
 @compiled

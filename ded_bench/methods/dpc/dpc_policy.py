@@ -102,7 +102,8 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     Raises:
         InputError: there is no policy or model (names the command that makes one), or it does not fit.
     """
-    policy, steps = DispatchPolicy.find(case, regime, settings), read_options(Options, settings.options).refine
+    policy = DispatchPolicy.find(case, regime, settings)
+    steps = read_options(Options, settings.options).refine
     if not steps:
         return as_solver(policy.scope, lambda instance: policy(instance)[0])
     model = find_model(case, settings.model or DEFAULT_MODEL, settings.search)

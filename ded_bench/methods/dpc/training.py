@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
@@ -67,7 +67,9 @@ class Pool:
     coarse_free_response: Tensor  # of the surrogate, (batch, n_gen + 1, n_coarse)
 
     @staticmethod
-    def of(channels: Channels, inputs: StackedInstances, model: Koopman, network: Network, grid: Array) -> Pool:
+    def of(
+        channels: Channels, inputs: StackedInstances, model: Koopman, network: Network, grid: Array
+    ) -> Pool:
         """Convert channels, and compute free responses on a time grid; float32."""
         stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
@@ -102,7 +104,7 @@ class RolloutLoss:
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
         self.spacing_s = condensed.stride * condensed.model.dt_s
 
-    def powers(self, network: StagedNetwork, pool: Pool) -> Tensor:
+    def powers(self, network: nn.Module, pool: Pool) -> Tensor:
         """Schedules at the knots, (batch, n_knots, n_gen), pu: what `DispatchPolicy.powers` computes."""
         powers: Tensor = network(pool.start, pool.free_response, pool.sequence, pool.constants)
         return powers
@@ -197,7 +199,8 @@ class _DispatchTraining(TrainingRun):
         penalty = _penalty(excess)
         self.penalty[rows] = penalty.detach().cpu()
         price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress * self.judge.spacing_s
-        return cost.mean() + price * penalty.mean()
+        total: Tensor = cost.mean() + price * penalty.mean()
+        return total
 
     def look(self) -> dict[str, float]:
         """Loss of the average at the last price, its cost, and what it exceeds, Hz."""

@@ -5,9 +5,9 @@ With x the generators' angles relative to those at t = 0 and the same damping ra
     M ẍ + γ M ẋ + (S + ΔS(t)) x = P - P_0 - T (L - L_0) - r(t)
 
 where S and T are the reduced stiffness and load share of the nominal point, ΔS is what stiffness changes
-along a trajectory, and r is all that is not in them. In modal coordinates x = q shape each mode is an oscillator of
-its own, which is advanced exactly from one point of the time grid to the next under an input that is linear
-between them.
+along a trajectory, and r is all that is not in them. In modal coordinates x = q shape each mode is an
+oscillator of its own, which is advanced exactly from one point of the time grid to the next under an input
+that is linear between them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class ModalLinearisation:
-    """The grid linearised along a trajectory: what is not P in the modes' inputs, and changes of stiffness."""
+    """The grid linearised along a trajectory: what is not P in the modes' inputs, changes of stiffness."""
 
     offset: Array  # -T (L - L_0) - r + ΔS x of the trajectory, less P_0, (batch, n_points, n_modes)
     change: Array  # ΔS of the modes, (batch, n_stiffness, n_modes, n_modes), 1/s²

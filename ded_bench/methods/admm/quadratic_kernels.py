@@ -8,8 +8,8 @@ from ded_bench.methods.admm.modal_kernels import oscillators
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
-#: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in one
-#: array of constant shape.
+#: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in
+#: one array of constant shape.
 LANES = 8
 
 
@@ -89,12 +89,9 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
                 to_q[r, m], to_speed[r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
                 for c in range(r, 4):
                     for i in range(1, len(maps)):
-                        stage[at, m] += (
-                            weights[2] * outputs[0, mode] * maps[i, 1, r, mode] * maps[i, 1, c, mode]
-                        )
-                        stage[at, m] += (
-                            weights[3] * outputs[1, mode] * maps[i, 0, r, mode] * maps[i, 0, c, mode]
-                        )
+                        on_speed, on_q = weights[2] * outputs[0, mode], weights[3] * outputs[1, mode]
+                        stage[at, m] += on_speed * maps[i, 1, r, mode] * maps[i, 1, c, mode]
+                        stage[at, m] += on_q * maps[i, 0, r, mode] * maps[i, 0, c, mode]
                     at += 1
         stage[7] += weights[1]
         stage[8] -= weights[1]

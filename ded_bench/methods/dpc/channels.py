@@ -1,10 +1,9 @@
 """What the network of `ded-dpc` reads: channels over the knots, and what a schedule would do.
 
 Loads enter as forecasts at the knots, with their bend between two knots, and as the static dispatch that
-they would have if nothing had inertia. What loads and initial state do to frequency and slack power, and what
-a schedule would do to both, is told by the linearised grid, condensed on the knots (`Response`). The
-linearisation needs no data, so that a policy file holds no model; whatever model the policy is trained on, its
-network learns what the linearisation misses.
+they would have if nothing had inertia. What loads, initial state and a schedule do to frequency and slack
+power is told by the linearised grid, condensed on the knots (`Response`). The linearisation needs no data, so
+that a policy file holds no model; what it misses the network learns from the model that it is trained on.
 """
 
 from __future__ import annotations

@@ -7,34 +7,31 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ded_bench.surrogates.linear import linear_model
-from ded_bench.results.reference_run import search_folders
-from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper
-from ded_bench.methods.dpc.inputs import Inputs
-from ded_bench.methods.dpc.kernels import predict
-from ded_bench.methods.dpc.policy import find_policy
+from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper, predict
+from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.score import score
+from ded_bench.surrogates.find import search_folders
+from ded_bench.surrogates.linear import linear_model
 
 #: Bounds so wide, or so tight, that no schedule exceeds them, or every one does.
 WIDE, TIGHT = 1e6, 1e-3
 
 
-def drawn(case: Case, count: int) -> Inputs:
+def drawn(case: Case, count: int) -> StackedInstances:
     """Instances off their equilibrium: some angles too, which Table III has not."""
-    inputs = Inputs.of(case, [sample_instance(case, POLICY_SEED, i) for i in range(count)])
-    n_gen = len(case.generators)
-    rng = np.random.default_rng(1)
-    inputs.state[::2, :n_gen] = rng.normal(0.0, 0.01, inputs.state[::2, :n_gen].shape)
+    inputs = StackedInstances.of(case, [sample_instance(case, POLICY_SEED, i) for i in range(count)])
+    inputs.delta[::2] = np.random.default_rng(1).normal(0.0, 0.01, inputs.delta[::2].shape)
     return inputs
 
 
-def random_powers(case: Case, inputs: Inputs, size: float) -> Array:
+def random_powers(case: Case, inputs: StackedInstances, size: float) -> Array:
     """Schedules that go somewhere at random, within every limit, (batch, n_knots, n_gen), pu."""
     knots, rng = case.knot_times(case.sampling.horizon_s), np.random.default_rng(0)
     middle, half = 0.5 * (case.p_min + case.p_max), 0.5 * (case.p_max - case.p_min)
@@ -48,13 +45,12 @@ def keeper_of(case: Case, scale: float = 1.0) -> BoundKeeper:
     return dataclasses.replace(made, limit=scale * made.limit)
 
 
-def omega_of(keeper: BoundKeeper, inputs: Inputs, p_gen: Array) -> Array:
+def omega_of(keeper: BoundKeeper, inputs: StackedInstances, p_gen: Array) -> Array:
     """What the keeper predicts, (batch, n_gen, n_points), rad/s."""
     omega = np.full((len(inputs), p_gen.shape[2], len(keeper.limit)), np.nan)
     by_generator = np.ascontiguousarray(p_gen.swapaxes(1, 2))
-    exceeds = predict(
-        inputs.load, inputs.state, by_generator, keeper.model, keeper.limit, keeper.spacing_s, omega
-    )
+    state = np.concatenate([inputs.delta, inputs.omega], axis=1)
+    exceeds = predict(inputs.load, state, by_generator, keeper.model, keeper.limit, keeper.spacing_s, omega)
     assert exceeds == (np.abs(omega) > keeper.limit).any()
     return omega
 
@@ -73,7 +69,7 @@ def test_the_prediction_is_the_linear_models(case: Case) -> None:
     for b, omega in enumerate(omega_of(keeper, inputs, p_gen)):
         powers = np.stack([np.interp(points, knots, column) for column in p_gen[b].T], axis=1)
         both = np.hstack([powers, inputs[b : b + 1].p_load(points)[0]])
-        psi = both[0] @ model.b.T + model.lift[:, angles] @ inputs.state[b, :n_gen]
+        psi = both[0] @ model.b.T + model.lift[:, angles] @ inputs.delta[b]
         psi[:n_gen] += inputs.omega[b]
         np.testing.assert_allclose(omega.T, model.rollout(psi, both)[:, :n_gen], atol=1e-12)
     change = random_powers(case, inputs, 0.3) - p_gen
@@ -115,9 +111,9 @@ def test_excess_falls_and_limits_hold(case: Case, scale: float, size: float) -> 
 @pytest.mark.parametrize("index", [10_003, 10_302])
 def test_what_the_committed_policy_exceeds_is_mended(ninebus: Case, index: int) -> None:
     """Two validation instances on which the network alone exceeds the bound, simulated on the true system."""
-    policy = find_policy(ninebus, "TO", Settings(search=search_folders(ninebus)))
+    policy = DispatchPolicy.find(ninebus, "TO", Settings(search=search_folders(ninebus)))
     instance = sample_instance(ninebus, VALIDATION_SEED, index)
-    inputs = Inputs.of(ninebus, [instance])
+    inputs = StackedInstances.of(ninebus, [instance])
     alone, kept = (
         score(ninebus, instance, Schedule(policy.knots, p[0]), "TO")
         for p in (policy.network_powers(inputs), policy.powers(inputs))

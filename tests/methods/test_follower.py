@@ -6,32 +6,37 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.methods.dpc.differentiable_follower import Clip, Follow
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import follow, track
+from ded_bench.methods.torch_follower import follow_within
 from ded_bench.problem.compiled import compiled
 
+LOW, HIGH, STEP = np.array([-0.5, -0.6, -9.0]), np.array([0.4, 0.8, 9.0]), np.array([0.1, 0.3, 0.5])
 
-def test_follower_in_torch_one_by_one_and_in_batches_agree() -> None:
+
+def test_follower_compiled_in_torch_and_one_by_one_agree() -> None:
     rng = np.random.default_rng(0)
-    targets, start = rng.uniform(-1, 1, (7, 20, 3)), rng.uniform(-1, 1, (7, 3))
-    step = np.array([0.1, 0.3, 0.5])
-    p = follow(targets, start, step)
+    targets, start = rng.uniform(-1, 1, (7, 20, 3)), np.full((7, 3), 0.1)
+    p = np.concatenate([start[:, None], targets], axis=1)
+    track(p, LOW, HIGH, STEP)
+    np.testing.assert_array_equal(follow(np.clip(targets, LOW, HIGH), start, STEP), p)
     for b in range(7):
-        np.testing.assert_array_equal(follow(targets[b : b + 1], start[b : b + 1], step)[0], p[b])
-    torch_p = Follow.apply(torch.as_tensor(targets), torch.as_tensor(start), torch.as_tensor(step))
-    np.testing.assert_array_equal(torch_p.numpy(), p)
-    np.testing.assert_allclose(np.abs(np.diff(p, axis=1)).max(axis=(0, 1)), step)
+        alone = follow(np.clip(targets[b : b + 1], LOW, HIGH), start[:1], STEP)
+        np.testing.assert_array_equal(alone[0], p[b])
+    found = follow_within(*map(torch.as_tensor, (targets, start, LOW, HIGH, STEP)))
+    np.testing.assert_array_equal(found.numpy(), p)
+    np.testing.assert_allclose(np.abs(np.diff(p, axis=1)).max(axis=(0, 1)), STEP)
     slow = follow(targets, start, np.full(3, 10.0))
     np.testing.assert_array_equal(slow[:, 1:], targets)  # without a limit it is where it should be
 
 
 def test_gradient_of_the_follower_is_the_recursions() -> None:
+    """Where no target lies beyond a bound."""
     rng = np.random.default_rng(1)
     targets = torch.tensor(rng.uniform(-1, 1, (5, 12, 2)), requires_grad=True)
     start = torch.tensor(rng.uniform(-1, 1, (5, 2)))
     weight = torch.tensor(rng.normal(size=(5, 13, 2)))
-    step = torch.tensor([0.3, 0.5], dtype=torch.float64)
-    (weight * Follow.apply(targets, start, step)).sum().backward()
+    low, high, step = torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]), torch.tensor([0.3, 0.5])
+    (weight * follow_within(targets, start, low.double(), high.double(), step.double())).sum().backward()
     plain = targets.detach().clone().requires_grad_()
     p = [start]
     for target in plain.unbind(1):
@@ -41,13 +46,12 @@ def test_gradient_of_the_follower_is_the_recursions() -> None:
     assert 0 < int((targets.grad == 0).sum()) < targets.numel()
 
 
-def test_clip_lets_descent_lead_back_inside() -> None:
-    value = torch.tensor([-2.0, -2.0, 0.5, 3.0, 3.0], requires_grad=True)
-    low, high = torch.tensor(0.0), torch.tensor(1.0)
-    clipped = Clip.apply(value, low, high)
-    (clipped * torch.tensor([1.0, -1.0, 2.0, 1.0, -1.0])).sum().backward()
-    torch.testing.assert_close(clipped.detach(), torch.tensor([0.0, 0.0, 0.5, 1.0, 1.0]))
-    torch.testing.assert_close(value.grad, torch.tensor([0.0, -1.0, 2.0, 1.0, 0.0]))
+def test_a_target_beyond_a_bound_can_come_back() -> None:
+    low, high, far = torch.zeros(1), torch.ones(1), torch.full((1,), 9.0)
+    for target, sign, expected in ((2.0, 1.0, 1.0), (2.0, -1.0, 0.0), (-2.0, 1.0, 0.0), (-2.0, -1.0, -1.0)):
+        targets = torch.full((1, 1, 1), target, requires_grad=True)
+        (sign * follow_within(targets, torch.zeros(1, 1), low, high, far)).sum().backward()
+        assert float(targets.grad) == expected
 
 
 def test_functions_are_compiled_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,176 @@
+"""The grid of the learned ADMM: loads, power flows, first schedules, linearisation along trajectories."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from ded_bench.methods.admm.admm_training import LOOSE, TIGHT, iterations_of
+from ded_bench.methods.admm.modal_grid import SMALLEST_COST
+from ded_bench.methods.admm.network_kernels import (
+    MISMATCH,
+    follow_trajectory,
+    plan_elimination,
+    start_angles,
+)
+from ded_bench.methods.admm.problems import POINTS, Problems, sampled
+from ded_bench.methods.stacked_instances import load_segments
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import POLICY_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
+from tests.methods.policies import in_operation, modal_grid, started
+
+GRIDS = ("9bus", "two-area", "39bus")
+
+
+def test_response_is_what_happens(case: Case) -> None:
+    """Against the simulation of the nonlinear equations: less than 4 % of the tightest bound."""
+    horizon = case.sampling.horizon_s
+    grid = modal_grid(case, horizon)
+    for instance in (sample_instance(case, POLICY_SEED, 1), in_operation(case, 2, horizon)):
+        start = grid.start(Problems.of(case, [instance], grid.points))
+        _, omega, p_slack = grid.respond(start.schedule, start, grid.along_first(start))
+        truth = simulate(case, instance, Schedule(grid.knots, start.schedule[0]))
+        points = np.clip(np.round(grid.points / instance.dt_s).astype(int), 0, instance.steps)
+        near = np.abs(grid.points - instance.grid[points]) < 1e-3
+        assert np.abs(omega[0] - truth.omega[points])[near].max() < 0.04 * grid.bound + 1e-3
+        assert np.abs(p_slack[0] - truth.p_slack[points])[near].max() < 0.01
+
+
+def test_loads_around_kinks_are_means_weighted_by_hats(ninebus: Case) -> None:
+    """Against quadrature of the load times the hat function of each grid point."""
+    instance, points = sample_instance(ninebus, POLICY_SEED, 3), np.linspace(0.0, 60.0, 197)
+    values = sampled(load_segments(ninebus, [instance]), points)[0]
+    h = points[1]
+    offsets = np.linspace(-h, h, 4001)
+    hat = 1.0 - np.abs(offsets) / h
+    for k in range(1, len(points) - 1):
+        exact = (instance.p_load(ninebus, points[k] + offsets) * hat[:, None]).sum(axis=0) / hat.sum()
+        np.testing.assert_allclose(values[k], exact, atol=1e-7)
+
+
+def test_what_is_drawn_for_training_is_of_both_kinds(case: Case) -> None:
+    problems = started(modal_grid(case), 200)[0].problems
+    moved = np.abs(problems.delta).max(axis=1) > 0
+    assert 0.1 < moved.mean() < 0.5
+    assert np.isfinite(problems.load).all()
+    if case.schema_ != "ded-bench/case/1":
+        assert (problems.load[~moved] * case.load_nominal >= 0).all()
+
+
+def test_elimination_of_a_ring_makes_its_mesh_lines() -> None:
+    """Four buses in a ring, one kept: each elimination leaves a smaller ring, and no line twice."""
+    ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [0, 1]])  # two lines in parallel
+    plan = plan_elimination(ends, 4, [3])
+    assert set(plan.buses.tolist()) == {0, 1, 2}
+    edges = [
+        {bus, int(other)}
+        for bus, first, last in zip(plan.buses.tolist(), plan.first[:-1], plan.first[1:], strict=True)
+        for other in plan.neighbours[first:last]
+    ]
+    assert len(edges) == len({frozenset(edge) for edge in edges}) == 5  # four of the ring and one mesh line
+    assert [edges[e] for e in plan.of_line] == [set(line) for line in ends.tolist()]
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_power_flows_and_stiffness_along_a_trajectory_are_the_networks(name: str) -> None:
+    """Angles to the mismatch that is accepted, stiffness by the network's own, dense, linearisation."""
+    grid = modal_grid(Case.load(name))
+    (start, _), network = started(grid, 2), grid.network
+    problems, generators = start.problems, network.generators
+    moved = start.schedule[0, -1] - problems.p_initial[0] - start.taken[0, -1]
+    angles = start.theta[0, generators] + np.linspace(0.0, 1.0, 5)[:, None] * (moved @ grid.compliance)
+    loads = problems.load[0, np.linspace(0, len(grid.points) - 1, 5).astype(int)]
+    f, stiffness = np.empty_like(angles), np.empty((2, len(generators), len(generators)))
+    plan = plan_elimination(network.ends, network.n_bus, [network.slack, *generators.tolist()])
+    taken = np.array([0, len(angles) - 1])
+    assert follow_trajectory(grid.lines, plan, angles, loads, start.theta[0], taken, f, stiffness)
+    theta = network.power_flow(problems.p_initial[0], loads[0])
+    np.testing.assert_allclose(start.theta[0], theta, atol=10 * MISMATCH)
+    last = np.zeros(network.n_bus)
+    last[generators] = angles[-1]
+    ends, injections = network.solve_loads(last, network.load_injections(loads[-1]))
+    np.testing.assert_allclose(f[-1], injections[generators], atol=10 * MISMATCH)
+    for found, angles_there in zip(stiffness, (theta, ends), strict=True):
+        np.testing.assert_allclose(found, network.linearise(angles_there).stiffness, rtol=1e-4, atol=1e-4)
+
+
+def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
+    """Powers that no line can carry."""
+    grid = modal_grid(case)
+    plan = plan_elimination(grid.network.ends, grid.network.n_bus, [grid.network.slack])
+    wanted, theta = np.full(grid.network.n_bus, 1e3), np.empty(grid.network.n_bus)
+    assert not start_angles(grid.lines, plan, grid.theta, wanted, theta)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_first_schedules_follow_a_dispatch_within_ramps(name: str) -> None:
+    """Its cost, knot by knot, is that of linear programs; schedules start at P_0, keep bounds and ramps."""
+    grid = modal_grid(Case.load(name))
+    (start, _), case = started(grid, 4), grid.case
+    problems, n = start.problems, len(case.generators)
+    costs = []
+    for cost, before, loads in zip(
+        problems.cost, problems.p_initial, problems.load[:, ::POINTS], strict=True
+    ):
+        prices, found = np.append(cost[1:], [cost[0], cost[0]]), []
+        for j, load in enumerate(loads.sum(axis=1)):
+            step = np.zeros(n) if j == 0 else grid.ramp
+            reach = np.stack(
+                [np.maximum(case.p_min, before - step), np.minimum(case.p_max, before + step)], 1
+            )
+            slack = [(0.0, None), (0.0, None)]  # what the slack takes and gives
+            program = linprog(prices, A_eq=[[1.0] * n + [1.0, -1.0]], b_eq=[-load], bounds=[*reach, *slack])
+            before = program.x[:n]
+            found.append(program.fun)
+        costs.append(np.mean(found))
+    least = SMALLEST_COST * max(1.0, n / 2)
+    np.testing.assert_allclose(start.scale, np.maximum(costs, least), rtol=1e-9)
+    np.testing.assert_array_equal(start.schedule[:, 0], problems.p_initial)
+    assert (np.abs(np.diff(start.schedule, axis=1)) <= grid.ramp + 1e-12).all()
+    assert ((start.schedule >= case.p_min) & (start.schedule <= case.p_max))[:, 1:].all()
+
+
+def test_iterations_by_size_and_bound() -> None:
+    """Fewer on large grids, and where the bound is loose."""
+    found = {}
+    for name in ("9bus", "39bus"):
+        case = Case.load(name)
+        grid = modal_grid(case)
+        for regime in case.regimes:
+            grid.bound = case.omega_bound(regime)
+            found[name, regime] = iterations_of(grid)
+    assert found["39bus", "TO"] == TIGHT[0] > found["39bus", "NO"] == LOOSE[0]
+    assert found["9bus", "TO"] == TIGHT[1] // 2 > found["9bus", "NO"] == LOOSE[1] // 2
+
+
+def test_trajectory_is_averaged_before_the_network_is_asked(ninebus: Case) -> None:
+    """A fast swing leaves no trace at the knots."""
+    grid = modal_grid(ninebus, 60.0)
+    start, linear = started(grid, 2)
+    x = grid.respond(start.schedule, start, linear)[0]
+    k = np.arange(x.shape[1])
+    swing = 0.01 * np.cos(np.pi * k / POINTS * 2)[None, :, None]
+    swing[:, [0, -1]] = 0.0
+    calm, swung = grid.along(start, x), grid.along(start, x + swing)
+    np.testing.assert_allclose(swung.offset[:, POINTS:-POINTS], calm.offset[:, POINTS:-POINTS], atol=3e-3)
+
+
+@pytest.mark.parametrize("far", [np.inf, np.nan, 1e300])
+def test_a_trajectory_without_end_is_not_served(case: Case, far: float) -> None:
+    """A schedule under which the linearised grid swings up: nothing is raised, and the others are served."""
+    grid = modal_grid(case)
+    start, expected = started(grid, 3)
+    assert start.served.all()
+    n_flows = (len(grid.knots) - 1) // grid.every + 1
+    slow = np.zeros((3, n_flows, len(case.generators)))
+    expected = grid.linearise(start, slow)
+    slow[1, n_flows // 2 :] = far
+    found = grid.linearise(start, slow)
+    np.testing.assert_array_equal(start.served, [True, False, True])
+    assert all(np.isfinite(values).all() for values in dataclasses.astuple(found))
+    np.testing.assert_array_equal(found.offset[[0, 2]], expected.offset[[0, 2]])

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
-from ded_bench.surrogates.koopman import Koopman
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.model_artifact import model_artifact
+from ded_bench.methods.artifact import Artifact, model_artifact
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.methods.registry import Method
 from ded_bench.methods.solution import Settings, Solution, Solver
@@ -22,7 +21,16 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
-SETTINGS = {"default": {}, "cautious": {"share": 0.25}}
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """How it answers."""
+
+    slope: float = option(0.0, "pu per second")
+
+
 #: The line of the registry.
 LEARNED = Method("learned", "tests.learned_method", "Learned constant", trainer="tests.learned_method")
 
@@ -33,23 +41,15 @@ class Policy:
 
 
 def train(
-    case: Case,
-    regime: str,
-    instances: Sequence[Instance],
-    model: Koopman,
-    out: Path,
-    options: TrainingOptions,
-    /,
-    *,
-    epochs: int = 3,
-    share: float = 0.5,
+    case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
 ) -> Policy:
     """The generators' mean initial powers, approached from their lower limits."""
+    epochs, share, model = options.epochs or 3, 0.5, options.find_model(case)
     mean = np.mean([i.p_initial(case) for i in instances], axis=0)
     first = float(np.sum((mean - case.p_min) ** 2))
     errors = [first * (1.0 - share) ** (2 * epoch) for epoch in range(1, epochs + 1)]
     power = mean + (case.p_min - mean) * (1.0 - share) ** epochs
-    facts = {"epochs": epochs, "seconds": 0.0, "training_loss": errors[-1], "seed": options.seed}
+    facts = options.facts() | {"epochs": epochs, "seconds": 0.0, "training_loss": errors[-1]}
     write_arrays(out, {"power": power}, {"training": facts | {"model": model.kind}})
     write_history(out, [{"epoch": e, "seconds": 0.0, "training": error} for e, error in enumerate(errors, 1)])
     return Policy(facts)
@@ -63,9 +63,12 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     power = read_arrays(find_policy_file(LEARNED.name, case, regime, settings))[0]["power"]
+    slope = read_options(Options, settings.options).slope
 
     def solve(instance: Instance) -> Solution:
-        schedule = Schedule(np.array([0.0, instance.horizon_s]), np.array([power, power]))
+        schedule = Schedule(
+            np.array([0.0, instance.horizon_s]), np.array([power, power + slope * instance.horizon_s])
+        )
         return Solution(Status.POLICY, schedule, solve_s=1e-6)
 
     return solve

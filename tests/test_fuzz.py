@@ -29,12 +29,12 @@ from ded_bench.analysis.summary import claims, summary, table_times, worst
 from ded_bench.cli import commands
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
-from ded_bench.methods.dpc import policy as dpc_policy
+from ded_bench.methods.dpc.channels import Response
+from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
-from ded_bench.methods.dpc.response import Response
-from ded_bench.methods.dpc_paper import paper_policy
-from ded_bench.methods.dpc_paper.paper_features import n_channels
-from ded_bench.methods.dpc_paper.paper_network import PaperNetwork
+from ded_bench.methods.dpc_paper.paper_inference import n_channels
+from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy
+from ded_bench.methods.dpc_paper.paper_training import PaperNetwork
 from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.plants import score as scorer
 from ded_bench.problem.benchmark import Manifest, Split
@@ -107,8 +107,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
         plain = PaperNetwork(n_channels(case), case.p_min, case.p_max)
         response = Response.make(case, case.knot_times(instance.horizon_s))
         network = StagedNetwork(case, response, 2, 4, (1, 2))
-    paper_policy.Policy(scope, weights_of(plain), {"seed": 0}).save(folder / "paper.safetensors")
-    dpc_policy.DispatchPolicy.of(scope, network, {"seed": 0}).save(folder / "policy.safetensors")
+    PaperPolicy(scope, weights_of(plain), {"seed": 0}).save(folder / "paper.safetensors")
+    DispatchPolicy(scope, weights_of(network), {"seed": 0} | network.shape).save(folder / "policy.safetensors")
     return folder
 
 

@@ -200,11 +200,11 @@ def test_a_locale_without_arrows(tmp_path: Path) -> None:
 def test_only_policies_that_need_a_koopman_model_ask_for_one(
     problem: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    """`ded-dpc-shared` is trained on the grid itself."""
+    """`ded-admm` is trained on the grid itself."""
     monkeypatch.setattr("ded_bench.methods.admm.admm_training.STEPS", 1)
     regime = next(iter(Case.load(str(problem)).regimes))
     where = ("--case", str(problem), "--regime", regime, "--epochs", "1", "--results", str(tmp_path))
     assert main(["train-dpc", "--method", "ded-dpc", *where]) == 2
-    assert "not identified yet" in capsys.readouterr().err
-    assert main(["train-dpc", "--method", "ded-dpc-shared", *where]) == 0
-    assert (tmp_path / "policies" / f"ded-dpc-shared-{regime}.safetensors").is_file()
+    assert "not there yet" in capsys.readouterr().err
+    assert main(["train-dpc", "--method", "ded-admm", *where]) == 0
+    assert (tmp_path / "policies" / f"ded-admm-{regime}.safetensors").is_file()

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from ded_bench.run.shipping import pack
 
 from ded_bench.cli import main
-from ded_bench.surrogates.linear import linear_model
-from ded_bench.surrogates.find import model_file
 from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS, trainable
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.run.runner import make_tasks
-from ded_bench.run.shipping import pack
 from ded_bench.run.tasks import solve_task
+from ded_bench.surrogates.find import model_file
+from ded_bench.surrogates.linear import linear_model
 from tests.conftest import CASE_FILES
 from tests.learned_method import LEARNED
 
@@ -60,25 +60,26 @@ def test_it_is_trained_by_the_command(problem: Path, out: Path, capsys) -> None:
     before = path.read_bytes()
     assert train(problem, out, "--epochs", "9") == 0
     assert path.read_bytes() == before  # it is there already
-    assert train(problem, out, "--settings", "cautious", "--epochs", "2") == 0
-    assert policy_file(out, "learned", "TO", settings="cautious").is_file()
-    assert train(problem, out, "--settings", "bold") == 2
-    assert "--settings: bold: unknown to method learned (known: default, cautious)" in capsys.readouterr().err
+    assert train(problem, out, "--force", "--epochs", "9") == 0
+    assert path.read_bytes() != before
+    assert train(problem, out, "--model", "linear") == 0
+    assert policy_file(out, "learned", "TO", "linear").is_file()
+    assert train(problem, out, "--force", "--start", str(path)) == 2
+    assert "--start" in capsys.readouterr().err
 
 
 def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: Path, tmp_path: Path) -> None:
     """What its artifacts name travels with the task, and nothing else."""
-    train(problem, out, "--settings", "cautious")
     train(problem, out)
     chosen = select_split(problem)
-    settings = Settings("cautious", search=(out,))
+    settings = Settings("slope=0.001", search=(out,))
     (task, *_) = make_tasks(chosen.case, chosen.instances, ["learned"], ["TO"], settings)
     here, _ = solve_task(chosen.case, task)
     assert here.schedule is not None
     files = pack(settings, LEARNED.artifacts(chosen.case, "TO", settings))
     assert sorted(name for name, _ in files) == [
         "koopman/koopman.safetensors",
-        "policies/learned-TO-cautious.safetensors",
+        "policies/learned-TO.safetensors",
     ]
     elsewhere = dataclasses.replace(settings, search=(tmp_path / "nowhere",))
     there, _ = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere, files=files))
@@ -89,7 +90,7 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
 
 
 def test_the_command_names_what_it_trains(out: Path, problem: Path, capsys) -> None:
-    assert trainable() == ["ded-dpc-paper", "ded-dpc", "ded-dpc-shared", "learned"]
+    assert trainable() == ["ded-dpc-paper", "ded-dpc", "ded-admm", "learned"]
     with pytest.raises(SystemExit):
         main(["train-dpc", "--help"])
     told = capsys.readouterr().out

@@ -139,7 +139,7 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
     from ded_bench.methods.training_record import LOSSES, TrainingOptions
-    from ded_bench.run.environment import version
+    from ded_bench.run.environment import commit, version
 
     case = Case.load(a.case)
     results = a.results or default_results(case)
@@ -160,6 +160,7 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
         model=a.model,
         search=search_folders(case, results),
         version=version(),
+        commit=commit(),
     )
     facts = train(case, regime, instances, out, options).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]

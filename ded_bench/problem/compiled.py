@@ -25,14 +25,14 @@ def compiled(function: Function) -> Function:
         made: Any = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError:  # there is no such folder
         return cast(Function, numba.njit(nogil=True)(function))
-    made._cache._cache_file._source_stamp = sources_stamp()
+    made._cache._cache_file._version = sources_stamp()  # looked at before anything of the file is unpickled
     return cast(Function, made)
 
 
 @functools.cache
 def sources_stamp(package: Path = _PACKAGE) -> str:
-    """Changes with any source below a folder that holds compiled functions."""
-    digest = hashlib.sha256()
+    """Changes with Numba, and any source below a folder that holds compiled functions."""
+    digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
         if b"@compiled" in content:

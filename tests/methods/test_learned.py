@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from ded_bench.run.shipping import pack
 
 from ded_bench.cli import main
 from ded_bench.methods.policy_file import policy_file
@@ -18,8 +17,7 @@ from ded_bench.methods.registry import METHODS, trainable
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
-from ded_bench.run.runner import make_tasks
-from ded_bench.run.tasks import solve_task
+from ded_bench.run.tasks import make_tasks, pack, solve_task
 from ded_bench.surrogates.find import model_file
 from ded_bench.surrogates.linear import linear_model
 from tests.conftest import CASE_FILES

@@ -28,4 +28,4 @@ def test_a_change_in_any_compiled_file_counts(tmp_path: Path) -> None:
 
 
 def test_the_cache_of_a_function_has_the_stamp() -> None:
-    assert solve_angles._cache._cache_file._source_stamp == sources_stamp()
+    assert solve_angles._cache._cache_file._version == sources_stamp()

@@ -59,7 +59,7 @@ def plain_name(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class Column:
+class CsvColumn:
     """One column: how its cells are read."""
 
     name: str
@@ -233,7 +233,7 @@ def _text(value: Any) -> str:
     return " ".join(str(value).splitlines()) if isinstance(value, str) else str(value)
 
 
-def _column(field: dataclasses.Field[Any], hint: Any) -> Column:
+def _column(field: dataclasses.Field[Any], hint: Any) -> CsvColumn:
     choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     (kind,) = (choice for choice in choices if choice is not types.NoneType)
-    return Column(field.name, kind, field.default, **field.metadata)
+    return CsvColumn(field.name, kind, field.default, **field.metadata)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from ded_bench.analysis.compare import Change, Comparison, name_of
 from ded_bench.report.columns import Column
-from ded_bench.report.page import Table, to_markdown
+from ded_bench.report.page import PageTable, to_markdown
 
 #: Rows that a section of the printed comparison names; the rest are counted.
 SHOWN = 10
@@ -40,7 +40,7 @@ def to_text(comparison: Comparison) -> str:
         said = (f"{name_of(change.key)}: {_arrow(change)}" for change in found)
         lines += _section(f"{column}: {len(found)} of {c.common} common rows", said)
     if len(c.summary):
-        lines += ["", to_markdown(Table(c.summary, PRINTED))]
+        lines += ["", to_markdown(PageTable(c.summary, PRINTED))]
     verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
     return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
 

@@ -35,7 +35,16 @@ from ded_bench.report.grids import (
     slopes,
     trainings,
 )
-from ded_bench.report.page import Block, Heading, Items, Picture, Table, Text, render_html, render_markdown
+from ded_bench.report.page import (
+    Block,
+    Heading,
+    Items,
+    PageTable,
+    Picture,
+    Text,
+    render_html,
+    render_markdown,
+)
 from ded_bench.report.sources import Sources
 from ded_bench.run.environment import environment, now
 
@@ -94,7 +103,7 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     return [*files, out / "overview.md", out / "overview.html"]
 
 
-def _tables(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, Table]:
+def _tables(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, PageTable]:
     """All tables by the name of their file."""
     columns = (REGIME, TITLE, *(Column(grid.case.id, grid.case.id) for grid in grids))
     cells = {
@@ -110,12 +119,12 @@ def _tables(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, Table]:
     paid = "After how many schedules trainings have paid, beside linear programs that need none"
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
-        "grids": Table(sizes(grids), GRIDS, "The grids"),
-        **{name: Table(across(found, cell), columns, caption) for name, (caption, cell) in cells.items()},
-        "slopes": Table(fitted, SLOPES, "How time and memory grow with the number of generators"),
-        "trainings": Table(trainings(grids), TRAININGS, "What was trained"),
-        "payoff": Table(break_evens(grids), BREAK_EVEN, paid),
-        "online": Table(operated, (CASE, *ONLINE), loop),
+        "grids": PageTable(sizes(grids), GRIDS, "The grids"),
+        **{name: PageTable(across(found, cell), columns, caption) for name, (caption, cell) in cells.items()},
+        "slopes": PageTable(fitted, SLOPES, "How time and memory grow with the number of generators"),
+        "trainings": PageTable(trainings(grids), TRAININGS, "What was trained"),
+        "payoff": PageTable(break_evens(grids), BREAK_EVEN, paid),
+        "online": PageTable(operated, (CASE, *ONLINE), loop),
     }
 
 
@@ -134,7 +143,7 @@ def _number(name: str) -> Callable[[dict[str, Any]], str]:
 
 
 def _blocks(
-    grids: Sequence[Sources], out: Path, known: dict[str, Block], tables: dict[str, Table]
+    grids: Sequence[Sources], out: Path, known: dict[str, Block], tables: dict[str, PageTable]
 ) -> list[Block]:
     """The page."""
     made: list[Block] = [

@@ -76,7 +76,7 @@ class Items:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class PageTable:
     """A frame, the columns to print and a caption."""
 
     frame: pd.DataFrame
@@ -117,7 +117,7 @@ class Details:
     blocks: tuple[Block, ...]
 
 
-Block = Heading | Text | Items | Table | Picture | Details
+Block = Heading | Text | Items | PageTable | Picture | Details
 
 
 def folded(summary: str, *blocks: Block) -> list[Block]:
@@ -125,14 +125,14 @@ def folded(summary: str, *blocks: Block) -> list[Block]:
     return [Details(summary, blocks)] if blocks else []
 
 
-def usual_first(table: Table, usual: pd.Series[bool]) -> list[Block]:
+def usual_first(table: PageTable, usual: pd.Series[bool]) -> list[Block]:
     """A table of its usual lines, or of all if there are none; that of all is folded away."""
     if not usual.any() or usual.all():
         return [table]
-    return [Table(table.frame[usual], table.columns, table.caption), *folded("All lines", table)]
+    return [PageTable(table.frame[usual], table.columns, table.caption), *folded("All lines", table)]
 
 
-def to_markdown(table: Table) -> str:
+def to_markdown(table: PageTable) -> str:
     """A pipe table; numbers are right-aligned."""
     marks = ["---:" if numeric else "---" for numeric in table.numeric]
     lines = [[column.heading for column in table.columns], marks, *table.cells]
@@ -158,7 +158,7 @@ def _markdown(block: Block) -> str:
             made = f"> **Note:** {text}\n" if note else f"{text}\n"
         case Items(items):
             made = "".join(f"- {item}\n" for item in items)
-        case Table(caption=caption):
+        case PageTable(caption=caption):
             made = (f"**{caption}**\n\n" if caption else "") + to_markdown(block)
         case Picture(path, caption):
             made = f"![{_plain(caption)}]({path})\n\n*{caption}*\n"
@@ -199,7 +199,7 @@ def _html(block: Block, folder: Path) -> str:
             )
         case Items(items):
             return "<ul>" + "".join(f"<li>{_inline(item)}</li>" for item in items) + "</ul>"
-        case Table(caption=caption):
+        case PageTable(caption=caption):
             words = f"<figcaption>{_inline(caption)}</figcaption>" if caption else ""
             return f'<figure class="table">{words}<div class="scroll">{to_html(block)}</div></figure>'
         case Picture(path, caption):
@@ -211,7 +211,7 @@ def _html(block: Block, folder: Path) -> str:
             return f"<details><summary>{_inline(summary)}</summary>\n{within}\n</details>"
 
 
-def to_html(table: Table) -> str:
+def to_html(table: PageTable) -> str:
     """An HTML table; classes: numbers `number`, sentences `words`, the first line of a regime `first`."""
     kinds = [' class="number"' if numeric else "" for numeric in table.numeric]
     head = "".join(

@@ -28,7 +28,7 @@ from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.trajectory import Trajectory
-from ded_bench.report.page import Picture, Table
+from ded_bench.report.page import PageTable, Picture
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
@@ -124,7 +124,7 @@ class Draft:
     """What sections put on the page: all tables by name, all pictures by topic (see `figures.FIGURES`)."""
 
     sources: Sources
-    tables: Mapping[str, Table]
+    tables: Mapping[str, PageTable]
     pictures: Mapping[str, list[Picture]]
 
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ded_bench.cli import main
 from ded_bench.analysis.inspect_case import check_case, suggested_knots
+from ded_bench.cli import main
 from ded_bench.files.strict import write_record
 from ded_bench.methods import ed
-from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.benchmark import load_split
-from ded_bench.problem.sampling import VALIDATION_SEED, sample_instances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.score import score
+from ded_bench.problem.benchmark import load_split
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.sampling import VALIDATION_SEED, sample_instances
 
 
 def test_the_chain_has_the_mode_of_a_spring_and_a_mass(threebus: Case) -> None:

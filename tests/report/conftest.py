@@ -11,9 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from ded_bench.files.strict import write_atomically, write_record
+from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.report import figures
 
 HORIZON = 1.0

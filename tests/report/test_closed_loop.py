@@ -11,7 +11,7 @@ from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import online_rows, own_latency, sweeps
 from ded_bench.methods import ed
 from ded_bench.problem.sampling import sample_scenario
-from ded_bench.report.figures.operation import latency_figure
+from ded_bench.report.figures.latency import latency_figure
 from ded_bench.report.overview import write_overview
 from ded_bench.report.report import write_report
 from ded_bench.results.online_results import OnlineResults, OnlineRow, keep_trajectory

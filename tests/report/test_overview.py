@@ -11,14 +11,14 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.results.folder import ResultsFolder
 from ded_bench.report.figures.growth import GAP, growth_figure
 from ded_bench.report.grids import across, break_evens, read_grid, slopes
 from ded_bench.report.overview import write_overview
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results, Row
+from ded_bench.results.timing import TIMING, TimingRow
 from tests.reading import Page
 
 #: Generators of the shipped cases that the tests have rows of.

@@ -13,8 +13,8 @@ from ded_bench.report.page import (
     Details,
     Heading,
     Items,
+    PageTable,
     Picture,
-    Table,
     Text,
     render_html,
     render_markdown,
@@ -30,14 +30,14 @@ COLUMNS = (Column("regime", "Regime"), Column("x", "x_1 (%)"), Column("n", "n"),
 
 
 def test_markdown_table() -> None:
-    lines = to_markdown(Table(FRAME, COLUMNS)).splitlines()
+    lines = to_markdown(PageTable(FRAME, COLUMNS)).splitlines()
     assert lines[0] == "| Regime | x_1 (%) | n | text |"
     assert lines[1] == "| --- | ---: | ---: | --- |"
     assert lines[2:] == ["| NO | 1.23e-09 | 1 | a\\|b |", "| NO | – | 2 | & |", "| TO | 12 | 3 |  |"]
 
 
 def test_html_table() -> None:
-    page = Page(to_html(Table(FRAME, COLUMNS)))
+    page = Page(to_html(PageTable(FRAME, COLUMNS)))
     assert not page.open
     assert [a.get("class") for a in page.every("tr")] == [None, None, None, "first"]
     assert [a.get("class") for a in page.every("td")][:4] == [None, "number", "number", None]
@@ -51,7 +51,7 @@ def test_both_renderings_of_every_block(tmp_path: Path) -> None:
         Heading("Part one"),
         Text("some **bold** & `code`"),
         Items(("first", "second")),
-        Table(FRAME, COLUMNS, "caption"),
+        PageTable(FRAME, COLUMNS, "caption"),
         Picture("p.png", "a `picture`"),
         Details("more & <more>", (Heading("Folded", 3), Text("a <b> c"))),
     ]

@@ -16,10 +16,10 @@ import pytest
 
 from ded_bench.files.arrays import write_arrays
 from ded_bench.plants.score import score
+from ded_bench.problem.benchmark import load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.benchmark import load_split
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.columns import GAPS, TABLE_V, TABLE_VI
 from ded_bench.report.figures.schedules import representative

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ded_bench.report.page import Block, Table
+from ded_bench.report.page import Block, PageTable
 from ded_bench.report.sections import (
     closed_loop,
     each_method,
@@ -19,7 +19,7 @@ from ded_bench.report.sources import Draft, Sources
 class Section(Protocol):
     """One part of the page."""
 
-    def tables(self, sources: Sources) -> dict[str, Table]:
+    def tables(self, sources: Sources) -> dict[str, PageTable]:
         """Tables by the name of their CSV file."""
 
     def blocks(self, draft: Draft) -> list[Block]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import crossed, own_latency, sweeps
 from ded_bench.report.columns import ONLINE, SWEEPS
-from ded_bench.report.page import Block, Heading, Items, Table, folded
+from ded_bench.report.page import Block, Heading, Items, PageTable, folded
 from ded_bench.report.sources import Draft, Sources
 
 EXPLANATION = (
@@ -23,17 +23,17 @@ EXPLANATION = (
 )
 
 
-def tables(sources: Sources) -> dict[str, Table]:
+def tables(sources: Sources) -> dict[str, PageTable]:
     """Those that have rows."""
     own, table = own_latency(sources.online), crossed(sweeps(sources.online))
     made = {}
     if len(own):
         caption = "Methods in the closed loop at their own latency, forecasts as announced"
-        made["online_methods"] = Table(titled(own), ONLINE, caption)
+        made["online_methods"] = PageTable(titled(own), ONLINE, caption)
     if len(table):
         known = tuple(column for column in SWEEPS if column.name in table or column.name == "title")
         caption = "What latency costs, by what is known: means over the same scenarios"
-        made["online_latency"] = Table(titled(table), known, caption)
+        made["online_latency"] = PageTable(titled(table), known, caption)
     return made
 
 

@@ -7,11 +7,11 @@ from ded_bench.analysis.summary import SMALLEST_GAP, by_model, claims, coverage,
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.columns import CLAIMS, COVERAGE, GAPS, MODELS, RATES, VIOLATIONS, WORST
 from ded_bench.report.notes import rows_caption
-from ded_bench.report.page import Block, Heading, Table, Text, folded, usual_first
+from ded_bench.report.page import Block, Heading, PageTable, Text, folded, usual_first
 from ded_bench.report.sources import Draft, Sources
 
 
-def tables(sources: Sources) -> dict[str, Table]:
+def tables(sources: Sources) -> dict[str, PageTable]:
     """Every number of every line; others of it stand beside it on the page."""
     overview = sources.summary
     caption = f"Gap to {sources.reference.title}, % ({rows_caption(sources)})"
@@ -22,11 +22,11 @@ def tables(sources: Sources) -> dict[str, Table]:
         f"gaps up to {SMALLEST_GAP:g} % and violations within tolerance are left out"
     )
     return {
-        "summary": Table(overview, GAPS, caption),
-        "claims": Table(claims(sources.judged), CLAIMS, "Rows"),
-        "models": Table(by_model(overview), MODELS, several),
-        "worst": Table(worst(sources.judged), WORST, largest),
-        "coverage": Table(coverage(scoring_rows(sources.rows), sources.judged), COVERAGE, more),
+        "summary": PageTable(overview, GAPS, caption),
+        "claims": PageTable(claims(sources.judged), CLAIMS, "Rows"),
+        "models": PageTable(by_model(overview), MODELS, several),
+        "worst": PageTable(worst(sources.judged), WORST, largest),
+        "coverage": PageTable(coverage(scoring_rows(sources.rows), sources.judged), COVERAGE, more),
     }
 
 
@@ -36,9 +36,9 @@ def blocks(draft: Draft) -> list[Block]:
     made: list[Block] = [
         Heading("Each method in detail"),
         *usual_first(draft.tables["summary"], usual),
-        *usual_first(Table(overview, RATES, "Claimed and verified: shares of all rows"), usual),
+        *usual_first(PageTable(overview, RATES, "Claimed and verified: shares of all rows"), usual),
         *folded("Solver status against the scorer's verdict", draft.tables["claims"]),
-        *usual_first(Table(overview, VIOLATIONS, "Largest violation of each schedule"), usual),
+        *usual_first(PageTable(overview, VIOLATIONS, "Largest violation of each schedule"), usual),
     ]
     for name in ("models", "coverage"):
         made += (
@@ -57,7 +57,7 @@ def _worst(draft: Draft) -> list[Block]:
     broken = usual[usual["worst_by"] == "violation"]
     names = ", ".join(dict.fromkeys(f"{row.title} {row.regime}" for row in broken.itertuples()))
     said = f"Limits are broken, beyond the tolerance, by {names}." if names else "No limit is broken."
-    table = Table(usual, WORST, draft.tables["worst"].caption)
+    table = PageTable(usual, WORST, draft.tables["worst"].caption)
     return [
         Heading("Worst instances"),
         Text(said),

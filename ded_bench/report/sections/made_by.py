@@ -5,18 +5,18 @@ from __future__ import annotations
 from ded_bench.analysis.lines import HEAD, groups, head, line_table
 from ded_bench.report.columns import PROVENANCE
 from ded_bench.report.notes import MADE_BY, listed
-from ded_bench.report.page import Block, Heading, Items, Table, folded
+from ded_bench.report.page import Block, Heading, Items, PageTable, folded
 from ded_bench.report.sources import Draft, Sources
 from ded_bench.run.environment import environment, now
 
 
-def tables(sources: Sources) -> dict[str, Table]:
+def tables(sources: Sources) -> dict[str, PageTable]:
     """One line per line of the other tables; several values with their numbers of rows."""
     rows = [
         head(regime, key) | {"rows": len(group)} | {name: listed(group[name]) for name in MADE_BY}
         for regime, key, group in groups(sources.judged)
     ]
-    return {"provenance": Table(line_table(rows, [*HEAD, "rows", *MADE_BY]), PROVENANCE)}
+    return {"provenance": PageTable(line_table(rows, [*HEAD, "rows", *MADE_BY]), PROVENANCE)}
 
 
 def blocks(draft: Draft) -> list[Block]:

@@ -14,7 +14,7 @@ from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_P
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import TABLE_V, TABLE_VI, front, tabulate, without_paper
 from ded_bench.report.notes import alarms, data_notes, rows_caption
-from ded_bench.report.page import Block, Heading, Items, Table, Text, folded
+from ded_bench.report.page import Block, Heading, Items, PageTable, Text, folded
 from ded_bench.report.sources import Draft, Sources
 
 #: How the tables are to be read.
@@ -46,7 +46,7 @@ def lines_of(sources: Sources) -> pd.DataFrame:
     return result_lines(rows, sources.timing, sources.paper, sources.reference.method)
 
 
-def tables(sources: Sources) -> dict[str, Table]:
+def tables(sources: Sources) -> dict[str, PageTable]:
     """Tables V and VI; without the paper's columns where it has no numbers."""
     rows, timing, lines = rows_caption(sources), sources.timing, lines_of(sources)
     timed = "times: not taken yet, run `ded-bench bench`"
@@ -60,7 +60,7 @@ def tables(sources: Sources) -> dict[str, Table]:
     found = {}
     for name, (columns, caption) in made.items():
         own = columns if sources.paper else without_paper(columns, sources.reference.title)
-        found[name] = Table(tabulate(own, lines), own, caption)
+        found[name] = PageTable(tabulate(own, lines), own, caption)
     return found
 
 
@@ -86,8 +86,8 @@ def blocks(draft: Draft) -> list[Block]:
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
         *(Text(text, note=True) for text in alarms(draft.sources)),
-        Table(five.frame[shown], front(five.columns), "Time and increase in objective (Table V)"),
-        Table(six.frame[shown], front(six.columns), "Mean of the largest violations (Table VI)"),
+        PageTable(five.frame[shown], front(five.columns), "Time and increase in objective (Table V)"),
+        PageTable(six.frame[shown], front(six.columns), "Mean of the largest violations (Table VI)"),
         Items(tuple(said)),
         *draft.pictures["tradeoff"],
         *folded(f"What is missing or mixed: {len(notes)}", *[Items(notes)] * bool(notes)),

@@ -7,13 +7,13 @@ import pandas as pd
 from ded_bench.analysis.lines import titled
 from ded_bench.analysis.rollouts import ROLLOUTS
 from ded_bench.report.columns import CERTIFICATE, TRAINING, Column
-from ded_bench.report.page import Block, Heading, Table, Text, folded
+from ded_bench.report.page import Block, Heading, PageTable, Text, folded
 from ded_bench.report.sources import Draft, Sources, training_table
 
 
-def tables(sources: Sources) -> dict[str, Table]:
+def tables(sources: Sources) -> dict[str, PageTable]:
     """How policies were trained."""
-    return {"training": Table(training_table(sources.folder), TRAINING)}
+    return {"training": PageTable(training_table(sources.folder), TRAINING)}
 
 
 def blocks(draft: Draft) -> list[Block]:
@@ -25,7 +25,7 @@ def blocks(draft: Draft) -> list[Block]:
         if name == ROLLOUTS:
             where = "under drawn schedules, the static dispatch and optimal schedules of test instances"
         caption = f"Errors of rollouts over the whole horizon {where}"
-        made += folded(caption, Table(errors, columns))
+        made += folded(caption, PageTable(errors, columns))
     made += (
         []
         if draft.sources.rollouts
@@ -35,11 +35,11 @@ def blocks(draft: Draft) -> list[Block]:
     frame = draft.tables["training"].frame
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()
-        made.append(Table(frame, tuple(column for column in TRAINING if filled[column.name])))
+        made.append(PageTable(frame, tuple(column for column in TRAINING if filled[column.name])))
     else:
         made.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
     made += [*draft.pictures["training"], Heading("Certificate")]
     if not draft.sources.certificates:
         return [*made, Text("No certificate was made for these results; `ded-bench certify` makes one.")]
     certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in draft.sources.certificates]))
-    return [*made, Table(certificates, CERTIFICATE, "All that makes them up stands in certificate.json")]
+    return [*made, PageTable(certificates, CERTIFICATE, "All that makes them up stands in certificate.json")]

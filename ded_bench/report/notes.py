@@ -141,7 +141,7 @@ def _times(sources: Sources) -> Iterator[str]:
     if set(timing["problems_version"]) - set(sources.rows["problems_version"]):
         yield f"Times were taken on problem version {_versions(timing)}."
     rows = sources.judged.drop_duplicates(GROUP).set_index(GROUP)["made_with"]
-    timed = timing.set_index(GROUP)["made_with"]
+    timed = sources.calls.drop_duplicates(GROUP, keep="last").set_index(GROUP)["made_with"]
     both = timed.index.intersection(rows.index)
     if other := [title(*key[1:]) + f" {key[0]}" for key in both if rows[key] != timed[key]]:
         yield f"Times were taken with another model or policy than the rows: {', '.join(other)}."

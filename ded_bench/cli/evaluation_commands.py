@@ -73,7 +73,7 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
     p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that score the rest")
+    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that score")
     p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_report)
 
@@ -159,7 +159,7 @@ def _compare(a: argparse.Namespace) -> int:
     if all(ResultsFolder(folder).results.is_file() for folder in (a.a, a.b)):
         say(f"comparing {a.a} with {a.b}")
     from ded_bench.analysis.compare import Tolerance, compare
-    from ded_bench.report.comparison import to_json, to_text
+    from ded_bench.cli.comparison import to_json, to_text
 
     limits = Tolerance(a.tolerance, a.tolerance_hz, a.tolerance_pu)
     found = compare(a.a, a.b, limits, common_only=a.common)

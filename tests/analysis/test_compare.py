@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ded_bench.analysis.compare import Tolerance, compare
+from ded_bench.cli.comparison import to_json, to_text
 from ded_bench.files.errors import InputError
-from ded_bench.report.comparison import to_json, to_text
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import TIMING, TimingRow
 

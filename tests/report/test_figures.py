@@ -71,12 +71,6 @@ def test_trajectories_in_panels(name: str, tmp_path: Path) -> None:
         save_figure(drawn, tmp_path / "figure.png")
 
 
-def test_the_curves_that_move_most_are_shown_in_their_order() -> None:
-    curves = np.outer(np.linspace(0, 1, 11), [0.0, 3.0, 1.0, 2.0])
-    assert busiest([curves], 2) == [1, 3]
-    assert busiest([curves, curves[:, ::-1] * 2], 2) == [0, 2]
-
-
 def test_trained_methods_are_shown_first_then_those_nearest_to_the_reference() -> None:
     gaps = {"ded": 0.0, "ded-ko": 0.1, "mine": 0.2, "ded-dpc-paper": 2.0, "ded-dpc": 1.0}
     assert challengers(pd.Series(gaps), "ded") == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]

@@ -13,7 +13,6 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.report.figures.growth import GAP, growth_figure
 from ded_bench.report.grids import across, break_evens, read_grid, slopes
 from ded_bench.report.overview import write_overview
 from ded_bench.results.folder import ResultsFolder
@@ -141,15 +140,3 @@ def test_a_method_without_any_cell_has_no_row() -> None:
     assert across(table, lambda row: "")["title"].to_list() == []
     (row,) = across(table, lambda row: "x" * (row["case"] == "b")).to_dict("records")
     assert json.loads(json.dumps(row)) == {"regime": "TO", "title": "ED", "a": "–", "b": "x", "c": "–"}
-
-
-def test_figures_over_grids() -> None:
-    """Both axes logarithmic; hollow where some schedules are infeasible."""
-    table = points(solve_s=[1.0, 2.0, 4.0], gap_percent_mean=[0.0, 0.1, -1.0])
-    figure = growth_figure(table, [("solve_s", "time (s)"), GAP])
-    times, gaps = figure.axes
-    assert (times.get_xscale(), times.get_yscale(), gaps.get_yscale()) == ("log", "log", "symlog")
-    curve, hollow = times.get_lines()
-    assert list(curve.get_xdata()) == [2, 4, 8]
-    assert (list(hollow.get_xdata()), hollow.get_markerfacecolor()) == ([4], "white")
-    assert list(gaps.get_lines()[0].get_ydata()) == [0.0, 0.1, -1.0]

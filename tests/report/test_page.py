@@ -18,7 +18,6 @@ from ded_bench.report.page import (
     Text,
     render_html,
     render_markdown,
-    to_html,
     to_markdown,
 )
 from tests.reading import Page
@@ -34,13 +33,6 @@ def test_markdown_table() -> None:
     assert lines[0] == "| Regime | x_1 (%) | n | text |"
     assert lines[1] == "| --- | ---: | ---: | --- |"
     assert lines[2:] == ["| NO | 1.23e-09 | 1 | a\\|b |", "| NO | – | 2 | & |", "| TO | 12 | 3 |  |"]
-
-
-def test_html_table() -> None:
-    page = Page(to_html(PageTable(FRAME, COLUMNS)))
-    assert not page.open
-    assert [a.get("class") for a in page.every("tr")] == [None, None, None, "first"]
-    assert [a.get("class") for a in page.every("td")][:4] == [None, "number", "number", None]
 
 
 def test_both_renderings_of_every_block(tmp_path: Path) -> None:

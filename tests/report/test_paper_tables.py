@@ -85,14 +85,6 @@ def test_what_was_not_run_is_an_empty_row_beside_the_papers() -> None:
     assert made(TABLE_V, frame_of()).loc[("NO", "ded-dpc-paper", "default"), "paper_increase_percent"] == 1.05
 
 
-def test_both_policies_stand_against_the_papers() -> None:
-    """Losses included: its recipe may be behind where ours is ahead."""
-    rows = [row("a", "ded", 100.0), row("a", "ded-dpc-paper", 107.0), row("a", "ded-dpc", 101.0)]
-    ours = made(TABLE_V, frame_of(*rows)).loc["TO"]
-    assert ours.loc[["ded-dpc-paper", "ded-dpc"], "paper_increase_percent"].to_list() == [5.2, 5.2]
-    assert ours.loc[["ded-dpc-paper", "ded-dpc"], "against_paper_increase"].to_list() == ["behind", "ahead"]
-
-
 def test_the_papers_rows_come_first_then_all_others() -> None:
     frame = frame_of(
         row("a", "mine", 1.0),
@@ -108,13 +100,6 @@ def test_the_papers_rows_come_first_then_all_others() -> None:
         ("ed", "default"),
         ("mine", "default"),
     ]
-
-
-def test_other_settings_and_other_methods_have_no_counterpart_in_the_paper() -> None:
-    frame = frame_of(row("a", "ded", 1.0), row("a", "ded", 1.0, settings="fast"), row("a", "mine", 1.0))
-    others = made(TABLE_VI, frame).loc[[("TO", "ded", "fast"), ("TO", "mine", "default")]]
-    assert others["paper_ramp_violation"].isna().all()
-    assert (others["against_paper_ramp"] == "").all()
 
 
 def test_table_vi_means_the_maxima_and_knows_equal(table: pd.DataFrame) -> None:

@@ -21,7 +21,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.report.columns import GAPS, TABLE_V, TABLE_VI
+from ded_bench.report.columns import TABLE_V, TABLE_VI
 from ded_bench.report.figures.schedules import representative
 from ded_bench.report.report import write_report
 from ded_bench.report.sources import read_sources
@@ -29,7 +29,7 @@ from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.scoring import scored_row
 from tests.reading import Page
-from tests.report.conftest import TEST, TRAIN
+from tests.report.conftest import TEST
 
 METHODS = {"ded": 0.05, "ded-ko": 1.0, "ded-dpc-paper": 5.0}
 
@@ -155,16 +155,6 @@ def test_table_v_is_what_the_rows_say(report, finished: Path) -> None:
     assert np.isnan(made.loc[("NO", "ded"), "solve_s"])
     assert made.loc[("NO", "ded-dpc"), "n"] == 0  # not run
     assert made["paper_solve_s"].notna().all()
-
-
-def test_training_rows_are_left_out_and_counted(report, finished: Path) -> None:
-    text = (finished / "report.md").read_text()
-    assert f"{TEST} test instances; {2 * 3 * TRAIN} other rows left out" in text
-    everything = cells(text, "<summary>Methods that were run on training instances too")
-    assert [row[2] for row in everything] == [str(TEST + TRAIN)] * 6
-    detail = cells(text, "**Gap to DED, % (")
-    assert [row[2] for row in detail] == [str(TEST)] * 6
-    assert len(detail[0]) == len(GAPS)
 
 
 def test_the_page_needs_nothing_else(report, finished: Path) -> None:

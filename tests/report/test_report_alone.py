@@ -48,21 +48,6 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
 
 
 @pytest.mark.usefixtures("sketched")
-def test_without_a_paper_every_surrogate_stands_on_the_first_screen(threebus: Case, tmp_path: Path) -> None:
-    """Which model a method plans with is what tells methods apart there; other settings stay folded."""
-    facts = {"objective": 100.0, "feasible": True, "feasible_strict": True, "case": threebus.id}
-    runs = [("ded-slp", "default", ""), ("ed", "every=1", "")]
-    runs += [("ded-ko-knots", "default", f"{name}@1") for name in ("koopman", "trajectory")]
-    rows = [Row("x", "test", "TO", m, s, "Optimal", model=model, **facts) for m, s, model in runs]
-    Results(tmp_path).add(rows)
-    write_report(threebus, tmp_path, tmp_path / "no-problems")
-    first, _, rest = (tmp_path / "report.md").read_text().partition("<details>")
-    assert "DED-KO (knots) [trajectory]" in first
-    assert "| ED [every=1] |" not in first
-    assert "| ED [every=1] |" in rest
-
-
-@pytest.mark.usefixtures("sketched")
 def test_why_there_is_no_gap(threebus: Case, tmp_path: Path) -> None:
     facts = {"case": threebus.id, "problems_version": "1-x"}
     row = Row("x", "test", "TO", "ed", "default", "Optimal", objective=1.0, **facts)

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ded_bench.analysis.lines import title
-from ded_bench.report.figures.style import (
-    BLACK,
-    DASHES,
-    GREY,
-    PALETTE,
-    Drawn,
-    legend_below,
-    new_figure,
-    plain,
-)
+from ded_bench.report.figures.panels import Curve, Panel, time_figure
+from ded_bench.report.figures.style import BLACK, DASHES, GREY, PALETTE, Drawn
 from ded_bench.report.sources import Sources
 
-LOSSES = {"training": {"color": GREY, "linewidth": 0.8}, "held out": {"color": BLACK, "linewidth": 1.4}}
+LOSSES: Mapping[str, dict[str, Any]] = {
+    "training": {"color": GREY, "linewidth": 0.8},
+    "held out": {"color": BLACK},
+}
 #: Columns of a history that are no terms of its loss.
 NO_TERMS = {"epoch", "step", "seconds", *LOSSES}
 
@@ -44,32 +38,17 @@ def history_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
     Args:
         histories: by name of the policy; columns as `methods.training_record` describes them.
     """
-    with new_figure(0.6 + 1.9 * len(histories)) as figure:
-        axes = figure.subplots(len(histories), 2, squeeze=False)
-        handles: list[Line2D] = []
-        for (name, history), (left, right) in zip(histories.items(), axes, strict=True):
-            for column, style in LOSSES.items():
-                if column in history:
-                    handles += _curve(left, history, column, **style)
-            for i, term in enumerate(str(name) for name in history if name not in NO_TERMS):
-                style = {
-                    "color": PALETTE[i % len(PALETTE)],
-                    "dashes": DASHES[i % len(DASHES)],
-                }
-                handles += _curve(right, history, term, **style)
-                right.set_yscale("log")
-            left.set_title(plain(name), fontsize=8.5, loc="left")
-            left.set_ylabel("loss")
-            right.set_ylabel("terms of the loss")
-            right.set_visible(bool(right.get_lines()))
-        for ax in axes[-1]:
-            ax.set_xlabel("training time (min)")
-        legend_below(figure, handles, columns=4)
-    return figure
+    panels = []
+    for name, history in histories.items():
+        losses = [_curve(history, column, style) for column, style in LOSSES.items() if column in history]
+        terms = [str(column) for column in history if column not in NO_TERMS]
+        styles = ({"color": colour, "dashes": dashes} for dashes in DASHES for colour in PALETTE)
+        drawn = [_curve(history, term, style) for term, style in zip(terms, styles, strict=False)]
+        panels += [Panel("loss", losses, title=name), Panel("terms of the loss", drawn, log=True)]
+    return time_figure("", panels, 2, time="training time (min)")
 
 
-def _curve(ax: Axes, history: pd.DataFrame, column: str, **style: object) -> list[Line2D]:
+def _curve(history: pd.DataFrame, column: str, style: Mapping[str, Any]) -> Curve:
     taken = history[["seconds", column]].dropna()
-    values = taken[column].where(taken[column] > 0) if column not in LOSSES else taken[column]
-    drawn: list[Line2D] = ax.plot(taken["seconds"] / 60, values, label=plain(column), **style)  # type: ignore[arg-type]
-    return drawn if len(taken) else []
+    positive = taken[column].where((taken[column] > 0) | (column in LOSSES))
+    return Curve(taken["seconds"].to_numpy() / 60, positive.to_numpy(), column, dict(style))

@@ -47,16 +47,17 @@ METHODS_SHOWN, GENERATORS_SHOWN = 3, 3
 
 
 def draw(sources: Sources) -> Iterator[Drawn]:
-    """A figure for each method that was swept over latencies, and one scenario."""
+    """A figure for each method that was swept over latencies, or one without sweeps; and one scenario."""
     own = titled(own_latency(sources.online))
     swept = titled(sweeps(sources.online))
+    markers = "Markers: methods at their own latency, over all scenarios that they operated."
     for (method, settings, name), lines in swept.groupby(["method", "settings", "title"], sort=False):
         counts = "/".join(map(str, sorted(set(lines["n"]))))
-        caption = (
-            f"{name} in the closed loop against its latency, by what its plans know; the mean over {counts} "
-            "scenarios. Markers: methods at their own latency, over all scenarios that they operated."
-        )
-        yield Drawn(f"online_latency_{method}_{settings}", caption, latency_figure(lines, own, str(name)))
+        swept_by = f"{name} against its latency, by what its plans know: mean over {counts} scenarios. "
+        figure = latency_figure(lines, own, str(name))
+        yield Drawn(f"online_latency_{method}_{settings}", swept_by + markers, figure)
+    if len(own) and not len(swept):
+        yield Drawn("online_latency", markers, latency_figure(swept, own, sources.case.id))
     scenario, shown = shown_scenario(sources)
     if shown:
         case, heading = sources.case, f"{scenario}, {sources.tightest}"
@@ -76,7 +77,7 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
         own: lines at methods' own latencies (see `online_summary.own_latency`), with their titles.
         heading: above the figure.
     """
-    regimes = list(dict.fromkeys(swept["regime"]))
+    regimes = list(dict.fromkeys((swept if len(swept) else own)["regime"]))
     with new_figure(5.4 + legend_height(len(KINDS) + own["title"].nunique(), 2)) as figure:
         axes = figure.subplots(2, len(regimes), sharex=True, squeeze=False)
         handles: list[Line2D] = []
@@ -113,11 +114,7 @@ def _points(ax: Axes, own: pd.DataFrame, name: str) -> list[Line2D]:
     handles = []
     for one in own.to_dict("records"):
         often = "" if one["period_s"] == 1.0 else f", every {one['period_s']:g} s"
-        style: dict[str, Any] = {
-            "marker": marker(one["method"]),
-            "color": colour(one["method"]),
-            "markersize": 6,
-        }
+        style: dict[str, Any] = {"marker": marker(one["method"]), "color": colour(one["method"])}
         style |= {"label": plain(one["title"] + often), "fillstyle": "none" if often else "full"}
         handles += ax.plot([one["latency_s"]], [one[name]], linestyle="none", zorder=3, **style)
     return handles

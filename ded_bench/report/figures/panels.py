@@ -37,6 +37,7 @@ class Panel:
     curves: list[Curve]
     limits: Sequence[float] = ()
     title: str = ""
+    log: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,9 @@ def slack_panel(case: Case, shown: Sequence[Shown]) -> Panel:
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
 
 
-def time_figure(heading: str, panels: Sequence[Panel], columns: int, legend: bool = True) -> Figure:
+def time_figure(
+    heading: str, panels: Sequence[Panel], columns: int, legend: bool = True, time: str = "time (s)"
+) -> Figure:
     """All panels, and one legend below."""
     rows = -(-len(panels) // columns)
     with new_figure(0.9 + (1.35 if columns == 1 else 1.8) * rows) as figure:
@@ -110,15 +113,16 @@ def time_figure(heading: str, panels: Sequence[Panel], columns: int, legend: boo
                     curve.t[::step], curve.values[::step], label=plain(curve.label), **curve.style
                 )
                 handles += lines[:1]
-                ax.set_xlim(float(curve.t[0]), float(curve.t[-1]))
             for level in panel.limits:
                 handles.append(
                     ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
                 )
+            ax.margins(x=0.0)
+            ax.set_yscale("log" if panel.log and panel.curves else "linear")
             ax.set_ylabel(panel.label)
             ax.set_title(plain(panel.title), fontsize=7)
         for ax in axes[max(len(panels) - columns, 0) : len(panels)]:
-            ax.set_xlabel("time (s)")
+            ax.set_xlabel(time)
             ax.tick_params(labelbottom=True)
         for ax in axes[len(panels) :]:
             ax.set_visible(False)

@@ -47,8 +47,12 @@ GONE_SETTINGS = ("averaged", "unlearned", "ac", "swing-ac")
 DROPPED = ("code", "score_code", "online_code")
 #: Tables of studies above this are compressed, bytes.
 LARGE = 1_000_000
-#: A point of a schedule this near to the line through its neighbours tells nothing, pu.
+#: Schedules of more points than this, one at each step, are made lighter.
+MANY_POINTS = 1000
+#: A point of such a schedule this near to the line through its neighbours tells nothing, pu.
 STRAIGHT = 1e-14
+#: Its powers are kept in multiples of this, pu: what lies below is noise that does not compress.
+ROUNDED = 2.0**-44
 
 Cells = dict[str, str]
 
@@ -141,8 +145,8 @@ class Move:
             if path.is_file():
                 instance = self.instances[row.instance]
                 schedule = Schedule.read(path, self.case, instance.horizon_s)
-                if row.method == "ed":
-                    schedule = without_straight(self.case, instance, schedule, row.regime)
+                if len(schedule.t) > MANY_POINTS:
+                    schedule = lighter(self.case, instance, schedule, row.regime)
                 results.archive(row).write(row.member, schedule, self.case)
                 kept += 1
         results.pack()
@@ -217,21 +221,21 @@ class Move:
             place.write_bytes(text)
 
 
-def without_straight(case: Case, instance: Instance, schedule: Schedule, regime: str) -> Schedule:
-    """A schedule without points on the line through those beside them, if its score stays the same."""
+def lighter(case: Case, instance: Instance, schedule: Schedule, regime: str) -> Schedule:
+    """A schedule with rounded powers and without straight points, if its score stays equal to 1e-12."""
     t, p, kept = schedule.t, schedule.p, [0]
     while kept[-1] < len(t) - 1:
-        first = last = kept[-1] + 1
+        last = kept[-1] + 1
         while last + 1 < len(t) and is_straight(t, p, kept[-1], last + 1):
             last += 1
-        kept.append(max(first, last))
-    fewer = Schedule(t[kept], p[kept])
-    before, after = (dataclasses.asdict(score(case, instance, s, regime)) for s in (schedule, fewer))
-    objectives = before.pop("objective"), after.pop("objective")
-    same = np.isclose(*objectives, rtol=1e-12, atol=0) and np.allclose(
-        list(before.values()), list(after.values()), rtol=0, atol=1e-12
-    )
-    return fewer if same else schedule
+        kept.append(last)
+    made = Schedule(t[kept], np.round(p[kept] / ROUNDED) * ROUNDED)
+    before, after = (dataclasses.asdict(score(case, instance, s, regime)) for s in (schedule, made))
+    same = np.isclose(before.pop("objective"), after.pop("objective"), rtol=1e-12, atol=0)
+    same &= np.allclose(list(before.values()), list(after.values()), rtol=0, atol=1e-12)
+    if not same:
+        print(f"{instance.id} {regime}: kept whole", before, after)
+    return made if same else schedule
 
 
 def is_straight(t: np.ndarray, p: np.ndarray, first: int, last: int) -> bool:

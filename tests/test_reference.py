@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from ded_bench.analysis.reproduce import reproduce
 from ded_bench.plants.score import Score, score
 from ded_bench.problem.case import REPOSITORY, SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.report.sections.opening import lines_of
+from ded_bench.report.sources import read_sources
 from ded_bench.results.rows import Results
 
 #: Methods whose answer on the paper's grid takes less than a second.
@@ -52,3 +55,20 @@ def test_rows_are_found_again() -> None:
     assert {line.method for line in lines} == set(FAST)
     assert [sentence for line in lines for sentence in line.differences] == []
     assert sum(line.rows for line in lines) >= len(lines) - sum(len(line.skipped) for line in lines)
+
+
+def test_readme_has_the_numbers_of_the_rows() -> None:
+    """Every line of its two tables, to three digits."""
+    case, readme = Case.load("9bus"), (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    lines = lines_of(read_sources(case, folder("9bus"), SHIPPED_CASES / case.id))
+    lines = lines[(lines["settings"] == "default") & lines["paper_solve_s"].notna()]
+    assert len(lines) == 2 * 4
+    tables = ("increase_percent", "solve_s"), ("freq_violation_hz_mean", "ramp_violation_mean")
+    for line in lines.to_dict("records"):
+        for names in tables:
+            values = [
+                value for name in names for value in (line[name], line[f"paper_{name}".replace("_mean", "")])
+            ]
+            cells = ["–" if pd.isna(value) else f"{value:.3g}" for value in values[:3]]
+            printed = " | ".join([line["regime"], line["title"], *cells])
+            assert f"| {printed} |" in readme, printed

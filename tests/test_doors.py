@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.results.rows import Results
 from ded_bench.results.timing import read_timing
@@ -88,7 +88,7 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
     solve = ["solve", "--method", "flat", "--case", problem, "--workers", 2, "--out", out]
     done = subprocess.run(
         [sys.executable, "-m", "ded_bench", *map(str, solve)],
-        env=os.environ | {"PYTHONPATH": str(site)},
+        env=os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{REPOSITORY}"},
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -102,7 +102,7 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
     assert command("report", "--case", problem, "--workers", 1, "--results", out)[0] == 0
     summary = pd.read_csv(out / "tables" / "summary.csv").set_index(["regime", "method"])
     for regime in ("NO", "TO"):
-        assert summary.loc[(regime, "flat"), "n"] == 2
+        assert summary.loc[(regime, "flat"), "rows"] == 2
     assert {(row.regime, row.method) for row in read_timing(out / "timing.csv")} == {
         ("NO", "flat"),
         ("TO", "flat"),

@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.benchmark import load_split, write_benchmark
+from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.results.rows import Results
 from ded_bench.results.timing import read_timing
 

@@ -35,7 +35,7 @@ SEED = 0
 
 
 @dataclass
-class Line:
+class Sampled:
     """What came of the sample of one method, settings, surrogate and regime.
 
     Attributes:
@@ -70,7 +70,7 @@ def reproduce(
     sample: int = 5,
     workers: int = 1,
     on_sentence: Callable[[str], None] = lambda sentence: None,
-) -> list[Line]:
+) -> list[Sampled]:
     """Solve a sample of rows again and compare; the folder stays as it is.
 
     Args:
@@ -92,8 +92,8 @@ def reproduce(
             parts.setdefault(name, []).append(row)
     if not parts:
         raise InputError(results.path, "method", f"has no rows of {', '.join(methods) or case.id}")
-    lines = [Line(*name) for name in sorted(parts)]
-    tasks: list[tuple[Line, Row, Task]] = []
+    lines = [Sampled(*name) for name in sorted(parts)]
+    tasks: list[tuple[Sampled, Row, Task]] = []
     for line in lines:
         chosen = _sample(line, parts[line.method, line.settings, line.model, line.regime], instances, sample)
         tasks += [
@@ -121,7 +121,7 @@ def solve_again(case: Case, task: Task, plant: str) -> Score | str | None:
     return verdict if isinstance(verdict, Score) else reason_of(verdict)
 
 
-def _sample(line: Line, rows: Sequence[Row], instances: Mapping[str, Instance], count: int) -> list[Row]:
+def _sample(line: Sampled, rows: Sequence[Row], instances: Mapping[str, Instance], count: int) -> list[Row]:
     """Rows to be solved again; what cannot be is noted."""
     unlike = [r for r in rows if r.objective is None or r.status in (Status.TIME_LIMIT, Status.FAILED)]
     if unlike:
@@ -133,7 +133,9 @@ def _sample(line: Line, rows: Sequence[Row], instances: Mapping[str, Instance], 
     return random.Random(f"{SEED} {line.name}").sample(known, min(count, len(known)))
 
 
-def _task(case: Case, line: Line, row: Row, instances: Mapping[str, Instance], folder: Path) -> Task | None:
+def _task(
+    case: Case, line: Sampled, row: Row, instances: Mapping[str, Instance], folder: Path
+) -> Task | None:
     """The task that makes a row; None, and noted why, if the folder has not what made it."""
     if line.method not in registered():
         line.skipped.append(f"{row.instance}: no method has this name")
@@ -156,7 +158,7 @@ def _task(case: Case, line: Line, row: Row, instances: Mapping[str, Instance], f
     return task
 
 
-def _compared(line: Line, row: Row, answer: object) -> Iterator[str]:
+def _compared(line: Sampled, row: Row, answer: object) -> Iterator[str]:
     """Note one answer; yields a sentence if it is not that of the row."""
     if answer is None:
         line.skipped.append(f"{row.instance}: ended by its limit this time")
@@ -179,7 +181,7 @@ def _compared(line: Line, row: Row, answer: object) -> Iterator[str]:
         yield line.differences[-1]
 
 
-def table_of(lines: Sequence[Line]) -> str:
+def table_of(lines: Sequence[Sampled]) -> str:
     """One line each: rows, how many differ, the largest differences."""
     cells = []
     for line in lines:

@@ -1,0 +1,50 @@
+"""Rows solved again: what is found, what differs, what cannot be compared."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from ded_bench.analysis.reproduce import reproduce, table_of
+from ded_bench.files.errors import InputError
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.case import Case
+from ded_bench.results.rows import Results
+from ded_bench.run.runner import run
+from ded_bench.run.tasks import make_tasks
+
+
+def test_differences_are_told_and_limits_named(threebus: Case, quiet_instance, tmp_path: Path) -> None:
+    instances = {name: quiet_instance(threebus, id=name, horizon_s=0.2) for name in "abcd"}
+    results = Results(tmp_path)
+    chosen = [(instance, "test") for instance in instances.values()]
+    a, b, c, d = run(threebus, make_tasks(threebus, chosen, ["ed"], ["TO"], Settings()), results)
+    dearer = dataclasses.replace(b, objective=b.objective * (1 + 2e-6))
+    rounded = dataclasses.replace(c, objective=c.objective * (1 + 1e-7))
+    results.add([dearer, rounded, dataclasses.replace(d, status="TimeLimit")])
+    results.add([dataclasses.replace(a, method="mine"), dataclasses.replace(a, policy="ed@f00")])
+    before = results.path.read_bytes()
+    said: list[str] = []
+    ours, theirs = reproduce(threebus, instances, results, sample=9, on_sentence=said.append)
+    assert (ours.rows, ours.objective) == (3, pytest.approx(2e-6, rel=1e-3))
+    assert [sentence.split(":")[0] for sentence in ours.differences] == ["b"]
+    assert [s for s in said if "ended by a limit (d)" in s]
+    assert [s for s in said if "its ed@f00 is not the one in" in s]
+    assert (theirs.rows, theirs.skipped) == (0, ["a: no method has this name"])
+    assert table_of([ours, theirs]).splitlines()[1].split()[:6] == ["ed", "default", "-", "TO", "3", "1"]
+    assert results.path.read_bytes() == before
+
+
+def test_the_sample_is_the_same_every_time(threebus: Case, quiet_instance, tmp_path: Path) -> None:
+    instances = {f"i{n}": quiet_instance(threebus, id=f"i{n}", horizon_s=0.2) for n in range(6)}
+    results = Results(tmp_path)
+    chosen = [(instance, "test") for instance in instances.values()]
+    rows = run(threebus, make_tasks(threebus, chosen, ["ed"], ["TO"], Settings()), results)
+    results.add([dataclasses.replace(row, objective=2.0 * row.objective) for row in rows])
+    first, again = (reproduce(threebus, instances, results, ["ed"], 2)[0].differences for _ in range(2))
+    assert sorted(first) == sorted(again)
+    assert len(first) == 2
+    with pytest.raises(InputError, match="has no rows of nobody"):
+        reproduce(threebus, instances, results, ["nobody"])

@@ -55,7 +55,7 @@ def test_answers_need_no_torch() -> None:
     """Of any method, our policies among them; only training imports it."""
     code = "from ded_bench.cli import commands\n"
     code += "from ded_bench.methods.registry import METHODS\n"
-    code += "[m.settings for m in METHODS.values()]\n"
+    code += "[m.options for m in METHODS.values()]\n"
     code += "import ded_bench.run.runner, ded_bench.analysis.certificate, ded_bench.report.report\n"
     assert "torch" not in loaded_after(code)
 
@@ -119,7 +119,7 @@ def test_solve_answers_like_the_method(threebus: Case, quiet_instance) -> None:
         ded_bench.solve(instance, "magic", "NO", case=threebus)
     with pytest.raises(InputError, match="unknown regime"):
         ded_bench.solve(instance, "ded", "XX", case=threebus)
-    with pytest.raises(InputError, match="magic: unknown to method ded"):
+    with pytest.raises(InputError, match="--set: magic: no such option"):
         ded_bench.solve(instance, "ded", "NO", case=threebus, settings=Settings("magic"))
 
 
@@ -146,7 +146,7 @@ def test_a_trajectory_is_a_frame_by_bus(case: Case, quiet_instance, constant) ->
         assert np.array_equal(frame[f"P_{bus}"], trajectory.p_gen[:, g])
         assert np.array_equal(frame[f"omega_{bus}"], trajectory.omega[:, g])
     for i, bus in enumerate(case.buses):
-        assert np.array_equal(frame[f"theta_{bus.id}"], trajectory.theta[:, i])
+        assert np.array_equal(frame[f"theta_{bus.id}"], trajectory.states[:, i])
     injections = frame[[c for c in frame.columns if c.startswith(("P_", "L_"))]]
     # At rest generation and load balance in a lossless network; the power flow solves to 1e-12 pu.
     assert injections.sum(axis=1).to_numpy() == pytest.approx(0.0, abs=1e-9)

@@ -12,7 +12,6 @@ import dataclasses
 import functools
 import gzip
 import io
-import itertools
 import pickle
 import random
 import re
@@ -29,49 +28,40 @@ from ded_bench.analysis.summary import claims, summary, table_times, worst
 from ded_bench.cli import commands
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record
-from ded_bench.methods.dpc.channels import Response
-from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
-from ded_bench.methods.dpc.policy_network import StagedNetwork
-from ded_bench.methods.dpc_paper.paper_inference import n_channels
-from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy
-from ded_bench.methods.dpc_paper.paper_training import PaperNetwork
-from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.plants import score as scorer
 from ded_bench.problem.benchmark import Manifest, Split
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import ROWS, Results, Row
+from ded_bench.results.archive import Archive
+from ded_bench.results.rows import ROWS, Row
 from ded_bench.results.timing import TIMING, TimingRow, read_timing
 from ded_bench.run import runner
 from ded_bench.run.scoring import scored_row
 from ded_bench.surrogates.linear import linear_model
-from tests.damage import (
-    Mutant,
-    Payload,
-    damaged_arrays,
-    damaged_bytes,
-    damaged_json,
-    damaged_table,
-)
 from tests.analysis.test_summary import with_gaps
+from tests.damage import Mutant, Payload, damaged_arrays, damaged_bytes, damaged_json, damaged_table
+from tests.methods.policies import HORIZON, random_policy
 
-#: Damaged files of each kind; together they are the 2000 and more that this module promises.
-COUNTS = {
-    "instance": 500,
-    "case": 400,
-    "schedule": 250,
-    "compressed schedule": 150,
-    "split": 100,
-    "manifest": 100,
-    "results": 200,
-    "timing": 100,
-    "model": 200,
-    "paper policy": 120,
-    "policy": 160,
+#: Every kind of file: where it lies, and how many damaged ones are tried.
+FILES = {
+    "instance": ("instance.json", 500),
+    "case": ("case.json", 400),
+    "schedule": ("schedule.csv", 250),
+    "compressed schedule": ("schedule.csv.gz", 150),
+    "split": ("split.json", 100),
+    "manifest": ("MANIFEST.json", 100),
+    "results": ("results.csv", 200),
+    "model": ("model.safetensors", 200),
+    "ded-dpc-paper": ("ded-dpc-paper.safetensors", 120),
+    "ded-dpc": ("ded-dpc.safetensors", 120),
+    "ded-admm": ("ded-admm.safetensors", 120),
 }
+POLICIES = ("ded-dpc-paper", "ded-dpc", "ded-admm")
 #: Longer valid instances are read, but not simulated.
 FEW_STEPS = 20
 PARSER = functools.cache(commands.parser)  # making one takes longer than most of these commands
+#: What a command says that it is about to do, before it finds what is wrong.
+ANNOUNCED = re.compile(r"^ded-bench: \d+ trainings? of .*\n", re.MULTILINE)
 
 Damaged = Sequence[Callable[[random.Random], Mutant]]
 
@@ -85,12 +75,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     write_record(instance, folder / "instances" / f"{instance.id}.json")
     own = quiet_instance(threebus, id="mine", horizon_s=0.05, seed=[2022, 7])  # no copy of another one
     write_record(own, folder / "instance.json")
-    write_record(Split(seed=1, train=(instance.id,), test=(instance.id,)), folder / "split.json")
-    write_record(Manifest(version="1-abc", files={"case.json": "00"}), folder / "MANIFEST.json")
+    split = {"seed": 1, "train": (instance.id,), "test": (instance.id,)}
+    write_record(Split(schema_="ded-bench/split/1", **split), folder / "split.json")
+    manifest = Manifest(schema_="ded-bench/manifest/1", version="1-abc", files={"case.json": "00"})
+    write_record(manifest, folder / "MANIFEST.json")
     t = np.linspace(0.0, 0.05, 6)
     schedule = Schedule(t, 0.6 + 0.001 * t[:, None])
     schedule.write(folder / "schedule.csv", case.generators)
     schedule.write(folder / "schedule.csv.gz", case.generators)
+    archive = Archive(folder / "schedules.npz")
+    archive.write("one", schedule, case)
+    archive.pack(["one"])
     claimed = {("NO", "ded"): "Optimal", ("TO", "ded"): "Optimal", ("TO", "ded-dpc"): "Policy"}
     rows = [scored(Row(instance.id, "test", *key, "default", status)) for key, status in claimed.items()]
     ROWS.write(folder / "results.csv", rows)
@@ -98,17 +93,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, threebus: Case, quiet_insta
     TIMING.write(folder / "timing.csv", [TimingRow("x", 1, r, *timed, solve_s=0.1) for r in case.regimes])
     rng = np.random.default_rng(0)
     mlp = tuple((0.1 * rng.normal(size=(n, m)), rng.normal(size=n)) for n, m in ((4, 3), (3, 4)))
-    model = linear_model(case)
     wide = dict(k=0.9 * np.eye(5), b=np.zeros((5, 2)), g=np.zeros((5, 2)), lift=rng.normal(size=(5, 9)))
-    dataclasses.replace(model, mlp=mlp, **wide).save(folder / "model.safetensors")
-    scope = Scope(case, "TO", instance.horizon_s)
+    dataclasses.replace(linear_model(case), mlp=mlp, **wide).save(folder / "model.safetensors")
     with torch.random.fork_rng():
-        torch.manual_seed(0)
-        plain = PaperNetwork(n_channels(case), case.p_min, case.p_max)
-        response = Response.make(case, case.knot_times(instance.horizon_s))
-        network = StagedNetwork(case, response, 2, 4, (1, 2))
-    PaperPolicy(scope, weights_of(plain), {"seed": 0}).save(folder / "paper.safetensors")
-    DispatchPolicy(scope, weights_of(network), {"seed": 0} | network.shape).save(folder / "policy.safetensors")
+        for method in POLICIES:
+            random_policy(method, case, horizon=HORIZON).save(folder / f"{method}.safetensors")
     return folder
 
 
@@ -125,16 +114,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     real = scorer.score
     nothing = scorer.Score(1.0, 0.0, 0.0, 0.0, 0.0)
 
-    def short(case: Case, instance: Any, schedule: Schedule, regime: str) -> scorer.Score:
-        return real(case, instance, schedule, regime) if instance.steps <= FEW_STEPS else nothing
+    def short(case: Case, instance: Any, *others: Any) -> scorer.Score:
+        return real(case, instance, *others) if instance.steps <= FEW_STEPS else nothing
 
     monkeypatch.setattr(commands, "parser", PARSER)
     monkeypatch.setattr(scorer, "score", short)
     monkeypatch.setattr(runner, "run", lambda *_: [])
-
-
-#: What a command says that it is about to do, before it finds what is wrong.
-ANNOUNCED = re.compile(r"^ded-bench: \d+ trainings? of .*\n", re.MULTILINE)
 
 
 def end_of(arguments: Sequence[object]) -> tuple[int, str]:
@@ -169,42 +154,23 @@ def ending(arguments: Sequence[object], path: Path, mutant: Mutant) -> tuple[int
     return code, f"{broken} {mutant.names}: {errors}" if broken else ""
 
 
-def mutants(kind: str, make: Sequence[Callable[[random.Random], Mutant]]) -> Iterator[Mutant]:
-    """As many as COUNTS says, the same every time, from several ways of damaging in turn."""
+def mutants(kind: str, count: int, make: Damaged) -> Iterator[Mutant]:
+    """So many, the same every time, from several ways of damaging in turn."""
     rng = random.Random(f"ded-bench {kind}")
-    for i in range(COUNTS[kind]):
+    for i in range(count):
         yield make[i % len(make)](rng)
-
-
-def test_there_are_enough() -> None:
-    assert sum(COUNTS.values()) >= 2000
-
-
-FILES = {
-    "instance": "instance.json",
-    "case": "case.json",
-    "schedule": "schedule.csv",
-    "compressed schedule": "schedule.csv.gz",
-    "split": "split.json",
-    "manifest": "MANIFEST.json",
-    "results": "results.csv",
-    "model": "model.safetensors",
-    "paper policy": "paper.safetensors",
-    "policy": "policy.safetensors",
-}
 
 
 def command(folder: Path, kind: str) -> list[object]:
     """A command that reads the file of a kind."""
-    path = folder / FILES[kind]
+    path = folder / FILES[kind][0]
     if kind in ("instance", "case", "schedule", "compressed schedule"):
         schedule = path if "schedule" in kind else folder / "schedule.csv"
         given = ["--instance", folder / "instance.json", "--case", folder / "case.json"]
         return ["score", *given, "--schedule", schedule, "--regime", "TO", "--json"]
-    method = {"model": "ded-ko-knots", "paper policy": "ded-dpc-paper", "policy": "ded-dpc"}.get(kind, "ded")
-    option = {"model": ["--model", path], "paper policy": ["--policy", path], "policy": ["--policy", path]}
-    given = ["--method", method, "--regime", "TO", "--case", folder, "--out", folder]
-    return ["solve", *given, *option.get(kind, [])]
+    method = kind if kind in POLICIES else "ded-ko-knots" if kind == "model" else "ded"
+    option = ["--policy", path] if kind in POLICIES else ["--model", path] if kind == "model" else []
+    return ["solve", "--method", method, "--regime", "TO", "--case", folder, "--out", folder, *option]
 
 
 def damage_to(path: Path) -> Damaged:
@@ -216,6 +182,8 @@ def damage_to(path: Path) -> Damaged:
         return [*[lambda r: damaged_json(whole.decode(), r)] * 3, lambda r: damaged_bytes(whole, r)]
     if path.suffix == ".csv":
         return [lambda r: damaged_table(whole.decode(), r), lambda r: damaged_bytes(whole, r)]
+    if path.suffix == ".npz":
+        return [lambda r: damaged_bytes(whole, r)]
     text = gzip.decompress(whole)
     return [
         lambda r: damaged_bytes(whole, r),
@@ -227,62 +195,63 @@ def damage_to(path: Path) -> Damaged:
 @pytest.mark.parametrize("kind", FILES)
 def test_commands_survive(folder: Path, kind: str) -> None:
     """Most damaged files are refused, some are as right as before; no row of the results changes."""
-    path, arguments = folder / FILES[kind], command(folder, kind)
+    (name, count), arguments = FILES[kind], command(folder, kind)
+    path = folder / name
     whole, before = path.read_bytes(), (folder / "results.csv").read_bytes()
     codes, problems = [], []
-    for mutant in mutants(kind, damage_to(path)):
+    for mutant in mutants(kind, count, damage_to(path)):
         code, problem = ending(arguments, path, mutant)
         codes.append(code)
         problems += [f"{problem[:600]} <- {mutant.data[:1500]!r}"] if problem else []
     path.write_bytes(whole)
     assert not problems, "\n".join(problems[:20])
     assert end_of(arguments)[0] == 0  # what was damaged was right
-    assert 0.3 * len(codes) < codes.count(2) < len(codes) == COUNTS[kind], codes.count(2)
+    assert 0.3 * len(codes) < codes.count(2) < len(codes) == count, codes.count(2)
     assert (folder / "results.csv").read_bytes() == before
 
 
-def test_timing_survives(folder: Path) -> None:
-    """`bench` and `report` read it; here its reader alone, since they have longer work to do."""
-    path = folder / "timing.csv"
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("timing.csv", lambda path, _: read_timing(path)),
+        ("schedules.npz", lambda path, case: Archive(path).read("one", case, 0.05)),
+    ],
+)
+def test_readers_survive(folder: Path, threebus: Case, name: str, read: Callable[..., object]) -> None:
+    """Those whose commands have longer work to do."""
+    path, refused = folder / name, 0
     whole = path.read_bytes()
-    refused: list[tuple[InputError, Mutant]] = []
-    for mutant in mutants("timing", damage_to(path)):
+    for mutant in mutants(name, 150, damage_to(path)):
         path.write_bytes(mutant.data)
         try:
-            read_timing(path)
+            read(path, threebus)
         except InputError as error:
-            refused.append((error, mutant))
+            refused += 1
+            assert error.source.startswith(str(path))
+            assert str(error).isprintable()
+            assert not mutant.names or any(name in str(error) for name in mutant.names)
     path.write_bytes(whole)
-    assert 0.3 * COUNTS["timing"] < len(refused) < COUNTS["timing"]
-    for error, mutant in refused:
-        assert error.source == str(path)
-        assert str(error).isprintable()
-        assert not mutant.names or any(name in str(error) for name in mutant.names)
+    assert 0.3 * 150 < refused < 150
 
 
 def test_summaries_survive_what_results_may_hold(folder: Path) -> None:
-    """Numbers that nobody would expect are still numbers: every table is made, without a warning."""
+    """Numbers that nobody would expect are still numbers: the table is made, without a warning."""
     whole = (folder / "results.csv").read_text()
     path, made = folder / "odd.csv", 0
-    for mutant in itertools.islice(mutants("results", [lambda r: damaged_table(whole, r)]), 80):
+    for mutant in mutants("results", 80, [lambda r: damaged_table(whole, r)]):
         path.write_bytes(mutant.data)
-        try:
-            rows = {row.key: row for row in ROWS.read(path)}
-        except InputError:
-            continue
-        results = Results(folder)
-        results.rows = rows
-        frame = with_gaps(named(results.frame()))
-        for table in (summary, table_times, claims, worst):
-            table(frame)
-        made += 1
+        with contextlib.suppress(InputError):
+            frame = with_gaps(named(ROWS.frame(ROWS.read(path))))
+            for table in (summary, table_times, claims, worst):
+                table(frame)
+            made += 1
     assert made > 10
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FILES if kind != "manifest"])
 def test_pickles_are_not_opened(folder: Path, tmp_path: Path, kind: str) -> None:
     """What would run code if it were unpickled, however it is packed, is only a damaged file."""
-    path, trace, zipped = folder / FILES[kind], tmp_path / "trace", io.BytesIO()
+    path, trace, zipped = folder / FILES[kind][0], tmp_path / "trace", io.BytesIO()
     torch.save(Payload(trace), zipped)
     plain = pickle.dumps(Payload(trace))
     whole = path.read_bytes()
@@ -292,20 +261,3 @@ def test_pickles_are_not_opened(folder: Path, tmp_path: Path, kind: str) -> None
     assert not trace.exists()
     pickle.loads(plain)
     assert trace.exists()  # it would have
-
-
-@pytest.mark.parametrize("method", ["ded-dpc-paper", "ded-dpc"])
-def test_a_checkpoint_is_not_unpickled_either(folder: Path, tmp_path: Path, method: str) -> None:
-    """Resuming from a file that is no checkpoint of this training is refused; nothing runs."""
-    out, trace = tmp_path / "p.safetensors", tmp_path / "trace"
-    path = out.with_suffix(".checkpoint.pt")
-    arguments = ["train-dpc", "--method", method, "--regime", "TO", "--case", folder, "--model", "linear"]
-    arguments += ["--resume", "--out", out, "--epochs", "1", "--limit", "1"]
-    arguments += ["--settings", "train400"] if method == "ded-dpc" else []  # draws no instances first
-    for content in (Payload(trace), {"network": {}}, [1, 2]):
-        torch.save(content, path)
-        assert ending(arguments, path, Mutant(path.read_bytes())) == (2, "")
-    for data in (b"", b"text", pickle.dumps(Payload(trace))):
-        assert ending(arguments, path, Mutant(data)) == (2, "")
-    assert not trace.exists()
-    assert not out.exists()

@@ -33,6 +33,7 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
     try:
         with safetensors.safe_open(str(path), framework="np") as file:
             header = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+            json.dumps(header, ensure_ascii=False).encode()  # no half of a character, which no text can hold
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None

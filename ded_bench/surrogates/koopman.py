@@ -20,6 +20,7 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
+from ded_bench.files.table import plain_name
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -129,7 +130,7 @@ class Koopman:
             layers = sum(name.endswith(".bias") for name in arrays)
             mlp = tuple((arrays[f"mlp.{i}.weight"], arrays[f"mlp.{i}.bias"]) for i in range(layers))
             model = Koopman(
-                kind=str(header["kind"]),
+                kind=plain_name(str(header["kind"])),  # it stands in rows, and in the names of files
                 case_id=case.id,
                 case_fingerprint=case.fingerprint,
                 dt_s=float(header["dt_s"]),

@@ -263,3 +263,26 @@ def test_pickles_are_not_opened(folder: Path, tmp_path: Path, kind: str) -> None
     assert not trace.exists()
     pickle.loads(plain)
     assert trace.exists()  # it would have
+
+
+def test_a_checkpoint_is_not_unpickled_either(folder: Path, tmp_path: Path) -> None:
+    """Resuming from a file that is no checkpoint of this training is refused; nothing runs."""
+    out, trace = tmp_path / "p.safetensors", tmp_path / "trace"
+    path = out.with_suffix(".checkpoint.pt")
+    arguments = [
+        "train-dpc",
+        "--method",
+        "ded-dpc-paper",
+        "--regime",
+        "TO",
+        "--case",
+        folder,
+        "--model",
+        "linear",
+    ]
+    arguments += ["--resume", "--out", out, "--epochs", "1", "--limit", "1"]
+    torch.save(Payload(trace), path)
+    for data in (path.read_bytes(), b"", b"text", pickle.dumps(Payload(trace))):
+        assert ending(arguments, path, Mutant(data)) == (2, "")
+    assert not trace.exists()
+    assert not out.exists()

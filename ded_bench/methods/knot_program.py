@@ -16,6 +16,7 @@ between knots bind: they get rows as solutions ask for them (`slp.solve_with_row
 
 from __future__ import annotations
 
+import functools
 import time
 from dataclasses import dataclass, replace
 
@@ -106,7 +107,6 @@ class KnotProgram:
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._cost = self._columns_cost()
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
-        self._at_knots = self._knot_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with |ω| limited at all knots and at the points chosen.
@@ -321,7 +321,8 @@ class KnotProgram:
         blocks += [(p[:, None], self._s[:, None], -one) for p in (place, place + n)]
         return self._matrix(2 * n, blocks)
 
-    def _knot_rows(self) -> sp.csc_matrix:
+    @functools.cached_property
+    def _at_knots(self) -> sp.csc_matrix:
         """δω of all generators at all knots but the first; a knot belongs to the interval after it."""
         row, speed = np.arange(self._u.size).reshape(self._n, -1), self.model.speed
         if isinstance(speed, slice):

@@ -99,17 +99,14 @@ class Move:
         return gone or now["settings"] in GONE_SETTINGS or now["settings"].startswith(("study", "start-"))
 
     def models(self) -> None:
-        """Models and their rollout errors."""
+        """The models that are kept."""
         for path in sorted((self.old / "koopman").iterdir()):
             name, kind = path.name.partition(".")[0], path.name.partition(".")[2]
             if name == "exchanged":
                 self.study(path.read_text().splitlines(), "exchanged")
-            elif name == "rollouts":
-                header, rows = read_cells(path)
-                none = {"method": "", "settings": ""}
-                kept = [cells for cells in rows if not self.is_gone(cells | none)]
-                write_cells(self.new / "koopman" / path.name, header, kept)
-            elif name == "koopman-paper" or (name == "koopman" and self.case.id == WITH_KOOPMAN):
+            elif kind == "safetensors" and (
+                name == "koopman-paper" or (name == "koopman" and self.case.id == WITH_KOOPMAN)
+            ):
                 copy(path, self.new / "koopman" / f"{name}.{kind}")
 
     def policies(self) -> None:

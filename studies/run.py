@@ -27,7 +27,6 @@ SHARED = {
     "train-dpc": ("case", "regime", "results", "workers"),
     "solve": ("case", "split", "regime", "limit", "workers", "out"),
     "online": ("case", "regime", "scenarios", "workers", "out"),
-    "rollouts": ("case", "results"),
     "certify": ("case", "regime", "results", "workers"),
     "bench": ("case", "results"),
     "report": ("case", "results"),

@@ -24,7 +24,7 @@ MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 #: The order of the list of commands: those of the road, then what judges results, then the closed loop.
 ORDER = (
     *("cases", "instances", "methods", "train-ko", "solve", "train-dpc", "bench", "report"),
-    *("score", "reproduce", "compare", "certify", "rollouts", "scenarios", "online", "overview"),
+    *("score", "reproduce", "compare", "certify", "scenarios", "online", "overview"),
 )
 #: Under the list of commands, which must fit a terminal 80 columns wide.
 ROAD = (

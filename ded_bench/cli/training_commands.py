@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,8 @@ from ded_bench.cli.arguments import (
 from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import trainable
-from ded_bench.problem.benchmark import problem_folder, select_split
+from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.surrogates.find import TRAINED
@@ -61,13 +61,6 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
     p.set_defaults(run=_train_dpc)
 
-    p = command(commands, "rollouts", "errors of the surrogates under several kinds of schedules")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--results", type=Path, help="results folder: gives models and optimal schedules")
-    p.add_argument("--limit", type=positive, default=10, help="how many test instances' optimal schedules")
-    p.add_argument("--draws", type=positive, default=30, metavar="N", help="drawn schedules, of all kinds")
-    p.set_defaults(run=_rollouts)
-
 
 def _train_ko(a: argparse.Namespace) -> int:
     from ded_bench.surrogates.find import model_file
@@ -82,9 +75,8 @@ def _train_ko(a: argparse.Namespace) -> int:
     if is_paper:
         _find_torch()
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
-    from ded_bench.analysis.rollouts import rollout_table
-    from ded_bench.surrogates.identify import held_out, identify
-    from ded_bench.surrogates.linear import nominal_model
+    from ded_bench.plants.lossless.network import Network
+    from ded_bench.surrogates.identify import held_out, identify, rollout_errors
 
     if is_paper:
         with _needing_torch():
@@ -93,10 +85,9 @@ def _train_ko(a: argparse.Namespace) -> int:
     else:
         model = identify(case, a.seed, a.count)
     model.save(out)
-    table = rollout_table(case, [nominal_model(case), model], held_out(case, a.seed))
-    write_atomically(out.with_suffix(".errors.csv"), table.to_csv(index=False))
-    print(table.to_string(index=False, float_format="{:.3g}".format))
-    print(f"wrote {out}")
+    omega, p_slack = rollout_errors(model, Network(case), held_out(case, a.seed))
+    held = f"{omega / (2 * math.pi):.3g} Hz at most, P_s by {p_slack:.3g} pu rms, on held-out trajectories"
+    print(f"wrote {out}: ω errs by {held}")
     return 0
 
 
@@ -183,29 +174,3 @@ def _needing_torch() -> Iterator[None]:
         if error.name != "torch":
             raise
         raise InputError("torch", "", "training needs PyTorch: pip install 'ded-bench[train]'") from None
-
-
-def _rollouts(a: argparse.Namespace) -> int:
-    from ded_bench.results.rows import Results
-    from ded_bench.surrogates.find import MODELS, find_surrogate
-
-    chosen = select_split(a.case, limit=a.limit)
-    case = chosen.case
-    results = Results(a.results or default_results(case))
-    say(f"simulating schedules of {case.id} on the true system and on every model")
-    from ded_bench.analysis.paper_numbers import read_paper
-    from ded_bench.analysis.reference import choose_reference
-    from ded_bench.analysis.rollouts import all_rollouts
-
-    surrogates = []
-    for name in MODELS:
-        try:
-            surrogates.append(find_surrogate(case, name, search_folders(case, results.folder)))
-        except InputError as error:
-            say(f"left out: {error}")
-    reference = choose_reference(results.frame(), read_paper(problem_folder(a.case, case)))
-    optimal = dict.fromkeys((reference.method, "ded-slp"))
-    instances = [instance for instance, _ in chosen.instances]
-    table = all_rollouts(case, results, instances, surrogates, tuple(optimal), a.draws)
-    print(table.to_string(index=False, float_format="{:.3g}".format))
-    return 0

@@ -53,7 +53,6 @@ class Sources:
         problems_version: of the benchmark's files; empty if there are none.
         histories: of trainings by method and name of the policy's file; the method is empty if the policy is
             not there. Columns seconds and, if they were taken, training, held out, and terms of the loss.
-        rollouts: tables of the surrogates' errors by the name of their file.
         notes: what could not be used, in sentences; figures add theirs.
     """
 
@@ -68,7 +67,6 @@ class Sources:
     instances: dict[str, Instance]
     test_count: int
     problems_version: str
-    rollouts: dict[str, pd.DataFrame]
     histories: dict[tuple[str, str], pd.DataFrame]
     certificates: tuple[Certificate, ...]
     notes: list[str] = field(default_factory=list)
@@ -166,7 +164,6 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         instances=instances,
         test_count=test_count,
         problems_version=version,
-        rollouts={p.name.removesuffix(".errors.csv"): _read_numbers(p) for p in paths.all_model_errors},
         histories=dict(_history(path) for path in paths.training_histories),
         certificates=read_certificates(folder),
         notes=notes,

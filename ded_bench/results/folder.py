@@ -56,15 +56,6 @@ class ResultsFolder:
         """The models that are there, by name."""
         return sorted(self.koopman.glob("*.safetensors"))
 
-    def model_errors(self, kind: str) -> Path:
-        """Rollout errors of models; `kind` is a model's, or says whose schedules they are."""
-        return self.koopman / f"{kind}.errors.csv"
-
-    @property
-    def all_model_errors(self) -> list[Path]:
-        """The tables of rollout errors that are there, by name."""
-        return sorted(self.koopman.glob("*.errors.csv"))
-
     def policy(self, name: str) -> Path:
         """A trained policy."""
         return self.path / "policies" / f"{name}.safetensors"

@@ -110,6 +110,12 @@ def predict(model: Koopman, network: Network, data: Trajectories) -> Array:
     return model.rollout(psi, data.inputs)[..., : n_gen + 1]
 
 
+def rollout_errors(model: Koopman, network: Network, data: Trajectories) -> tuple[float, float]:
+    """Largest |Δω| (rad/s) and root mean square of ΔP_s (pu) of a model's rollouts of trajectories."""
+    error = predict(model, network, data) - data.outputs
+    return float(np.abs(error[..., :-1]).max()), float(np.sqrt(np.square(error[..., -1]).mean()))
+
+
 def _residuals(model: Koopman, network: Network, data: Trajectories) -> Array:
     n_gen = len(network.generators)
     unit = np.append(np.full(n_gen, OMEGA_UNIT), SLACK_UNIT)

@@ -114,7 +114,7 @@ def test_certificate_is_shown(ninebus: Case, problems: Path, tmp_path: Path) -> 
 @pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(
     "name",
-    ["results.csv", "timing.csv", "policies/p.history.csv", "koopman/k.errors.csv", "certificate.json"],
+    ["results.csv", "timing.csv", "policies/p.history.csv", "certificate.json"],
 )
 @pytest.mark.parametrize("text", ["", "a,b\n1,2,3,4\n1\n"])
 def test_a_wrong_table_is_bad_input(

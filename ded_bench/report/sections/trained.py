@@ -1,13 +1,12 @@
-"""What was trained: surrogates and their errors, policies, certificates."""
+"""What was trained: policies, certificates."""
 
 from __future__ import annotations
 
 import pandas as pd
 
 from ded_bench.analysis.lines import titled
-from ded_bench.analysis.rollouts import ROLLOUTS
-from ded_bench.report.columns import CERTIFICATE, TRAINING, Column
-from ded_bench.report.page import Block, Heading, PageTable, Text, folded
+from ded_bench.report.columns import CERTIFICATE, TRAINING
+from ded_bench.report.page import Block, Heading, PageTable, Text
 from ded_bench.report.sources import Draft, Sources, training_table
 
 
@@ -17,21 +16,8 @@ def tables(sources: Sources) -> dict[str, PageTable]:
 
 
 def blocks(draft: Draft) -> list[Block]:
-    """Errors of surrogates folded away; trainings and certificates in sight."""
-    made: list[Block] = [Heading("Surrogates")]
-    for name, errors in draft.sources.rollouts.items():
-        columns = tuple(Column(str(column), str(column)) for column in errors.columns)
-        where = f"on simulated trajectories held out from the identification of `{name}`"
-        if name == ROLLOUTS:
-            where = "under drawn schedules, the static dispatch and optimal schedules of test instances"
-        caption = f"Errors of rollouts over the whole horizon {where}"
-        made += folded(caption, PageTable(errors, columns))
-    made += (
-        []
-        if draft.sources.rollouts
-        else [Text("The folder holds no errors of surrogates; see `ded-bench rollouts`.")]
-    )
-    made.append(Heading("Training of the policies"))
+    """Trainings and certificates."""
+    made: list[Block] = [Heading("Training of the policies")]
     frame = draft.tables["training"].frame
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()

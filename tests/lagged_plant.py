@@ -20,8 +20,7 @@ from ded_bench.plants.lossless.lossless_plant import LosslessPlant, LosslessStat
 from ded_bench.plants.plant import PLANTS, Piece
 from ded_bench.plants.time_varying import Delivered, Hold, Indices, TimeVarying, across_intervals
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.instance import State
+from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.trajectory import Trajectory
 
 #: Time constant of the turbines, s.

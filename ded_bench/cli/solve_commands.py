@@ -24,11 +24,16 @@ from ded_bench.cli.messages import counted, say
 from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import PLANTS
-from ded_bench.problem.benchmark import SPLITS, Selection, problem_folder, select_files, select_split
+from ded_bench.problem.benchmark import (
+    SPLITS,
+    Selection,
+    check_own_name,
+    problem_folder,
+    select_files,
+    select_split,
+)
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.benchmark import check_own_name
-from ded_bench.problem.instance import check_plausible
+from ded_bench.problem.instance import Instance, check_plausible
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.reference_run import default_results, search_folders
 from ded_bench.solvers.status import Status

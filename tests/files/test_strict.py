@@ -12,8 +12,8 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import read_record, write_atomically, write_record
-from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.benchmark import load_manifest, load_split
+from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.sampling import sample_instance
 
 VALID = {

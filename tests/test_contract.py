@@ -15,7 +15,7 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.files.errors import InputError
-from ded_bench.methods import memory
+from ded_bench.methods import solution
 from ded_bench.methods.options import described
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings, Solution
@@ -128,7 +128,7 @@ def test_too_little_memory_is_an_answer(
     name: str, folder: Path, strange: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that does not fit is refused before it is made; small ones are still answered."""
-    monkeypatch.setattr(memory, "MAX_BYTES", 1000)
+    monkeypatch.setattr(solution, "MAX_BYTES", 1000)
     instance = sample_instance(strange, 77, 1)
     answer = solved(strange, folder, name, instance)
     assert answer.schedule is not None or "GiB" in answer.error

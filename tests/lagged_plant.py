@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -114,9 +114,6 @@ class LaggedPlant:
 
     def columns(self, states: Any) -> Mapping[str, Array]:
         return self.network.columns(states)
-
-    def servable(self, instances: Sequence[Instance]) -> Any:
-        return self.network.servable(instances)
 
     def check_servable(self, instance: Instance, source: str) -> None:
         self.network.check_servable(instance, source)

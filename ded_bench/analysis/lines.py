@@ -111,16 +111,14 @@ def _natural(text: str) -> tuple[tuple[str, float], ...]:
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that tables are about: on test instances if there are any, else all `scoring_rows`."""
-    frame = scoring_rows(frame)
-    test = frame[frame["split"] == "test"]
-    return test if len(test) else frame
+    """The rows that tables are about: on test instances if there are any, else all but those of validation.
 
-
-def scoring_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """All rows but those of validation instances, on which methods were chosen."""
-    chosen: pd.DataFrame = frame[frame["split"] != "validation"]
-    return chosen
+    Methods are chosen on validation instances.
+    """
+    for chosen in (frame["split"] == "test", frame["split"] != "validation"):
+        if chosen.any():
+            return where(frame, chosen)
+    return frame.iloc[:0]
 
 
 def on_usual_model(frame: pd.DataFrame) -> pd.DataFrame:

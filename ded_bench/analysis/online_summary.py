@@ -74,11 +74,8 @@ def _line(rows: pd.DataFrame) -> dict[str, Any]:
         "max_excess_mhz_mean": 1e3 * done["max_excess_hz"].mean(),
         "max_excess_mhz_max": 1e3 * done["max_excess_hz"].max(),
         "unforeseen_mhz_mean": 1e3 * done["unforeseen_hz"].mean(),
-        "mean_excess_mhz": 1e3 * done["mean_excess_hz"].mean(),
         "share_outside": done["share_outside"].mean(),
         "slack_travel_pu": done["slack_travel_pu"].mean(),
-        "ramp_violation_max": done["ramp_violation"].max(),
-        "bound_violation_max": done["bound_violation"].max(),
         **{name: float(rows[name].sum()) / plans for name in ("late", "failed", "infeasible")},
     }
 

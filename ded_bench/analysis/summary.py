@@ -14,13 +14,10 @@ import pandas as pd
 
 from ded_bench.analysis.lines import GROUP, HEAD, groups, head, line_table, records
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU
-from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
 
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
 SUCCESS = [str(status) for status in (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)]
-#: Shift of the shifted geometric mean, s: times far below it count as equal.
-TIME_SHIFT_S = 0.01
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
 #: What each of them is called.
 LIMITS = dict(zip(VIOLATIONS, ("frequency", "ramp", "bounds", "initial power"), strict=True))
@@ -29,7 +26,6 @@ SMALLEST_GAP = 1e-3
 #: The scorer's limits on each of them for `feasible` (see `plants.score`).
 FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
 SPREAD = ("mean", "median", "p95", "max")
-PARTS = ("build_s", "setup_s", "solve_s")
 
 
 def gaps(frame: pd.DataFrame, objectives: pd.Series[float]) -> pd.DataFrame:
@@ -90,49 +86,6 @@ def _spread(name: str, values: pd.Series[float]) -> dict[str, float]:
         return dict.fromkeys((f"{name}_{part}" for part in SPREAD), np.nan)
     found = (numbers.mean(), np.median(numbers), np.quantile(numbers, 0.95), numbers.max())
     return {f"{name}_{part}": float(value) for part, value in zip(SPREAD, found, strict=True)}
-
-
-def coverage(everything: pd.DataFrame, judged: pd.DataFrame) -> pd.DataFrame:
-    """The summary of all rows of those lines that have more rows than the judged ones."""
-    overall = summary(everything)
-    counts = judged.groupby(GROUP).size().reindex(pd.MultiIndex.from_frame(overall[GROUP]), fill_value=0)
-    return overall[overall["rows"].to_numpy() > counts.to_numpy()].reset_index(drop=True)
-
-
-def by_model(overview: pd.DataFrame) -> pd.DataFrame:
-    """The lines of a summary whose method and settings were run on more than one surrogate."""
-    several = overview.groupby(["method", "settings"])["model"].transform("nunique") > 1
-    return overview[several].reset_index(drop=True)
-
-
-def table_times(frame: pd.DataFrame) -> pd.DataFrame:
-    """Build, set-up and solve times of the results table, quartiles of every line, s.
-
-    These were taken while `workers` processes shared the machine: they compare methods by orders
-    of magnitude, nothing finer.
-    """
-    rows = []
-    for regime, key, group in groups(frame):
-        times = {name: group[name].dropna().to_numpy(dtype=float) for name in PARTS}
-        row: dict[str, Any] = {"n": len(times["solve_s"])}
-        row["workers"] = " ".join(map(str, sorted(set(group["workers"]))))
-        for name, values in times.items():
-            row |= quartiles(name, values)
-        row["solve_s_shifted_geometric_mean"] = shifted_geometric_mean(times["solve_s"])
-        rows.append(head(regime, key) | row)
-    names = [f"{name}{part}" for name in PARTS for part in ("", "_q1", "_q3")]
-    return line_table(rows, [*HEAD, "n", "workers", *names, "solve_s_shifted_geometric_mean"])
-
-
-def quartiles(name: str, values: Array) -> dict[str, float]:
-    """Median and quartiles as `name`, `name_q1`, `name_q3`; missing if there are no values."""
-    q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75]) if len(values) else [np.nan] * 3
-    return {name: float(median), f"{name}_q1": float(q1), f"{name}_q3": float(q3)}
-
-
-def shifted_geometric_mean(values: Array, shift: float = TIME_SHIFT_S) -> float:
-    """exp(mean(log(values + shift))) - shift; missing if there are no values."""
-    return float(np.exp(np.log(values + shift).mean()) - shift) if len(values) else np.nan
 
 
 def claims(frame: pd.DataFrame) -> pd.DataFrame:
@@ -220,7 +173,7 @@ def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:
     `seconds` is the median of the timing table where it has the line (`alone` is true), else that
     of the results table, taken under parallel load.
     """
-    loaded = table_times(frame).set_index(GROUP)["solve_s"]
+    loaded = frame.groupby(GROUP)["solve_s"].median()
     alone = timing.dropna(subset=["solve_s"]).set_index(GROUP)["solve_s"]
     found = summary(frame)
     keys = pd.MultiIndex.from_frame(found[GROUP])

@@ -92,11 +92,8 @@ class Plant(Protocol):
     def columns(self, states: Any) -> Mapping[str, Array]:
         """What only this plant has, of `Piece.states`, as named columns of shape (n,)."""
 
-    def servable(self, instances: Sequence[Instance]) -> NDArray[np.bool_]:
-        """Tell which instances static dispatch can serve throughout, shape (n,): the rule of drawing them."""
-
     def check_servable(self, instance: Instance, source: str) -> None:
-        """Raise InputError, which names the source and the field, unless static dispatch can serve it."""
+        """Raise InputError, which names source and field, unless static dispatch can serve it throughout."""
 
 
 #: Plants by name: `module:class`, called with the case.
@@ -110,7 +107,8 @@ def plant_of(case: Case, name: str | None = None) -> Plant:
         InputError: there is no such plant, or the case lacks its data.
     """
     name = name or case.plant_name
-    check_plant(name)
+    if name not in PLANTS:
+        raise InputError("plant", name[:40], f"is not one of {', '.join(PLANTS)}")
     return _made(case, name)
 
 
@@ -121,12 +119,15 @@ def _made(case: Case, name: str) -> Plant:
     return plant
 
 
-def check_plant(name: str) -> None:
-    """Raise InputError unless there is a plant of this name."""
-    if name not in PLANTS:
-        raise InputError("plant", name[:40], f"is not one of {', '.join(PLANTS)}")
-
-
 def servable(case: Case, instances: Sequence[Instance]) -> NDArray[np.bool_]:
-    """Tell which instances the case's plant can serve, shape (n,); see `Plant.servable`."""
-    return plant_of(case).servable(instances)
+    """Tell which instances static dispatch can serve on the case's plant, shape (n,): the rule of draws."""
+    plant = plant_of(case)
+
+    def served(instance: Instance) -> bool:
+        try:
+            plant.check_servable(instance, "")
+        except InputError:
+            return False
+        return True
+
+    return np.array([served(instance) for instance in instances], dtype=np.bool_)

@@ -216,54 +216,18 @@ class TimeVarying:
             raise ValueError("the set-points are delivered")
         on_state, on_input = (np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2])
 
+        length, count = self.lengths, self.lengths.astype(float)
+        count[-1] += 1.0  # the point at a knot is of the interval after it, the last of the last one
+
         def add(r: int, costate: Array) -> None:
-            here = self._within(r)
+            here = np.flatnonzero(r < count)
             costate[here, 0] += on_state[here]
 
-        rows, count = self._costates(1, add), self.lengths.astype(float)
-        count[-1] += 1.0
+        rows = self._costates(1, add)
         # u rises linearly over an interval: Σ r / length over its points, of which the last has one more.
-        risen = (count - 1.0) * count / 2.0 / self.lengths
+        risen = (count - 1.0) * count / 2.0 / length
         start, end = on_input * (count - risen)[:, None], on_input * risen[:, None]
         return LocalRows(rows.interval, rows.x[:, 0], rows.start[:, 0] + start, rows.end[:, 0] + end)
-
-    def _within(self, r: int) -> Indices:
-        """Intervals with a point r steps after their start; the point at a knot is of the one after it."""
-        length = self.lengths
-        return np.flatnonzero((r < length) | ((r == length) & (self.points[1:] == self.points[-1])))
-
-    def adjoint(self, on_omega: Array, on_slack: Array) -> Array:
-        """Gradient with respect to u of Σ on_omega · ω + on_slack · P_s over all grid points.
-
-        Args:
-            on_omega: weights, shape (n_points, n_gen).
-            on_slack: weights, shape (n_points,).
-
-        Returns:
-            Shape (n_knots, n_gen).
-        """
-        n_gen, length = self.p_gen.shape[1], self.lengths
-
-        def add(r: int, costate: Array) -> None:
-            here = self._within(r)
-            at = self.points[here] + r
-            if isinstance(self.speed, slice):
-                costate[here, 0, self.speed] += on_omega[at]
-            else:
-                costate[here, 0] += np.einsum("jg,jgi->ji", on_omega[at], self.speed[here])
-            costate[here, 0] += on_slack[at, None] * self.slack[here]
-
-        rows = self._costates(1, add)
-        gradient = np.zeros((len(self.points), n_gen))
-        gradient[:-1] += rows.start[:, 0]
-        gradient[1:] += rows.end[:, 0]
-        costate = np.zeros(self.slack.shape[1])
-        for j in range(len(length) - 1, -1, -1):
-            through, slope = costate @ self.across.g[j], costate @ self.across.h[j] / length[j]
-            gradient[j] += through - slope
-            gradient[j + 1] += slope
-            costate = rows.x[j, 0] + costate @ self.across.f[j]
-        return gradient
 
     def _costates(self, n_rows: int, add: Callable[[int, Array], None]) -> LocalRows:
         """The adjoint recursion through all intervals at once, `n_rows` weighted sums in each.

@@ -10,18 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    WrapValidator,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
-from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
+from ded_bench.problem.case import Array, Case, Extended, Name, NonNegative, Number, Positive
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,7 +91,7 @@ def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
         raise ValueError(f"{name}: must be a whole multiple of dt_s")
 
 
-class Initial(Record):
+class Initial(Extended):
     """State at t = 0, by generator bus: power in pu, frequency deviation in rad/s, angle in rad.
 
     Without angles (always in instance/1) they are those of the power flow.
@@ -107,10 +100,6 @@ class Initial(Record):
     power: dict[Name, Number]
     omega: dict[Name, Number]
     theta: dict[Name, Number] | None = None
-
-    @model_serializer(mode="wrap")
-    def _given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in write(self).items() if value is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +138,8 @@ class Instance(Fingerprinted):
         return seed
 
     @model_validator(mode="after")
-    def _whole_steps(self) -> Instance:
+    def _consistent(self) -> Instance:
         check_whole_steps("horizon_s", self.horizon_s, self.dt_s)
-        return self
-
-    @model_validator(mode="after")
-    def _fields_of_its_schema(self) -> Instance:
         second = self.schema_ == "ded-bench/instance/2"
         if "theta" in self.initial.model_fields_set and not second:
             raise ValueError("initial.theta: needs schema ded-bench/instance/2")

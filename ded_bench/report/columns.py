@@ -147,8 +147,6 @@ RATES = (
     Column("correct_rate", "feasible (verified)", form=".1%"),
     Column("strict_rate", "strictly feasible (verified)", form=".1%"),
 )
-COVERAGE = (*RATES, FAILURES, _GAPS[0], _GAPS[-1], _FREQUENCY[0], _FREQUENCY[-1])
-MODELS = (*_HEAD, MODEL, N, FAILURES, *_GAPS, _FREQUENCY[0], _FREQUENCY[-1])
 VIOLATIONS = (
     *_HEAD,
     *_FREQUENCY,
@@ -172,21 +170,16 @@ PROVENANCE = (
     Column("made_with", "surrogate and policy"),
     Column("solver_version", "solver"),
 )
-_TIMES = (
+TIMING = (
+    *(*_HEAD, INSTANCES, Column("repeats", "repeats")),
     Column("solve_s_q1", "solve 25 %"),
     Column("solve_s", "solve median"),
     Column("solve_s_q3", "solve 75 %"),
     Column("setup_s", "set-up median"),
     Column("build_s", "build median"),
-)
-TIMING = (
-    *(*_HEAD, INSTANCES, Column("repeats", "repeats"), *_TIMES, FAILURES),
+    FAILURES,
     Column("peak_memory_mib", "peak memory", "MiB"),
     *(Column("load_average", "load"), DATE, Column("error", "error")),
-)
-LOADED_TIMES = (
-    *(*_HEAD, N, Column("workers", "workers"), *_TIMES),
-    Column("solve_s_shifted_geometric_mean", "solve, shifted geometric mean"),
 )
 WORST = (
     *_HEAD,

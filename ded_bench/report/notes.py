@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import pandas as pd
 
@@ -13,8 +12,6 @@ from ded_bench.report.sources import Sources
 
 #: One-minute load average above which a timing was not alone on the machine.
 BUSY = 1.5
-#: Columns that say what made a row.
-MADE_BY = ("version", "commit", "method_version", "made_with", "solver_version")
 
 
 def rows_caption(sources: Sources) -> str:
@@ -27,14 +24,6 @@ def rows_caption(sources: Sources) -> str:
         left = len(sources.rows) - len(frame)
         return f"{instances} test instances" + (f"; {left} other rows left out" if left else "")
     return f"all {instances} instances, none of them of the test split"
-
-
-def listed(values: Iterable[object]) -> str:
-    """Distinct values, the most frequent first; with their numbers, if there are several."""
-    counts = Counter(str(value) for value in values)
-    if len(counts) == 1:
-        return next(iter(counts))
-    return ", ".join(f"{value or 'unknown'} × {count}" for value, count in counts.most_common())
 
 
 def alarms(sources: Sources) -> list[str]:
@@ -109,18 +98,8 @@ def _missing(sources: Sources) -> Iterator[str]:
 
 
 def _makers(sources: Sources) -> Iterator[str]:
-    """Rows of one line that different versions made, and rows that today's methods would not make."""
+    """Rows that today's methods would not make."""
     made = sources.judged[sources.judged["objective"].notna()]
-    words = {"version": "versions of ded-bench", "method_version": "versions of the method"}
-    words["solver_version"] = "versions of the solver"
-    for name, what in words.items():
-        mixed = [
-            f"{title(*key)} {regime} ({listed(rows[name])})"
-            for regime, key, rows in groups(made)
-            if rows[name].nunique() > 1
-        ]
-        if mixed:
-            yield f"Rows of one line come from different {what}: {'; '.join(mixed)}."
     today = {str(name): METHODS[str(name)].version for name in set(made["method"]) & set(METHODS)}
     old = sorted(
         {m for m, v in zip(made["method"], made["method_version"], strict=True) if v != today.get(m, v)}

@@ -12,7 +12,6 @@ import pandas as pd
 
 from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.files.strict import write_atomically
 from ded_bench.report.columns import (
     BREAK_EVEN,
     CASE,
@@ -42,8 +41,7 @@ from ded_bench.report.page import (
     PageTable,
     Picture,
     Text,
-    render_html,
-    render_markdown,
+    write_page,
 )
 from ded_bench.report.sources import Sources
 from ded_bench.run.environment import environment, now
@@ -58,15 +56,6 @@ EXPLANATION = (
     "the method's process held, all that it imports included. Exponents b are of value = a · generators^b, "
     "by least squares on logarithms, on three grids at least.",
 )
-#: What stands under which heading, by the names of tables and figures.
-PARTS = {
-    "The grids": ("grids",),
-    "Gaps": ("gaps",),
-    "Claimed and verified": ("verified", "violations"),
-    "Time and memory against size": ("growth", "slopes", "times", "memory"),
-    "The closed loop": ("online",),
-    "Trainings": ("payoff", "trainings"),
-}
 
 
 def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
@@ -84,48 +73,70 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     """
     grids = sorted((read_grid(folder) for folder in folders), key=lambda grid: len(grid.case.generators))
     found = points(grids)
-    tables = {name: table for name, table in _tables(grids, found).items() if len(table.frame)}
-    for name, table in tables.items():
-        write_atomically(out / "tables" / f"{name}.csv", table.frame.to_csv(index=False))
-    known: dict[str, Block] = {**tables}
-    files = [out / "tables" / f"{name}.csv" for name in tables]
-    if len(found):
-        files.append(out / "figures" / "growth.png")
-        save_figure(growth_figure(found), files[-1])
-        caption = (
-            "Time, memory and mean gap of each method against the number of generators; gaps are linear "
-            "within ±0.01 %. Hollow: some schedules are infeasible."
-        )
-        known["growth"] = Picture("figures/growth.png", caption)
-    blocks = _blocks(grids, out, known, tables)
-    write_atomically(out / "overview.md", render_markdown(blocks))
-    write_atomically(out / "overview.html", render_html(blocks, out))
-    return [*files, out / "overview.md", out / "overview.html"]
+    made: list[Block] = [
+        Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
+        Items(EXPLANATION),
+    ]
+    for heading, blocks in _parts(grids, found, out).items():
+        made += [Heading(heading), *blocks] if blocks else []
+    if not found["solve_s"].notna().any():
+        made.append(Text("No method was timed alone yet; run `ded-bench bench`."))
+    folders_here = {grid.case.id: Path(os.path.relpath(grid.folder, out)).as_posix() for grid in grids}
+    items = [f"`{case}`: `{folder}`, seen from this page" for case, folder in folders_here.items()]
+    hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
+    here = "; ".join(f"{name} {value}" for name, value in environment().items())
+    items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]
+    return write_page([*made, Heading("Where the rows come from"), Items(tuple(items))], out, "overview")
 
 
-def _tables(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, PageTable]:
-    """All tables by the name of their file."""
-    columns = (REGIME, TITLE, *(Column(grid.case.id, grid.case.id) for grid in grids))
-    cells = {
-        "gaps": ("Mean gap to the reference, % (instances)", _gap),
-        "verified": ("Claimed → verified: success and feasibility", _rates),
-        "violations": ("Largest excess over the frequency bound, Hz", _number("freq_violation_hz_max")),
-        "times": ("Median time of a schedule, s", _number("solve_s")),
-        "memory": ("Peak memory of the method's process, MiB", _number("peak_memory_mib")),
-    }
-    fitted = slopes(found, [name for name, _ in VALUES])
-    fitted = fitted[fitted[[name for name, _ in VALUES]].notna().any(axis=1)]
+def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str, list[Block]]:
+    """Tables and the figure by the heading that they stand under."""
+    cases = (REGIME, TITLE, *(Column(grid.case.id, grid.case.id) for grid in grids))
+
+    def table(file: str, frame: pd.DataFrame, columns: tuple[Column, ...], caption: str) -> list[Block]:
+        return [PageTable(frame, columns, caption, file)] if len(frame) else []
+
+    def side_by_side(file: str, cell: Callable[[dict[str, Any]], str], caption: str) -> list[Block]:
+        return table(file, across(found, cell), cases, caption)
+
+    values = [name for name, _ in VALUES]
+    fitted = slopes(found, values)
+    fitted = fitted[fitted[values].notna().any(axis=1)]
     operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
+    excess = "Largest excess over the frequency bound, Hz"
     paid = "After how many schedules trainings have paid, beside linear programs that need none"
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
-        "grids": PageTable(sizes(grids), GRIDS, "The grids"),
-        **{name: PageTable(across(found, cell), columns, caption) for name, (caption, cell) in cells.items()},
-        "slopes": PageTable(fitted, SLOPES, "How time and memory grow with the number of generators"),
-        "trainings": PageTable(trainings(grids), TRAININGS, "What was trained"),
-        "payoff": PageTable(break_evens(grids), BREAK_EVEN, paid),
-        "online": PageTable(operated, (CASE, *ONLINE), loop),
+        "The grids": table("grids", sizes(grids), GRIDS, "The grids"),
+        "Gaps": side_by_side("gaps", _gap, "Mean gap to the reference, % (instances)"),
+        "Claimed and verified": [
+            *side_by_side("verified", _rates, "Claimed → verified: success and feasibility"),
+            *side_by_side("violations", _number("freq_violation_hz_max"), excess),
+        ],
+        "Time and memory against size": [
+            *_growth(found, out),
+            *table("slopes", fitted, SLOPES, "How time and memory grow with the number of generators"),
+            *side_by_side("times", _number("solve_s"), "Median time of a schedule, s"),
+            *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
+        ],
+        "The closed loop": table("online", operated, (CASE, *ONLINE), loop),
+        "Trainings": [
+            *table("payoff", break_evens(grids), BREAK_EVEN, paid),
+            *table("trainings", trainings(grids), TRAININGS, "What was trained"),
+        ],
     }
+
+
+def _growth(found: pd.DataFrame, out: Path) -> list[Block]:
+    """The figure, drawn into the page's folder."""
+    if not len(found):
+        return []
+    save_figure(growth_figure(found), out / "figures" / "growth.png")
+    caption = (
+        "Time, memory and mean gap of each method against the number of generators; gaps are linear "
+        "within ±0.01 %. Hollow: some schedules are infeasible."
+    )
+    return [Picture("figures/growth.png", caption)]
 
 
 def _gap(row: dict[str, Any]) -> str:
@@ -140,24 +151,3 @@ def _rates(row: dict[str, Any]) -> str:
 
 def _number(name: str) -> Callable[[dict[str, Any]], str]:
     return lambda row: "" if np.isnan(row[name]) else f"{row[name]:.3g}"
-
-
-def _blocks(
-    grids: Sequence[Sources], out: Path, known: dict[str, Block], tables: dict[str, PageTable]
-) -> list[Block]:
-    """The page."""
-    made: list[Block] = [
-        Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
-        Items(EXPLANATION),
-    ]
-    for heading, names in PARTS.items():
-        inside = [known[name] for name in names if name in known]
-        made += [Heading(heading), *inside] if inside else []
-    if "times" not in tables:
-        made.append(Text("No method was timed alone yet; run `ded-bench bench`."))
-    folders = {grid.case.id: Path(os.path.relpath(grid.folder, out)).as_posix() for grid in grids}
-    items = [f"`{case}`: `{folder}`, seen from this page" for case, folder in folders.items()]
-    hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
-    here = "; ".join(f"{name} {value}" for name, value in environment().items())
-    items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]
-    return [*made, Heading("Where the rows come from"), Items(tuple(items))]

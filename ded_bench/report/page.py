@@ -5,12 +5,13 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
+from ded_bench.files.strict import write_atomically
 from ded_bench.report.columns import Column, computed
 
 #: Cells with more characters may be broken into lines.
@@ -77,11 +78,12 @@ class Items:
 
 @dataclass(frozen=True, eq=False)
 class PageTable:
-    """A frame, the columns to print and a caption."""
+    """A frame, the columns to print and a caption; `file` names the CSV file of the whole frame, if any."""
 
     frame: pd.DataFrame
     columns: tuple[Column, ...]
     caption: str = ""
+    file: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", computed(self.frame, self.columns))
@@ -130,6 +132,36 @@ def usual_first(table: PageTable, usual: pd.Series[bool]) -> list[Block]:
     if not usual.any() or usual.all():
         return [table]
     return [PageTable(table.frame[usual], table.columns, table.caption), *folded("All lines", table)]
+
+
+def write_page(blocks: Sequence[Block], folder: Path, name: str) -> list[Path]:
+    """Write a page as Markdown and HTML, and its tables below `tables/`.
+
+    Args:
+        blocks: the first one is the page's title.
+        folder: where the page lies, and paths of its pictures start.
+        name: of the page's files, without suffix.
+
+    Returns:
+        The files written, and the pictures.
+    """
+    written = []
+    for block in _each(blocks):
+        if isinstance(block, Picture):
+            written.append(folder / block.path)
+        elif isinstance(block, PageTable) and block.file:
+            written.append(folder / "tables" / f"{block.file}.csv")
+            write_atomically(written[-1], block.frame.to_csv(index=False))
+    for suffix, text in (("md", render_markdown(blocks)), ("html", render_html(blocks, folder))):
+        written.append(folder / f"{name}.{suffix}")
+        write_atomically(written[-1], text)
+    return written
+
+
+def _each(blocks: Sequence[Block]) -> Iterator[Block]:
+    """All blocks, folded ones too."""
+    for block in blocks:
+        yield from _each(block.blocks) if isinstance(block, Details) else (block,)
 
 
 def to_markdown(table: PageTable) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +27,6 @@ from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.trajectory import Trajectory
-from ded_bench.report.page import PageTable, Picture
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
@@ -115,15 +113,6 @@ class Sources:
     def _note(self, error: Exception) -> None:
         if (text := f"Not drawn: {error}") not in self.notes:
             self.notes.append(text)
-
-
-@dataclass(frozen=True, eq=False)
-class Draft:
-    """What sections put on the page: all tables by name, all pictures by topic (see `figures.FIGURES`)."""
-
-    sources: Sources
-    tables: Mapping[str, PageTable]
-    pictures: Mapping[str, list[Picture]]
 
 
 def read_sources(case: Case, folder: Path, problems: Path) -> Sources:

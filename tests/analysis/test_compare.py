@@ -143,16 +143,6 @@ def test_folders_without_a_common_row_cannot_either(folders) -> None:
     assert compare(*folders([row("z")])).incomparable == "no row is in both"
 
 
-def test_long_lists_are_cut_and_the_largest_change_comes_first(folders) -> None:
-    base = [row(f"i{k:02d}") for k in range(30)]
-    text = to_text(
-        compare(*folders([dataclasses.replace(r, objective=100.0 + k) for k, r in enumerate(base)], base))
-    )
-    lines = text[text.index("objective: 29 of 30") :].splitlines()
-    assert lines[1] == "  i29 TO ded-radau: 100 → 129 (relative 0.22)"
-    assert lines[11] == "  … and 19 more"
-
-
 def test_times_taken_alone_are_told_where_both_have_them(folders) -> None:
     a, b = folders(BASE)
     for folder, seconds in ((a, 2.0), (b, 5.0)):

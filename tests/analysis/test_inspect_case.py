@@ -83,15 +83,6 @@ def test_knots_lie_on_the_grid_however_fast_the_mode(threebus: Case, fastest: fl
     assert suggested_knots(threebus, fastest) == knots
 
 
-def test_the_command_lists_the_shipped_cases(capsys) -> None:
-    assert main(["cases"]) == 0
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[0] == ["case", "buses", "generators", "loads", "instances", "version"]
-    assert lines[1][:5] == ["9bus", "9", "2", "3", "400+100"]
-    assert lines[1][5] == json.loads((SHIPPED_CASES / "9bus" / "MANIFEST.json").read_text())["version"]
-    assert {line[0] for line in lines[1:6]} == {p.parent.name for p in SHIPPED_CASES.glob("*/case.json")}
-
-
 def test_the_command_checks_a_case(threebus: Case, alter, tmp_path: Path, capsys) -> None:
     """Exit code 0; 1 where the grid cannot work; 2 where the file is wrong."""
     write_record(threebus, tmp_path / "good" / "case.json")

@@ -109,12 +109,3 @@ def test_a_sweep_has_one_period(tmp_path):
     lines = sweeps(online_rows(results, "here"))
     assert lines["latency_s"].tolist() == [0.0, 0.5, 1.0, 3.0]
     assert lines["increase_percent_mean"].nunique() == 1
-
-
-def test_nothing_gives_empty_tables(tmp_path):
-    """Without a table, and without a sweep."""
-    nothing = online_rows(OnlineResults(tmp_path), "here")
-    assert len(own_latency(nothing)) == len(sweeps(nothing)) == len(crossed(sweeps(nothing))) == 0
-    results = OnlineResults(tmp_path)
-    results.table.add([row("a", 0.0, 101.0)])
-    assert len(sweeps(online_rows(results, "here"))) == 0

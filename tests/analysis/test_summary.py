@@ -8,17 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import GROUP, judged_rows, named
+from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
-    TIME_SHIFT_S,
-    by_model,
     claims,
-    coverage,
     gaps,
     performance_profile,
-    shifted_geometric_mean,
     summary,
-    table_times,
     timed_rows,
     tradeoff,
     worst,
@@ -85,29 +80,10 @@ def test_gaps_are_signed_percent_of_ded(table: pd.DataFrame) -> None:
     assert (ours["ded"].dropna() == 0).all()
 
 
-def test_gaps_compare_within_a_regime_and_with_default_settings_only() -> None:
-    frame = frame_of(
-        row("a", "ded", 100.0, regime="NO"),
-        row("a", "ded", 200.0, regime="TO"),
-        row("a", "ded", 50.0, regime="NO", settings="accelerated"),
-        row("a", "ed", 110.0, regime="NO"),
-        row("a", "ed", 110.0, regime="TO"),
-    )
-    ours = with_gaps(frame).set_index(["method", "settings", "regime"])["gap_percent"]
-    assert ours["ed", "default", "NO"] == pytest.approx(10.0)
-    assert ours["ed", "default", "TO"] == pytest.approx(-45.0)
-    assert ours["ded", "accelerated", "NO"] == pytest.approx(-50.0)
-
-
 def test_no_gap_where_ded_costs_nothing() -> None:
     frame = frame_of(row("a", "ded", 0.0), row("a", "ed", 1.0))
     assert with_gaps(frame)["gap_percent"].isna().all()
     assert summary(with_gaps(frame))["unpaired"].to_list() == [1, 1]
-
-
-def test_gaps_do_not_depend_on_the_order_of_rows(table: pd.DataFrame) -> None:
-    shuffled = table.sample(frac=1.0, random_state=0).reset_index(drop=True)
-    pd.testing.assert_frame_equal(summary(with_gaps(table)), summary(with_gaps(shuffled)))
 
 
 def test_summary_counts_and_spreads(table: pd.DataFrame) -> None:
@@ -153,25 +129,6 @@ def test_a_time_limit_is_no_success(status: str, rate: int) -> None:
     assert summary(with_gaps(frame_of(row("a", "ded", 1.0, status=status))))["success_rate"].to_list() == [
         rate
     ]
-
-
-def test_coverage_is_of_methods_with_rows_beyond_the_tables() -> None:
-    everything = frame_of(
-        row("a", "ded", 1.0),
-        row("b", "ded", 2.0, split="train", freq_violation_hz=3e-4, feasible=False),
-        row("c", "ded", split="train"),
-        row("a", "ed", 3.0),
-    )
-    everything = with_gaps(everything)
-    judged = judged_rows(everything)
-    covered = coverage(everything, judged)
-    assert covered[["method", "settings", "rows", "failures"]].to_numpy().tolist() == [
-        ["ded", "default", 3, 1]
-    ]
-    assert covered["correct_rate"].item() == pytest.approx(1 / 3)
-    assert covered["freq_violation_hz_max"].item() == 3e-4
-    assert not len(coverage(judged, judged))
-    assert not len(coverage(everything[:0], judged[:0]))
 
 
 def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:
@@ -220,30 +177,6 @@ def test_rows_take_the_median_of_their_times_alone() -> None:
     assert timed_rows(frame, calls[:0]).empty
 
 
-def test_performance_profile_counts_failures_as_never_solved(table: pd.DataFrame) -> None:
-    profile = performance_profile(table, "objective")
-    assert (profile["ratio"] >= 1).all()
-    top = profile.groupby("method")["fraction"].max()
-    assert top["ded"] == pytest.approx(4 / 5)
-    assert top["ded-ko"] == pytest.approx(3 / 5)
-
-
-def test_shifted_geometric_mean() -> None:
-    assert shifted_geometric_mean(np.array([3.0, 3.0, 3.0])) == pytest.approx(3.0)
-    assert shifted_geometric_mean(np.array([1.0, 100.0]), shift=0.0) == pytest.approx(10.0)
-    by_hand = math.sqrt((1 + TIME_SHIFT_S) * (100 + TIME_SHIFT_S)) - TIME_SHIFT_S
-    assert shifted_geometric_mean(np.array([1.0, 100.0])) == pytest.approx(by_hand)
-    assert math.isnan(shifted_geometric_mean(np.array([])))
-
-
-def test_table_times_are_quartiles_and_say_how_many_workers() -> None:
-    rows = [row(name, "ded", 1.0, solve_s=float(i), workers=2) for i, name in enumerate("abcde")]
-    times = table_times(frame_of(*rows)).iloc[0]
-    assert (times["solve_s_q1"], times["solve_s"], times["solve_s_q3"]) == (1.0, 2.0, 3.0)
-    assert (times["n"], times["workers"]) == (5, "2")
-    assert math.isnan(times["build_s"])
-
-
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
     points = tradeoff(
         with_gaps(table), pd.DataFrame([["TO", "ded-ko", "default", "", 0.25, 0]], columns=NO_TIMES.columns)
@@ -256,17 +189,7 @@ def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
 
 def test_an_empty_table_has_its_columns() -> None:
     empty = with_gaps(frame_of())
-    for made in (summary(empty), claims(empty), table_times(empty), worst(empty), tradeoff(empty, NO_TIMES)):
+    for made in (summary(empty), claims(empty), worst(empty), tradeoff(empty, NO_TIMES)):
         assert len(made) == 0
         assert {"regime", "method", "settings", "title"} <= set(made.columns)
     assert len(performance_profile(empty, "solve_s")) == 0
-
-
-def test_surrogates_are_compared_where_there_are_several() -> None:
-    frame = frame_of(
-        *(row("a", "ded-ko", 1.0, model=f"{name}@1") for name in ("koopman", "linear")),
-        row("a", "ded-ko-knots", 1.0, model="koopman@1"),
-        row("a", "ded", 1.0),
-    )
-    found = by_model(summary(with_gaps(frame)))
-    assert found[["method", "model"]].to_numpy().tolist() == [["ded-ko", "koopman"], ["ded-ko", "linear"]]

@@ -8,7 +8,6 @@ import pickle
 import numpy as np
 import pytest
 
-from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import PLANTS, Plant, plant_of
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import SHIPPED_CASES, Case
@@ -88,8 +87,3 @@ def test_what_is_observed_leads_to_the_same_state(plant, case, alter):
     part = simulate(case, rest, Schedule(rest.grid, whole.p_set[k:]), plant)
     np.testing.assert_allclose(part.omega, whole.omega[k:], rtol=0, atol=2e-9)
     np.testing.assert_allclose(part.p_slack, whole.p_slack[k:], rtol=0, atol=2e-9)
-
-
-def test_other_names_are_refused(case):
-    with pytest.raises(InputError, match="plant: atlantis: is not one of lossless"):
-        plant_of(case, "atlantis")

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from ded_bench.files.errors import InputError
 from ded_bench.plants.score import Score, judge, score
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.schedule import Schedule
@@ -218,12 +217,3 @@ def test_feasible_and_feasible_strict_have_their_thresholds(name):
 
 
 # Refusals.
-
-
-def test_wrong_regimes_and_schedules_are_refused(case, instance, constant):
-    """Before any simulation, naming what is wrong."""
-    good = constant(instance, case.p_nominal)
-    with pytest.raises(InputError, match="unknown regime 'XX'"):
-        score(case, instance, good, "XX")
-    with pytest.raises(InputError, match=r"must end at the horizon 1\.0, not 0\.5"):
-        score(case, instance, Schedule(t=0.5 * good.t, p=good.p), "NO")

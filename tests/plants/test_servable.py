@@ -63,13 +63,6 @@ def test_what_cannot_be_served_is_drawn_again(weak: Case) -> None:
     assert list(drawn_with_redraws(weak, 1, 5, first=150, servable=servable)) == drawn[150:155]
 
 
-def test_a_case_that_serves_nothing_is_told(weak: Case, alter) -> None:
-    lines = json.loads(weak.model_dump_json(by_alias=True))["lines"]
-    hopeless = alter(weak, lines=[line | {"x": 100.0} for line in lines])
-    with pytest.raises(InputError, match="sampling: 1000 draws in a row cannot be served"):
-        next(sample_instances(hopeless, 1, 1, servable=servable))
-
-
 def test_the_manifest_counts_redraws(weak: Case, threebus: Case, tmp_path) -> None:
     """Only where there are any: what was written before there was a rule stays as it is."""
     expected = sum(redraws for _, redraws in drawn_with_redraws(weak, 3, 10, servable=servable))
@@ -110,11 +103,3 @@ def test_check_servable_names_source_and_field(case, quiet_instance):
     with pytest.raises(InputError, match=rf"my\.json: load: loads at t = {horizon:g} s cannot be served"):
         check_servable(case, cut_off, "my.json")
     check_servable(case, quiet_instance(case, load=_ramp(case, start=horizon + 1, rate=-40.0)), "my.json")
-
-
-def test_check_servable_refuses_initial_power_that_no_line_carries(case, quiet_instance):
-    """Generators of an instance may lie outside their limits, but not outside physics."""
-    power = dict.fromkeys(case.generators, 50.0)
-    instance = quiet_instance(case, initial={"power": power, "omega": dict.fromkeys(case.generators, 0.0)})
-    with pytest.raises(InputError, match="initial loads and power cannot be served"):
-        check_servable(case, instance, "my.json")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.lossless.stepper import KUTTA_4
@@ -169,10 +168,3 @@ def test_losing_synchronism_is_an_error(case, quiet_instance, constant, power):
     instance = quiet_instance(case, load=loads)
     with pytest.raises(SimulationError, match="cannot follow this schedule"):
         simulate(case, instance, constant(instance, np.full(len(case.generators), power)))
-
-
-def test_schedules_of_another_horizon_are_refused(case, quiet_instance):
-    instance = quiet_instance(case)
-    short = Schedule(t=np.array([0.0, 1.0]), p=np.stack([case.p_nominal] * 2))
-    with pytest.raises(InputError, match="must end at the horizon"):
-        simulate(case, instance, short)

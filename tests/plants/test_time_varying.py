@@ -1,4 +1,4 @@
-"""The linear model along a trajectory: exact to first order, its rows and adjoint those of its rollout."""
+"""The linear model along a trajectory: exact to first order, its rows those of its rollout."""
 
 from __future__ import annotations
 
@@ -119,16 +119,6 @@ def test_states_at_knots_are_those_of_the_steps(made):
     assert omega[POINTS] == pytest.approx(expected, abs=1e-11)
 
 
-def test_adjoint_is_the_transpose(made):
-    """Dot products of weights with outputs and of gradient with increments agree."""
-    model, rng = made.model, np.random.default_rng(6)
-    on_omega, on_slack = rng.normal(size=model.omega.shape), rng.normal(size=model.p_slack.shape)
-    u = rng.normal(size=model.p_gen.shape)
-    omega, p_slack = model.outputs(u)
-    forward = (on_omega * (omega - model.omega)).sum() + on_slack @ (p_slack - model.p_slack)
-    assert (model.adjoint(on_omega, on_slack) * u).sum() == pytest.approx(forward, rel=1e-10)
-
-
 def value_of(rows: LocalRows, x: Array, u: Array) -> Array:
     """What rows give with x and u at the ends of their intervals."""
     j = rows.interval
@@ -160,7 +150,6 @@ def test_speeds_may_be_any_combination_of_the_state(made):
     for name, arguments in (
         ("outputs", (u,)),
         ("frequency_rows", (generators, points)),
-        ("adjoint", (model.omega, model.p_slack)),
         ("rollout", (np.tile(model.p_gen[0], (STEPS + 1, 1)),)),
     ):
         for one, same in zip(getattr(model, name)(*arguments), getattr(other, name)(*arguments), strict=True):

@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import parse_record, write_record
+from ded_bench.files.strict import write_record
 from ded_bench.problem.benchmark import (
     VALIDATION_COUNT,
-    Manifest,
-    Split,
     check_own_name,
     load_manifest,
     load_split,
@@ -23,7 +21,6 @@ from ded_bench.problem.benchmark import (
 )
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
-from ded_bench.problem.scenario import Scenario
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +72,6 @@ def test_files_know_their_split_and_version(folder: Path, tmp_path: Path, threeb
     assert chosen.version == ""
 
 
-def test_wrong_choices_are_told(folder: Path) -> None:
-    with pytest.raises(InputError, match="split: holdout: is not one of test, train, validation, all"):
-        select_split(folder, "holdout")
-    with pytest.raises(InputError, match="no such case"):
-        select_split("atlantis")
-    with pytest.raises(InputError, match="no instance"):
-        select_files([])
-
-
 def test_a_folder_of_results_does_not_hide_the_shipped_case(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "two-area" / "tables").mkdir(parents=True)
@@ -104,20 +92,6 @@ def test_an_edited_copy_needs_a_name_of_its_own(
     with pytest.raises(InputError, match=rf"copy.json: id: {instance.id} is the name of .*: choose another"):
         check_own_name(edited, "copy.json", tmp_path, threebus)
     check_own_name(alter(edited, id="mine"), "copy.json", tmp_path, threebus)
-
-
-@pytest.mark.parametrize(
-    ("kind", "fields"),
-    [
-        (Split, {"seed": 1, "train": [], "test": []}),
-        (Manifest, {"version": "1-abc", "files": {}}),
-        (Scenario, {"id": "s"}),
-    ],
-)
-def test_a_file_says_what_it_is(kind, fields) -> None:
-    """Of which schema."""
-    with pytest.raises(InputError, match=r"a\.json: schema: field required"):
-        parse_record(kind, json.dumps(fields), "a.json")
 
 
 def test_a_copy_of_a_benchmark_has_its_version(tmp_path: Path, threebus: Case) -> None:

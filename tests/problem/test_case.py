@@ -58,12 +58,6 @@ def test_a_case_resolves_from_name_folder_and_file(ninebus, tmp_path, monkeypatc
         Case.load(tmp_path)
 
 
-def test_fingerprint_follows_content(case, alter):
-    """Equal content, equal fingerprint; any change, another one."""
-    assert alter(case).fingerprint == case.fingerprint
-    assert alter(case, ramp_pu_per_s=case.ramp_pu_per_s * (1 + 1e-15)).fingerprint != case.fingerprint
-
-
 def _set(path: str, value: object):
     """Return an edit of plain JSON data that sets the field at a dotted path."""
 

@@ -26,15 +26,6 @@ def test_load_ramp_follows_the_papers_three_branches(rate, duration):
     np.testing.assert_allclose(ramp.at(t), branches, rtol=0, atol=1e-15)
 
 
-def test_a_ramp_may_start_or_end_beyond_the_horizon():
-    """It is cut off, not squeezed: at the horizon only the part before it has happened."""
-    t = np.array([0.0, 59.0, 60.0])
-    late = LoadRamp(initial=-1.0, start=59.5, duration=20.0, rate=-0.04)
-    np.testing.assert_allclose(late.at(t), [-1.0, -1.0, -1.02], rtol=1e-15)
-    never = LoadRamp(initial=-1.0, start=60.0, duration=5.0, rate=-0.04)
-    np.testing.assert_array_equal(never.at(t), -1.0)
-
-
 def test_loads_come_in_the_order_of_the_case(case):
     """Column j of p_load is the j-th load bus, whatever the order in the file."""
     instance = sample_instance(case, 3, 4)
@@ -56,19 +47,6 @@ def test_the_grid_has_one_point_more_than_steps(case, quiet_instance):
     assert instance.grid[-1] == pytest.approx(case.sampling.horizon_s, abs=1e-12)
     assert quiet_instance(case, horizon_s=0.3, dt_s=0.1).steps == 3
     assert quiet_instance(case, horizon_s=7, dt_s=7).steps == 1
-
-
-def test_vectors_follow_the_order_of_the_case(ninebus, quiet_instance):
-    """Dictionaries in a file may be in any order."""
-    instance = quiet_instance(
-        ninebus,
-        cost={"3": 0.3, "s": 0.1, "2": 0.2},
-        initial={"power": {"3": 0.9, "2": 1.2}, "omega": {"3": -0.003, "2": 0.002}},
-    )
-    np.testing.assert_array_equal(instance.cost_gen(ninebus), [0.2, 0.3])
-    assert instance.cost_slack(ninebus) == 0.1
-    np.testing.assert_array_equal(instance.p_initial(ninebus), [1.2, 0.9])
-    np.testing.assert_array_equal(instance.omega_initial(ninebus), [0.002, -0.003])
 
 
 # instance/2.
@@ -134,14 +112,6 @@ def test_wrong_points_are_refused(threebus, quiet_instance, points, field, probl
         parse_record(Instance, second(threebus, quiet_instance(threebus), points={"town": points}), "bad")
     assert caught.value.field == field
     assert problem in caught.value.problem
-
-
-def test_angles_are_given_for_exactly_the_generators(threebus, quiet_instance):
-    for theta, field in (({}, "plant"), ({"plant": 0.0, "town": 0.0}, "town")):
-        instance = parse_record(Instance, second(threebus, quiet_instance(threebus), theta=theta), "bad")
-        with pytest.raises(InputError) as caught:
-            instance.check_case(threebus)
-        assert caught.value.field == f"initial.theta.{field}"
 
 
 # Mistakes that no file format refuses.

@@ -185,17 +185,6 @@ def test_the_same_seed_gives_the_same_bytes(case, tmp_path):
     assert instances == list(sample_instances(case, 99, 12))
 
 
-def test_the_version_changes_with_any_file(case, alter, tmp_path):
-    """Other seed, other count or other case: results are not comparable."""
-    versions = {
-        write_benchmark(case, 6, 1, tmp_path / "a").version,
-        write_benchmark(case, 6, 2, tmp_path / "b").version,
-        write_benchmark(case, 7, 1, tmp_path / "c").version,
-        write_benchmark(alter(case, ramp_pu_per_s=0.06), 6, 1, tmp_path / "d").version,
-    }
-    assert len(versions) == 4
-
-
 def test_a_folder_of_another_case_is_left_alone(threebus, ninebus, alter, tmp_path):
     """Instances never lie beside a case that they were not drawn from, and nothing is deleted."""
     write_benchmark(threebus, 3, 1, tmp_path)

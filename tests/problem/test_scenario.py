@@ -130,16 +130,6 @@ def test_wrong_scenarios_are_refused(known, threebus, tmp_path, field, value):
         Scenario.load_file(path, threebus)
 
 
-def test_half_an_announcement_is_refused(known, threebus, tmp_path):
-    """Start without rate."""
-    path = tmp_path / "scenario.json"
-    path.write_text(
-        known.model_dump_json(by_alias=True).replace('"announced_rate":-0.03', '"announced_rate":null')
-    )
-    with pytest.raises(InputError, match="both or neither"):
-        Scenario.load_file(path, threebus)
-
-
 def test_the_sampler_repeats_itself(case, tmp_path):
     """Byte for byte, into a folder that held others; another seed gives other numbers."""
     folders = [tmp_path / name for name in "ab"]

@@ -149,20 +149,3 @@ def test_a_compressed_bomb_is_refused(ninebus, tmp_path, monkeypatch):
     path.write_bytes(gzip.compress(b"t,P_2,P_3\n" + b"0" * 10_000))
     with pytest.raises(InputError, match="too large"):
         Schedule.read(path, ninebus, 60.0)
-
-
-def test_schedules_made_in_memory_are_checked_too(case):
-    """Methods hand over arrays, not files."""
-    good = knots(case, 5)
-    good.check(60.0)
-    nan = good.p.copy()
-    nan[2, 0] = np.nan
-    for bad, problem in [
-        (Schedule(good.t, nan), "P: values must be finite"),
-        (Schedule(good.t[::-1].copy(), good.p), "t: must increase strictly"),
-        (Schedule(good.t[:1], good.p[:1]), "t: at least two rows"),
-        (Schedule(good.t[1:], good.p[1:]), "t: must start at 0, not 15.0"),
-        (Schedule(good.t[:-1], good.p[:-1]), "t: must end at the horizon 60.0, not 45.0"),
-    ]:
-        with pytest.raises(InputError, match=f"my method: {problem}"):
-            bad.check(60.0, "my method")

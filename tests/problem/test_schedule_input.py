@@ -39,9 +39,3 @@ def test_lists_and_frames_mean_what_arrays_mean(case: Case, quiet_instance, cons
 def test_anything_else_is_refused_in_a_sentence(threebus: Case, given: object, said: str) -> None:
     with pytest.raises(InputError, match=said):
         as_schedule(given, threebus)
-
-
-def test_a_negative_limit_means_nothing() -> None:
-    with pytest.raises(InputError, match="limit: must be at least 0, or None for all, not -1"):
-        ded_bench.load_instances("9bus", limit=-1)
-    assert ded_bench.load_instances("9bus", limit=0) == []

@@ -7,11 +7,8 @@ import dataclasses
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import titled
-from ded_bench.analysis.online_summary import online_rows, own_latency, sweeps
 from ded_bench.methods import ed
 from ded_bench.problem.sampling import sample_scenario
-from ded_bench.report.figures.latency import latency_figure
 from ded_bench.report.overview import write_overview
 from ded_bench.report.report import write_report
 from ded_bench.results.online_results import OnlineResults, OnlineRow, keep_trajectory
@@ -76,13 +73,3 @@ def test_the_overview_sets_grids_side_by_side(tmp_path):
     assert lines[["case", "title", "increase_percent_mean"]].to_numpy().tolist() == [
         ["two-area", "ED [every=1]", 0.25]
     ]
-
-
-def test_the_figure_shows_the_numbers(folder):
-    """A method's marker lies at its latency."""
-    frame = online_rows(OnlineResults(folder), "threebus")
-    cost = latency_figure(sweeps(frame), titled(own_latency(frame)), "").axes[0]
-    swept, own = cost.get_lines()
-    assert list(swept.get_xdata()) == [0.0, 0.5, 2.0]
-    assert own.get_xdata()[0] == 0.0
-    assert own.get_ydata()[0] == swept.get_ydata()[0]

@@ -12,7 +12,6 @@ import pytest
 from ded_bench.analysis.lines import GROUP, title
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.report.figures.history import history_figure
 from ded_bench.report.figures.panels import (
     FEW,
     Shown,
@@ -24,8 +23,7 @@ from ded_bench.report.figures.panels import (
     time_figure,
 )
 from ded_bench.report.figures.profile import profile_figure
-from ded_bench.report.figures.schedules import challengers
-from ded_bench.report.figures.style import colour, marker, new_figure, save_figure
+from ded_bench.report.figures.style import colour, marker, save_figure
 from ded_bench.report.figures.tradeoff import tradeoff_figure
 
 PAPERS = pd.DataFrame(
@@ -71,11 +69,6 @@ def test_trajectories_in_panels(name: str, tmp_path: Path) -> None:
         save_figure(drawn, tmp_path / "figure.png")
 
 
-def test_trained_methods_are_shown_first_then_those_nearest_to_the_reference() -> None:
-    gaps = {"ded": 0.0, "ded-ko": 0.1, "mine": 0.2, "ded-dpc-paper": 2.0, "ded-dpc": 1.0}
-    assert challengers(pd.Series(gaps), "ded") == ["ded-dpc", "ded-dpc-paper", "ded-ko", "mine"]
-
-
 def test_methods_differ_in_colour_and_marker() -> None:
     assert len({colour(name) for name in METHODS}) == len({marker(name) for name in METHODS}) == len(METHODS)
     assert colour("stranger") == colour("other")
@@ -116,28 +109,3 @@ def test_profiles_end_at_the_share_of_instances_solved(tmp_path: Path) -> None:
         assert list(line.get_ydata()) == [0.0, 0.5, 1.0, 1.0]
         assert ax.get_lines()[1].get_ydata()[-1] == 0.25
     save_figure(profile_figure(profile, profile[:0]), tmp_path / "figure.png")
-
-
-def test_training_history(tmp_path: Path) -> None:
-    """In minutes; columns that were taken now and then, or not at all."""
-    history = pd.DataFrame(
-        {"epoch": [1, 2], "seconds": [60.0, 120.0], "training": [9.0, 8.0], "held out": [7.0, 6.0]}
-        | {"ramp up": [0.0, 1e-3]}
-    )
-    few = pd.DataFrame({"seconds": [1.0, 2.0, 3.0], "training": [9.0, np.nan, 7.0], "held out": [np.nan] * 3})
-    figure = history_figure({"one": history, "few": few})
-    left, right, below, _ = figure.axes
-    assert left.get_lines()[0].get_xdata().tolist() == [1.0, 2.0]
-    assert shows(left, np.array([7.0, 6.0]))
-    assert right.get_lines()[0].get_ydata()[1] == 1e-3
-    assert shows(below, np.array([9.0, 7.0]))
-    save_figure(figure, tmp_path / "figure.png")
-
-
-def test_files_are_the_same_every_time(tmp_path: Path) -> None:
-    for name in ("one.png", "two.png"):
-        with new_figure(2.0) as figure:
-            figure.subplots().plot([1.0, 2.0])
-        save_figure(figure, tmp_path / name)
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    assert (tmp_path / "one.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

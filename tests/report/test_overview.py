@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.report.grids import across, break_evens, read_grid, slopes
-from ded_bench.report.overview import write_overview
+from ded_bench.report.grids import break_evens, read_grid, slopes
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import TIMING, TimingRow
@@ -77,17 +75,6 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert len(list(page.every("img"))) == 1
 
 
-def test_methods_that_were_not_timed_are_said(folders: list[Path], tmp_path: Path) -> None:
-    folder = results_of(tmp_path / "one", "9bus")
-    (folder / "timing.csv").unlink()
-    write_overview([folder], tmp_path / "out")
-    text = (tmp_path / "out" / "overview.md").read_text()
-    assert "No method was timed alone yet" in text
-    assert "`9bus`: `../one`, seen from this page" in text
-    assert str(tmp_path) not in text
-    assert not (tmp_path / "out" / "tables" / "slopes.csv").exists()
-
-
 def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_path, capsys) -> None:
     with pytest.raises(InputError, match="is missing"):
         read_grid(tmp_path)
@@ -133,10 +120,3 @@ def test_exponents_of_a_power_law() -> None:
     assert row["solve_s_grids"] == 3
     assert np.isnan(row["peak_memory_mib"])  # two grids have no exponent
     assert row["peak_memory_mib_grids"] == 2
-
-
-def test_a_method_without_any_cell_has_no_row() -> None:
-    table = points(solve_s=[1.0, 2.0, 3.0])
-    assert across(table, lambda row: "")["title"].to_list() == []
-    (row,) = across(table, lambda row: "x" * (row["case"] == "b")).to_dict("records")
-    assert json.loads(json.dumps(row)) == {"regime": "TO", "title": "ED", "a": "–", "b": "x", "c": "–"}

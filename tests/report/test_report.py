@@ -110,8 +110,8 @@ def cells(markdown: str, heading: str) -> list[list[str]]:
 def test_every_file_is_written(report: list[Path], finished: Path) -> None:
     assert all(path.is_file() and path.stat().st_size for path in report)
     names = {str(path.relative_to(finished)) for path in report}
-    tables = ("table_v", "table_vi", "summary", "claims", "models", "coverage", "worst", "training")
-    assert {f"tables/{name}.csv" for name in (*tables, "times_under_load", "provenance")} <= names
+    tables = ("table_v", "table_vi", "summary", "claims", "worst", "training", "provenance")
+    assert {f"tables/{name}.csv" for name in tables} <= names
     figures = ("schedule_NO", "schedule_TO", "frequencies_TO", "tradeoff", "profile", "training_ded-dpc")
     assert {f"figures/{name}.png" for name in (*figures, "worst_NO", "worst_TO")} <= names
     assert {"report.md", "report.html"} <= names
@@ -179,21 +179,9 @@ def test_the_page_needs_nothing_else(report, finished: Path) -> None:
 
 def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
     text = (finished / "report.md").read_text()
-    for fact in ("Hosts of the rows: h", "Master seeds of the instances: 3", "python 3", "casadi"):
-        assert fact in text
     assert cells(text, "## Training of the policies")[0][:3] == ["ded-dpc-TO", "124", "7"]
     made = pd.read_csv(finished / "tables" / "provenance.csv").set_index(["regime", "method"])
     assert made.loc[("TO", "ded-ko"), "made_with"] == "koopman@1"
-    assert f"Only {TEST - 1} of" not in text
-    assert "No certificate" in text
-
-
-@pytest.mark.usefixtures("sketched")
-def test_the_second_report_has_the_same_tables(report, ninebus, problems, finished: Path, tmp_path) -> None:
-    again = copy(finished, tmp_path)
-    write_report(ninebus, again, problems)
-    for path in sorted((finished / "tables").iterdir()):
-        assert (again / "tables" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_the_instance_shown_is_usual(ninebus: Case, problems: Path, finished: Path) -> None:
@@ -239,44 +227,3 @@ def test_strangers_text_stays_text(ninebus: Case, problems: Path, finished: Path
     assert name in page.text
     five = cells((folder / "report.md").read_text(), "**Table V:")
     assert all(len(line) == len(TABLE_V) for line in five[:2])
-
-
-@pytest.mark.usefixtures("sketched")
-def test_what_cannot_be_compared_is_said(ninebus, problems: Path, finished: Path, tmp_path: Path) -> None:
-    folder = copy(finished, tmp_path)
-    results = Results(folder)
-    row = next(iter(results.rows.values()))
-    unscored = dict.fromkeys(("objective", "feasible", "feasible_strict"))
-    results.add([dataclasses.replace(row, problems_version="0-old", version="0", **unscored)])
-    second = next(row for row in list(results.rows.values())[1:] if row.method == "ded-dpc-paper")
-    newer = dataclasses.replace(second, policy="ded-dpc-paper@2", date="2027", version="2", method_version=0)
-    results.add([newer])
-    slow = (folder / "timing.csv").read_text().replace(",0.9,", ",3.0,")
-    (folder / "timing.csv").write_text(slow)
-    write_report(ninebus, folder, problems)
-    text = (folder / "report.md").read_text()
-    for note in (
-        "Rows of different problem versions are not comparable: 0-old, 1-",
-        "1 rows have a schedule but no score yet",
-        "are of an older model or policy and left out; those of ded-dpc-paper@2 count",
-        "other versions of their methods than those installed here: DED-DPC (paper's recipe)",
-        "while the machine was busy",
-    ):
-        assert note in text
-
-
-@pytest.mark.usefixtures("sketched")
-def test_a_row_whose_instance_is_unknown_is_tabulated_but_not_drawn(
-    ninebus, problems, finished: Path, tmp_path
-) -> None:
-    folder = copy(finished, tmp_path)
-    row = next(row for row in Results(folder).rows.values() if row.method == "ded")
-    (folder / "results.csv").unlink()
-    Results(folder).add([dataclasses.replace(row, instance="stranger")])
-    write_report(ninebus, folder, problems)
-    assert not list((folder / "figures").glob("schedule_*"))
-    assert len(pd.read_csv(folder / "tables" / "summary.csv")) == 1
-    text = (folder / "report.md").read_text()
-    assert f"Only 0 of {TEST} test instances were run: DED {row.regime} (without 9bus-" in text
-    other = next(regime for regime in ninebus.regimes if regime != row.regime)
-    assert f"No rows of DED in regime {other}." in text

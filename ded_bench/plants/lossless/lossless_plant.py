@@ -7,12 +7,11 @@ is missing. See `network` for the equations.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network, PowerFlowError
@@ -28,8 +27,6 @@ from ded_bench.problem.trajectory import Trajectory
 STEP_BY_MODE = 0.25
 #: Mismatch of the algebraic equations where a linearisation follows, pu: ω is then within 1e-6 Hz (140bus).
 PLANNING_MISMATCH = 1e-7
-#: Numbers in the Jacobians of power flows that are solved together.
-BATCH = 1_000_000
 
 
 class LosslessState(NamedTuple):
@@ -126,55 +123,28 @@ class LosslessPlant:
         """Angles of all buses, `theta_<bus>`, rad, relative to the slack."""
         return {f"theta_{bus.id}": column for bus, column in zip(self.case.buses, states.T, strict=True)}
 
-    def servable(self, instances: Sequence[Instance]) -> NDArray[np.bool_]:
-        """See `Plant.servable`.
+    def check_servable(self, instance: Instance, source: str) -> None:
+        """See `Plant.check_servable`.
 
         The power flow must serve the initial loads from P_0, and the loads at 0, at each kink and at the
         horizon from the static dispatch.
         """
-        p_gen, p_load, first = [], [], [0]
-        for instance in instances:
-            _, gen, load = self._tested(instance)
-            p_gen += [instance.p_initial(self.case)[None], gen]
-            p_load += [load[:1], load]
-            first.append(first[-1] + 1 + len(load))
-        served = self._served(np.concatenate(p_gen), np.concatenate(p_load))
-        return np.logical_and.reduceat(served, first[:-1])
-
-    def check_servable(self, instance: Instance, source: str) -> None:
-        """See `Plant.check_servable`."""
         try:
             self.network.initial_angles(instance)
         except PowerFlowError as error:
             given = "power" if instance.initial.theta is None else "theta"
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
-        for t, gen, load in zip(*self._tested(instance), strict=True):
+        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
+        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
+        p_load = instance.p_load(case, times)
+        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+        for t, gen, load in zip(times, p_gen, p_load, strict=True):
             try:
                 self.network.power_flow(gen, load)
             except PowerFlowError as error:
                 raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
 
-    def _tested(self, instance: Instance) -> tuple[Array, Array, Array]:
-        """Times at which the power flow must serve the loads, s; static dispatch and loads there, pu."""
-        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
-        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
-        p_load = instance.p_load(case, times)
-        return times, merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load), p_load
-
-    def _served(self, p_gen: Array, p_load: Array) -> NDArray[np.bool_]:
-        """Tell which rows of powers can be served; a batch that fails is halved until one is left."""
-        n = len(p_gen)
-        if n == 1 or n * self.network.n_bus**2 <= BATCH:
-            try:
-                self.network.power_flow(p_gen, p_load)
-            except PowerFlowError:
-                if n == 1:
-                    return np.zeros(1, dtype=np.bool_)
-            else:
-                return np.ones(n, dtype=np.bool_)
-        halves = (self._served(p_gen[s], p_load[s]) for s in (slice(n // 2), slice(n // 2, n)))
-        return np.concatenate(list(halves))
 
 
 def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hold:

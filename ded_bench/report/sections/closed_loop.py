@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import crossed, own_latency, sweeps
 from ded_bench.report.columns import ONLINE, SWEEPS
-from ded_bench.report.page import Block, Heading, Items, PageTable, folded
-from ded_bench.report.sources import Draft, Sources
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, folded
+from ded_bench.report.sources import Sources
 
 EXPLANATION = (
     "Every scenario is operated for its whole length: every period, or when the last plan is due if that is "
@@ -23,24 +25,18 @@ EXPLANATION = (
 )
 
 
-def tables(sources: Sources) -> dict[str, PageTable]:
-    """Those that have rows."""
+def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
+    """Nothing without rows."""
     own, table = own_latency(sources.online), crossed(sweeps(sources.online))
-    made = {}
+    found: list[Block] = []
     if len(own):
         caption = "Methods in the closed loop at their own latency, forecasts as announced"
-        made["online_methods"] = PageTable(titled(own), ONLINE, caption)
+        found.append(PageTable(titled(own), ONLINE, caption, "online_methods"))
     if len(table):
         known = tuple(column for column in SWEEPS if column.name in table or column.name == "title")
         caption = "What latency costs, by what is known: means over the same scenarios"
-        made["online_latency"] = PageTable(titled(table), known, caption)
-    return made
-
-
-def blocks(draft: Draft) -> list[Block]:
-    """Nothing without rows."""
-    found = [draft.tables[name] for name in ("online_methods", "online_latency") if name in draft.tables]
+        found.append(PageTable(titled(table), known, caption, "online_latency"))
     if not found:
         return []
     explained = folded("How to read the closed loop", Items(EXPLANATION))
-    return [Heading("The closed loop"), *found, *explained, *draft.pictures["online"]]
+    return [Heading("The closed loop"), *found, *explained, *pictures["online"]]

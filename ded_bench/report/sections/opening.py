@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -14,8 +14,8 @@ from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_P
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import TABLE_V, TABLE_VI, front, tabulate, without_paper
 from ded_bench.report.notes import alarms, data_notes, rows_caption
-from ded_bench.report.page import Block, Heading, Items, PageTable, Text, folded
-from ded_bench.report.sources import Draft, Sources
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded
+from ded_bench.report.sources import Sources
 
 #: How the tables are to be read.
 EXPLANATION = (
@@ -35,68 +35,59 @@ EXPLANATION = (
     "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly instances weigh more "
     "in it than in the mean of the gaps.",
     "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
-    "taken while several workers shared the machine and stand in the details only.",
+    "taken while several workers shared the machine and stand in no table here.",
     "**Names** in brackets are options and surrogates that differ from a method's usual ones.",
 )
 
 
-def lines_of(sources: Sources) -> pd.DataFrame:
-    """The lines of both tables (see `result_lines`): beside a paper's numbers, on usual surrogates alone."""
-    rows = on_usual_model(sources.judged) if sources.paper else sources.judged
-    return result_lines(rows, sources.timing, sources.paper, sources.reference.method)
-
-
-def tables(sources: Sources) -> dict[str, PageTable]:
-    """Tables V and VI; without the paper's columns where it has no numbers."""
-    rows, timing, lines = rows_caption(sources), sources.timing, lines_of(sources)
-    timed = "times: not taken yet, run `ded-bench bench`"
-    if len(timing):
-        counts = "/".join(map(str, sorted(set(timing["instances"]))))
-        timed = f"times: median on {counts} instances, alone on {timing['host'].iloc[-1]}"
-    made = {
-        "table_v": (TABLE_V, f"Table V: Average Solution Time and Change in Objective ({rows}; {timed})"),
-        "table_vi": (TABLE_VI, f"Table VI: Average maximum constraint violation ({rows})"),
-    }
-    found = {}
-    for name, (columns, caption) in made.items():
-        own = columns if sources.paper else without_paper(columns, sources.reference.title)
-        found[name] = PageTable(tabulate(own, lines), own, caption)
-    return found
-
-
-def blocks(draft: Draft) -> list[Block]:
+def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """The first screen, and all methods folded away."""
-    case, reference = draft.sources.case, draft.sources.reference.title
+    case, reference, paper = sources.case, sources.reference, sources.paper
     regimes = ", ".join(f"{name} |ω| ≤ {limit.omega_hz:g} Hz" for name, limit in case.regimes.items())
     what = (
         f"{len(case.buses)} buses, {len(case.generators)} generators besides the slack bus, "
-        f"{len(case.loads)} loads; {rows_caption(draft.sources)}; regimes: {regimes}. "
-        f"Every objective and violation is re-simulated; gaps are to {reference}."
+        f"{len(case.loads)} loads; {rows_caption(sources)}; regimes: {regimes}. "
+        f"Every objective and violation is re-simulated; gaps are to {reference.title}."
     )
-    lines = lines_of(draft.sources)
+    # Beside the paper's numbers, methods stand on their usual surrogates alone.
+    rows = on_usual_model(sources.judged) if paper else sources.judged
+    lines = result_lines(rows, sources.timing, paper, reference.method)
+    five, six = _paper_tables(sources, lines)
     papers = lines["paper_solve_s"].notna()
     shown = papers if papers.any() else lines["settings"] == DEFAULT
-    five, six = draft.tables["table_v"], draft.tables["table_vi"]
-    said = [*findings(case, lines, reference), *_against_paper(five.frame, six.frame)]
-    said += [
-        f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in draft.sources.certificates
-    ]
-    notes = (*data_notes(draft.sources), *draft.sources.notes)
+    said = [*findings(case, lines, reference.title), *_against_paper(five.frame, six.frame)]
+    said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
+    notes = (*data_notes(sources), *sources.notes)
     return [
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
-        *(Text(text, note=True) for text in alarms(draft.sources)),
+        *(Text(text, note=True) for text in alarms(sources)),
         PageTable(five.frame[shown], front(five.columns), "Time and increase in objective (Table V)"),
         PageTable(six.frame[shown], front(six.columns), "Mean of the largest violations (Table VI)"),
         Items(tuple(said)),
-        *draft.pictures["tradeoff"],
+        *pictures["tradeoff"],
         *folded(f"What is missing or mixed: {len(notes)}", *[Items(notes)] * bool(notes)),
         Heading("Both tables in full"),
         *folded("All methods, options and verdicts", five, six),
         *folded("How to read them", Items(EXPLANATION)),
         Heading("Schedules and frequencies"),
-        *draft.pictures["schedules"],
+        *pictures["schedules"],
     ]
+
+
+def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:
+    """Tables V and VI; without the paper's columns where it has no numbers."""
+    rows, timing = rows_caption(sources), sources.timing
+    timed = "times: not taken yet, run `ded-bench bench`"
+    if len(timing):
+        counts = "/".join(map(str, sorted(set(timing["instances"]))))
+        timed = f"times: median on {counts} instances, alone on {timing['host'].iloc[-1]}"
+    for file, columns, caption in (
+        ("table_v", TABLE_V, f"Table V: Average Solution Time and Change in Objective ({rows}; {timed})"),
+        ("table_vi", TABLE_VI, f"Table VI: Average maximum constraint violation ({rows})"),
+    ):
+        own = columns if sources.paper else without_paper(columns, sources.reference.title)
+        yield PageTable(tabulate(own, lines), own, caption, file)
 
 
 def findings(case: Case, lines: pd.DataFrame, reference: str) -> list[str]:

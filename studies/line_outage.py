@@ -67,7 +67,7 @@ def judged(grid: Case, weights: dict[str, Path], draws: int) -> list[dict]:
     answers.append((f"{first}, refined", Settings("iterations=80", policy=path)))
     rows = []
     for instance in (sample_instance(grid, SEED, k) for k in range(draws)):
-        best = solve(instance, "ded-slp", REGIME, case=grid) if servable(grid, [instance])[0] else None
+        best = solve(instance, "ded-slp", REGIME, case=grid) if servable(grid, instance) else None
         if best is None or best.schedule is None:
             continue
         least = score(instance, best.schedule, REGIME, case=grid).objective

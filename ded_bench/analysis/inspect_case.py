@@ -12,7 +12,7 @@ from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import VALIDATION_SEED, drawn_with_redraws, sample_instances
+from ded_bench.problem.sampling import VALIDATION_SEED, drawn_with_redraws
 
 #: Longest distance of knots, in periods of the fastest mode.
 KNOT_PERIODS = 2 / 3
@@ -30,9 +30,7 @@ class CaseCheck:
     drawn: int  # instances
     served: int  # of these at the first draw
     redrawn_loads: int  # because their sign changed; case/2 only
-    peak_hz: (
-        Array  # ascending largest |ω| of the served instances under static dispatch; ∞ where it collapses
-    )
+    peak_hz: Array  # ascending largest |ω| of those served under static dispatch; ∞ where it collapses
 
     def violating(self, bound_hz: float) -> float:
         """Share of the served instances that static dispatch takes beyond a bound."""
@@ -50,9 +48,8 @@ def check_case(case: Case, count: int) -> CaseCheck:
     modes = network.linearise(theta).modes()
     modes = modes[modes.imag >= 0]
     modes = modes[np.argsort(np.abs(modes))]
-    drawn = list(sample_instances(case, VALIDATION_SEED, count))
-    served = servable(case, drawn)
-    peaks = [_peak(case, instance) for instance, good in zip(drawn, served, strict=True) if good]
+    drawn = list(drawn_with_redraws(case, VALIDATION_SEED, count))
+    served = [instance for instance, _ in drawn if servable(case, instance)]
     frequency = np.abs(modes) / (2 * np.pi)
     return CaseCheck(
         p_slack=float(-case.p_nominal.sum() - case.load_nominal.sum()),
@@ -61,9 +58,9 @@ def check_case(case: Case, count: int) -> CaseCheck:
         damping=-modes.real / np.abs(modes),
         knots=suggested_knots(case, float(frequency[-1])),
         drawn=count,
-        served=int(served.sum()),
-        redrawn_loads=sum(redraws for _, redraws in drawn_with_redraws(case, VALIDATION_SEED, count)),
-        peak_hz=np.sort(peaks),
+        served=len(served),
+        redrawn_loads=sum(redraws for _, redraws in drawn),
+        peak_hz=np.sort([_peak(case, instance) for instance in served]),
     )
 
 

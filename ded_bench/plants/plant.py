@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.time_varying import Indices, TimeVarying
@@ -119,15 +116,10 @@ def _made(case: Case, name: str) -> Plant:
     return plant
 
 
-def servable(case: Case, instances: Sequence[Instance]) -> NDArray[np.bool_]:
-    """Tell which instances static dispatch can serve on the case's plant, shape (n,): the rule of draws."""
-    plant = plant_of(case)
-
-    def served(instance: Instance) -> bool:
-        try:
-            plant.check_servable(instance, "")
-        except InputError:
-            return False
-        return True
-
-    return np.array([served(instance) for instance in instances], dtype=np.bool_)
+def servable(case: Case, instance: Instance) -> bool:
+    """Tell whether static dispatch can serve an instance on the case's plant: the rule of drawing them."""
+    try:
+        plant_of(case).check_servable(instance, "")
+    except InputError:
+        return False
+    return True

@@ -56,6 +56,11 @@ class LocalRows(NamedTuple):
     start: Array  # (n_rows, n_gen)
     end: Array  # (n_rows, n_gen)
 
+    def take(self, interval: Indices, slot: Indices) -> LocalRows:
+        """Chosen rows of several in each interval, by interval and place."""
+        chosen = interval, slot
+        return LocalRows(interval, self.x[chosen], self.start[chosen], self.end[chosen])
+
 
 class Delivered(NamedTuple):
     """What generators deliver where that is not their set-points."""
@@ -177,11 +182,7 @@ class TimeVarying:
             here = np.flatnonzero(steps == r)
             costate[interval[here], slot[here]] += self._speed_rows(interval[here], generators[here])
 
-        count = int(slot.max(initial=-1)) + 1
-        rows = self._costates(count, add)
-        return LocalRows(
-            interval, rows.x[interval, slot], rows.start[interval, slot], rows.end[interval, slot]
-        )
+        return self._costates(int(slot.max(initial=-1)) + 1, add).take(interval, slot)
 
     def slack_rows(self, first: Indices) -> LocalRows:
         """Sums of δP_s over stretches of grid points, as rows in the variables of their intervals.
@@ -198,10 +199,7 @@ class TimeVarying:
             here = np.flatnonzero((begin <= r) & (r < end))
             costate[interval[here], slot[here]] += self.slack[interval[here]]
 
-        rows = self._costates(int(slot.max()) + 1, add)
-        return LocalRows(
-            interval, rows.x[interval, slot], rows.start[interval, slot], rows.end[interval, slot]
-        )
+        return self._costates(int(slot.max()) + 1, add).take(interval, slot)
 
     def cost_rows(self, cost: Array) -> LocalRows:
         """Sums of cost · δP, as delivered, over the grid points of every interval, a row for each.

@@ -6,7 +6,7 @@ that a file is the same on every machine. What cannot be used is drawn again fro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from statistics import NormalDist
 
 import numpy as np
@@ -27,8 +27,6 @@ SCENARIO_SEED = 4_000_000
 DECIMALS = 9
 #: How often one is drawn before the case's ranges are taken to be wrong.
 ATTEMPTS = 1000
-#: Instances that are drawn, and checked, together.
-CHUNK = 128
 
 #: Scenarios of a case, and their duration, s, unless told otherwise.
 SCENARIOS, DURATION_S = 20, 300.0
@@ -41,8 +39,8 @@ FLUCTUATION, STEP_S, DECAY_S, SMOOTH_S = 0.0005, 0.5, 20.0, 2.0
 #: Digits of the fluctuation after the point, in pu: a tenth of a thousandth of its standard deviation.
 FLUCTUATION_DECIMALS = 8
 
-#: Tells which of some instances of a case its plant can serve, shape (n,) (`plants.plant.servable`).
-Servable = Callable[[Case, Sequence[Instance]], NDArray[np.bool_]]
+#: Tells whether an instance of a case can be served on its plant (`plants.plant.servable`).
+Servable = Callable[[Case, Instance], bool]
 
 
 def sample_instances(
@@ -71,27 +69,18 @@ def drawn_with_redraws(
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
     """
-    for start in range(first, first + count, CHUNK):
-        indices = range(start, min(start + CHUNK, first + count))
-        generators = {i: np.random.default_rng(np.random.SeedSequence([master, i])) for i in indices}
-        drawn: dict[int, Instance] = {}
-        redraws = dict.fromkeys(indices, 0)
-        wanted = list(indices)
+    for index in range(first, first + count):
+        generator = np.random.default_rng(np.random.SeedSequence([master, index]))
+        redraws = 0
         for _ in range(ATTEMPTS):
-            for i in wanted:
-                drawn[i], repeated = _draw(case, master, i, generators[i])
-                redraws[i] += repeated
-            if servable is None:
+            instance, repeated = _draw(case, master, index, generator)
+            redraws += repeated
+            if servable is None or servable(case, instance):
                 break
-            usable = servable(case, [drawn[i] for i in wanted])
-            wanted = [i for i, good in zip(wanted, usable, strict=True) if not good]
-            if not wanted:
-                break
-            for i in wanted:
-                redraws[i] += 1
+            redraws += 1
         else:
             raise InputError(f"case {case.id}", "sampling", f"{ATTEMPTS} draws in a row cannot be served")
-        yield from ((drawn[i], redraws[i]) for i in indices)
+        yield instance, redraws
 
 
 def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -> tuple[Instance, int]:
@@ -183,7 +172,7 @@ def sample_scenario(
     generator = np.random.default_rng(np.random.SeedSequence([SCENARIO_SEED + seed, index]))
     for _ in range(ATTEMPTS):
         scenario = _draw_scenario(case, seed, index, generator, duration_s)
-        if servable is None or bool(servable(case, _snapshots(case, scenario)).all()):
+        if servable is None or all(servable(case, instance) for instance in _snapshots(case, scenario)):
             return scenario
     raise InputError(f"case {case.id}", "sampling", f"{ATTEMPTS} scenarios in a row cannot be served")
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import pandas as pd
 
-from ded_bench.analysis.break_even import MANY
 from ded_bench.analysis.lines import HEAD, records
 
 Cells = Mapping[str, Any]
@@ -120,11 +119,6 @@ TABLE_VI = (
 )
 
 
-def front(columns: Sequence[Column]) -> tuple[Column, ...]:
-    """Columns of Table V or VI on the first screen: without the verdicts."""
-    return tuple(column for column in columns if not column.name.startswith("against_"))
-
-
 def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ...]:
     """Columns of Table V or VI where there is no paper to stand beside; `reference` is what gaps are to."""
     kept = [column for column in columns if "paper" not in column.name]
@@ -194,7 +188,7 @@ WORST = (
     Column("excess", "× tolerance"),
 )
 TRAINING = (
-    *(Column("policy", "Policy"), SECONDS, Column("epochs", "epochs"), INSTANCES),
+    *(Column("name", "Policy"), SECONDS, Column("epochs", "epochs"), INSTANCES),
     Column("held_out", "held out"),
     Column("held_out_loss", "held-out loss", form=".6g"),
     Column("training_loss", "training loss", form=".6g"),
@@ -211,7 +205,7 @@ CERTIFICATE = (
     DATE,
 )
 
-#: The closed loop: methods at their own latency, and sweeps.
+#: The closed loop: methods at their own latency.
 ONLINE = (
     *_HEAD,
     Column("period_s", "every", "s", "g"),
@@ -220,7 +214,6 @@ ONLINE = (
     FAILURES,
     Column("increase_percent_mean", "cost over hindsight", "%", ".4f"),
     Column("increase_percent_max", "largest", "%", ".4f"),
-    Column("over_known_percent_mean", "over perfect forecast and no latency", "%", ".4f"),
     Column("over_static_percent_mean", "over ED every second", "%", ".4f"),
     Column("max_excess_mhz_mean", "largest excess, mean", "mHz", ".4f"),
     Column("max_excess_mhz_max", "largest", "mHz", ".4f"),
@@ -232,28 +225,6 @@ ONLINE = (
     Column("failed", "failed", form=".1%"),
     Column("infeasible", "infeasible", form=".1%"),
 )
-#: What plans of a sweep knew.
-KIND_NAMES = {
-    "announced": "forecast as announced",
-    "perfect": "perfect forecast",
-    "worse": "announcements four times as wrong",
-    "persistence": "persistence",
-    "present": "as announced, planned from the present state",
-}
-SWEEPS = (
-    *_HEAD,
-    Column("latency_s", "latency", "s"),
-    N,
-    *(
-        Column(f"increase_percent_mean_{kind}", f"cost: {KIND_NAMES[kind]}", "%", ".4f")
-        for kind in KIND_NAMES
-    ),
-    *(
-        Column(f"max_excess_mhz_mean_{kind}", f"excess: {KIND_NAMES[kind]}", "mHz", ".4f")
-        for kind in KIND_NAMES
-    ),
-)
-
 #: Over several grids.
 GRIDS = (
     CASE,
@@ -278,17 +249,4 @@ SLOPES = (
 TRAININGS = (
     *(CASE, Column("name", "model or policy"), SECONDS, INSTANCES),
     *(Column("trajectories", "trajectories"), PARAMETERS, DEVICE),
-)
-BREAK_EVEN = (
-    *(CASE, *_HEAD, Column("rival", "other")),
-    Column("training_s", "training", "s"),
-    Column("paid_after", "paid after", "schedules", ".0f"),
-    Column("gap_percent_mean", "gap", "%"),
-    Column("rival_gap_percent_mean", "other's", "%"),
-    Column("correct_rate", "feasible", form=".0%"),
-    Column("rival_correct_rate", "other's", form=".0%"),
-    Column("solve_s", "one schedule", "s"),
-    Column("rival_solve_s", "other's", "s"),
-    Column("many_s", f"training and {MANY}", "s"),
-    Column("rival_many_s", "other's", "s"),
 )

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.break_even import break_even
 from ded_bench.analysis.lines import GROUP, groups, main_lines, records
 from ded_bench.analysis.summary import summary
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.report.sources import Sources, read_sources, training_facts, training_table
+from ded_bench.report.sources import Sources, read_sources
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
 
@@ -116,24 +115,3 @@ def slopes(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(
         rows, columns=["regime", "title", *(f for name in names for f in (name, f"{name}_grids"))]
     )
-
-
-def trainings(grids: Sequence[Sources]) -> pd.DataFrame:
-    """What was trained for each grid, models and policies, from the headers of their files."""
-    rows = [
-        {"case": grid.case.id, "name": path.stem} | training_facts(path)
-        for grid in grids
-        for path in (*grid.results.paths.models, *grid.results.paths.policies)
-    ]
-    columns = ["case", "name", "seconds", "instances", "trajectories", "parameters", "device"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def break_evens(grids: Sequence[Sources]) -> pd.DataFrame:
-    """After how many schedules the trainings of all grids have paid: see `break_even`."""
-    parts = []
-    for grid in grids:
-        seconds = training_table(grid.folder).set_index("policy")["seconds"].dropna()
-        parts.append(break_even(grid.judged, grid.timing, {str(k): float(v) for k, v in seconds.items()}))
-        parts[-1].insert(0, "case", grid.case.id)
-    return pd.concat(parts, ignore_index=True)

@@ -13,7 +13,6 @@ import pandas as pd
 from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.report.columns import (
-    BREAK_EVEN,
     CASE,
     GRIDS,
     ONLINE,
@@ -27,12 +26,10 @@ from ded_bench.report.figures.growth import VALUES, growth_figure
 from ded_bench.report.figures.style import save_figure
 from ded_bench.report.grids import (
     across,
-    break_evens,
     points,
     read_grid,
     sizes,
     slopes,
-    trainings,
 )
 from ded_bench.report.page import (
     Block,
@@ -43,7 +40,7 @@ from ded_bench.report.page import (
     Text,
     write_page,
 )
-from ded_bench.report.sources import Sources
+from ded_bench.report.sources import Sources, trainings
 from ded_bench.run.environment import environment, now
 
 EXPLANATION = (
@@ -104,7 +101,10 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
     fitted = fitted[fitted[values].notna().any(axis=1)]
     operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
     excess = "Largest excess over the frequency bound, Hz"
-    paid = "After how many schedules trainings have paid, beside linear programs that need none"
+    trained = [
+        trainings((*grid.results.paths.models, *grid.results.paths.policies)).assign(case=grid.case.id)
+        for grid in grids
+    ]
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
         "The grids": table("grids", sizes(grids), GRIDS, "The grids"),
@@ -120,10 +120,7 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
             *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
         ],
         "The closed loop": table("online", operated, (CASE, *ONLINE), loop),
-        "Trainings": [
-            *table("payoff", break_evens(grids), BREAK_EVEN, paid),
-            *table("trainings", trainings(grids), TRAININGS, "What was trained"),
-        ],
+        "Trainings": table("trainings", pd.concat(trained), TRAININGS, "What was trained"),
     }
 
 

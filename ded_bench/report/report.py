@@ -7,8 +7,15 @@ from pathlib import Path
 from ded_bench.problem.case import Case
 from ded_bench.report.figures import draw_figures
 from ded_bench.report.page import write_page
-from ded_bench.report.sections import SECTIONS
+from ded_bench.report.sections.closed_loop import closed_loop
+from ded_bench.report.sections.each_method import each_method, solve_times
+from ded_bench.report.sections.made_by import made_by, trained
+from ded_bench.report.sections.opening import opening
 from ded_bench.report.sources import read_sources
+
+#: The sections, in the order in which they stand: what each puts on the page, of the sources and of the
+#: pictures by topic (see `figures.FIGURES`).
+SECTIONS = (opening, each_method, solve_times, trained, closed_loop, made_by)
 
 
 def write_report(case: Case, folder: Path, problems: Path) -> list[Path]:

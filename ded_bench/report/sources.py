@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -206,22 +206,20 @@ def _read_numbers(path: Path) -> pd.DataFrame:
     return pd.read_csv(io.StringIO(text))
 
 
-def training_table(folder: Path) -> pd.DataFrame:
-    """How each policy of a folder was trained, from their files' headers; `problem` if one is damaged."""
-    facts = [{"policy": path.stem} | training_facts(path) for path in ResultsFolder(folder).policies]
-    return pd.DataFrame(facts, columns=["policy", *TRAINING_FACTS, "problem"])
-
-
-def training_facts(path: Path) -> dict[str, Any]:
-    """What the header of a model or policy says of its training, and what is wrong with the file."""
-    try:
-        facts = read_arrays(path)[1].get("training")
-    except InputError as error:
-        return {"problem": str(error)}
-    return {"problem": ""} | (facts if isinstance(facts, dict) else {})
-
-
+#: What headers of models and policies say of their training.
 TRAINING_FACTS = (
-    *("seconds", "epochs", "instances", "held_out", "held_out_loss", "training_loss"),
+    *("seconds", "epochs", "instances", "trajectories", "held_out", "held_out_loss", "training_loss"),
     *("parameters", "model", "seed", "device"),
 )
+
+
+def trainings(paths: Iterable[Path]) -> pd.DataFrame:
+    """How models or policies were trained, from their files' headers; `problem` if one is damaged."""
+    rows = []
+    for path in paths:
+        try:
+            facts, problem = read_arrays(path)[1].get("training"), ""
+        except InputError as error:
+            facts, problem = None, str(error)
+        rows.append({"name": path.stem, "problem": problem} | (facts if isinstance(facts, dict) else {}))
+    return pd.DataFrame(rows, columns=["name", *TRAINING_FACTS, "problem"])

@@ -23,10 +23,10 @@ STATIC |= {"forecast": "announced", "predicted": True, "warm": True}
 
 @pytest.fixture(scope="module")
 def folder(threebus, tmp_path_factory):
-    """One scenario of the chain under static dispatch at three latencies, one of them its own."""
+    """One scenario of the chain under static dispatch at its own latency, and at one that was asked for."""
     results = OnlineResults(tmp_path_factory.mktemp("online"))
     scenario = sample_scenario(threebus, 0, 0, None, threebus.sampling.horizon_s)
-    for latency in (0.0, 0.5, 2.0):
+    for latency in (0.0, 0.5):
         options = LoopOptions(latency_s=latency)
         trajectory = run_loop(
             threebus, scenario, lambda i, _: Planned(ed.dispatch(threebus, i, 1.0)), options
@@ -52,10 +52,8 @@ def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     own = pd.read_csv(folder / "tables" / "online_methods.csv")
     assert own["increase_percent_mean"].tolist() == pytest.approx([1.0])
     assert own["title"].tolist() == ["ED [every=1]"]
-    swept = pd.read_csv(folder / "tables" / "online_latency.csv")
-    assert swept["increase_percent_mean_announced"].tolist() == pytest.approx([1.0, 1.5, 3.0])
     names = {path.name for path in (folder / "figures").iterdir()}
-    assert {"online_scenario.png", "online_latency_ed_every-1.png"} <= names
+    assert {"online_scenario.png", "online_latency.png"} <= names
     Results(tmp_path / "other").add([Row("x", "test", "TO", "ed", "default", "Feasible", objective=1.0)])
     write_report(threebus, tmp_path / "other", tmp_path / "no-problems")
     assert "The closed loop" not in (tmp_path / "other" / "report.md").read_text()

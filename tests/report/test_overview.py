@@ -12,7 +12,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.report.grids import break_evens, read_grid, slopes
+from ded_bench.report.grids import read_grid, slopes
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import TIMING, TimingRow
@@ -20,7 +20,6 @@ from tests.reading import Page
 
 #: Generators of the shipped cases that the tests have rows of.
 GENERATORS = {"9bus": 2, "two-area": 3, "39bus": 9}
-TRAINED = {"training": {"seconds": 10.0}}
 
 
 def results_of(folder: Path, case: str) -> Path:
@@ -85,25 +84,6 @@ def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_pa
     assert main(["overview", "--results", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
     assert "typo/results.csv: is missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_after_how_many_schedules_a_training_is_paid(tmp_path: Path) -> None:
-    """10 s of training, 0.3 s instead of 0.9: after 17 schedules."""
-    folder = results_of(tmp_path / "one", "39bus")
-    facts = {"objective": 101.0, "case": "39bus", "policy": "ded-admm@0"}
-    Results(folder).add([Row("a", "test", "TO", "ded-admm", "default", "Policy", **facts)])
-    write_arrays(folder / "policies" / "ded-admm-TO.safetensors", {"w": np.zeros(1)}, TRAINED)
-    (without_time,) = break_evens([read_grid(folder)]).to_dict("records")
-    assert np.isnan(without_time["paid_after"])
-    times = TimingRow("r", 1, "TO", "ded-slp", "default", "a", "Optimal", solve_s=0.9, case="39bus")
-    ours = dataclasses.replace(times, method="ded-admm", solve_s=0.3)
-    TIMING.write(folder / "timing.csv", [times, ours])
-    (line,) = break_evens([read_grid(folder)]).to_dict("records")
-    assert (line["title"], line["rival"]) == ("DED-ADMM", "DED (SLP)")
-    assert (line["many_s"], line["rival_many_s"]) == pytest.approx((310.0, 900.0))
-    assert line["paid_after"] == 17
-    TIMING.write(folder / "timing.csv", [times, dataclasses.replace(ours, solve_s=1.0)])
-    assert break_evens([read_grid(folder)])["paid_after"].to_list() == [np.inf]
 
 
 def points(**values: list[float]) -> pd.DataFrame:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -25,13 +23,13 @@ VALUES = (("solve_s", "time per schedule (s)"), ("peak_memory_mib", "peak memory
 GAP = ("gap_percent_mean", "mean gap (%)")
 
 
-def growth_figure(points: pd.DataFrame, values: Sequence[tuple[str, str]] = (*VALUES, GAP)) -> Figure:
+def growth_figure(points: pd.DataFrame) -> Figure:
     """Values of each method against the number of generators; hollow where some schedules are infeasible.
 
     Args:
-        points: columns regime, case, generators, method, title, correct_rate, and the values.
-        values: columns to draw, a row of panels each, with their labels.
+        points: see `grids.points`.
     """
+    values = (*VALUES, GAP)
     regimes = sorted(points["regime"].unique())
     sizes = points.drop_duplicates("case").sort_values("generators")
     with new_figure(0.7 + 2.3 * len(values) + legend_height(points["title"].nunique())) as figure:

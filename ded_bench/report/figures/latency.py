@@ -1,4 +1,4 @@
-"""The closed loop: what latency costs, and one scenario under several methods."""
+"""The closed loop: methods at their own latency, and one scenario under several of them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ded_bench.analysis.lines import titled, where
-from ded_bench.analysis.online_summary import KINDS, STATIC, own_latency, sweeps
-from ded_bench.report.columns import KIND_NAMES
+from ded_bench.analysis.online_summary import STATIC, own_latency
 from ded_bench.report.figures.panels import (
     Shown,
     frequency_panels,
@@ -22,8 +21,6 @@ from ded_bench.report.figures.panels import (
     time_figure,
 )
 from ded_bench.report.figures.style import (
-    DASHES,
-    PALETTE,
     Drawn,
     colour,
     legend_below,
@@ -47,17 +44,11 @@ METHODS_SHOWN, GENERATORS_SHOWN = 3, 3
 
 
 def draw(sources: Sources) -> Iterator[Drawn]:
-    """A figure for each method that was swept over latencies, or one without sweeps; and one scenario."""
+    """Cost and excess of all methods against latency, and one scenario."""
     own = titled(own_latency(sources.online))
-    swept = titled(sweeps(sources.online))
-    markers = "Markers: methods at their own latency, over all scenarios that they operated."
-    for (method, settings, name), lines in swept.groupby(["method", "settings", "title"], sort=False):
-        counts = "/".join(map(str, sorted(set(lines["n"]))))
-        swept_by = f"{name} against its latency, by what its plans know: mean over {counts} scenarios. "
-        figure = latency_figure(lines, own, str(name))
-        yield Drawn(f"online_latency_{method}_{settings}", swept_by + markers, figure)
-    if len(own) and not len(swept):
-        yield Drawn("online_latency", markers, latency_figure(swept, own, sources.case.id))
+    if len(own):
+        caption = "Methods at their own latency, over all scenarios that they operated."
+        yield Drawn("online_latency", caption, latency_figure(own, sources.case.id))
     scenario, shown = shown_scenario(sources)
     if shown:
         case, heading = sources.case, f"{scenario}, {sources.tightest}"
@@ -69,21 +60,19 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         yield Drawn("online_scenario", caption, time_figure(heading, panels, 1))
 
 
-def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figure:
-    """Cost and excess against latency, a column per regime, with every method at its own latency.
+def latency_figure(own: pd.DataFrame, heading: str) -> Figure:
+    """Cost and excess against latency, a column per regime.
 
     Args:
-        swept: lines of one method (see `online_summary.sweeps`).
         own: lines at methods' own latencies (see `online_summary.own_latency`), with their titles.
         heading: above the figure.
     """
-    regimes = list(dict.fromkeys((swept if len(swept) else own)["regime"]))
-    with new_figure(5.4 + legend_height(len(KINDS) + own["title"].nunique(), 2)) as figure:
+    regimes = list(dict.fromkeys(own["regime"]))
+    with new_figure(5.4 + legend_height(own["title"].nunique(), 2)) as figure:
         axes = figure.subplots(2, len(regimes), sharex=True, squeeze=False)
         handles: list[Line2D] = []
         for (name, label, linear), row in zip(MEASURES, axes, strict=True):
             for regime, ax in zip(regimes, row, strict=True):
-                handles += _sweep(ax, swept[swept["regime"] == regime], name)
                 handles += _points(ax, own[own["regime"] == regime], name)
                 ax.set_xscale("symlog", linthresh=LINEAR_S)
                 ax.set_yscale("symlog", linthresh=linear)
@@ -95,18 +84,6 @@ def latency_figure(swept: pd.DataFrame, own: pd.DataFrame, heading: str) -> Figu
         legend_below(figure, handles, columns=2)
         figure.suptitle(plain(heading))
     return figure
-
-
-def _sweep(ax: Axes, lines: pd.DataFrame, name: str) -> list[Line2D]:
-    handles = []
-    for place, kind in enumerate(KINDS):
-        chosen = lines[lines["kind"] == kind].sort_values("latency_s")
-        if len(chosen):
-            style: dict[str, Any] = {"color": PALETTE[place], "dashes": DASHES[place]}
-            handles += ax.plot(
-                chosen["latency_s"], chosen[name], ".", label=KIND_NAMES[kind], ls="-", **style
-            )
-    return handles
 
 
 def _points(ax: Axes, own: pd.DataFrame, name: str) -> list[Line2D]:
@@ -127,8 +104,7 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     second, and of the other methods those of least excess, each with its best line.
     """
     files, rows = OnlineFiles(sources.folder), sources.online
-    rows = rows[(rows["latency_source"] == "timing") & (rows["regime"] == sources.tightest)]
-    rows = rows[rows["period_s"] == 1]
+    rows = rows[(rows["regime"] == sources.tightest) & (rows["period_s"] == 1)]
     rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
     if not len(rows):
         return "", []

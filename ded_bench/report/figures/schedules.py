@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ded_bench.analysis.lines import main_lines, records, titled, where
@@ -35,7 +34,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         names = " and ".join(one.label for one in reversed(shown))
         caption = (
             f"{names} on {heading}: generator powers with bounds, loads, slack power. The instance's gap is "
-            "near the median of those whose schedules are kept, and its loads move most."
+            "nearest to the median of those whose schedules are kept."
         )
         panels = [*power_panels(case, shown), load_panel(case, shown[0]), slack_panel(case, shown)]
         yield Drawn(f"schedule_{regime}", caption, time_figure(heading, panels, 2))
@@ -56,32 +55,18 @@ def representative(sources: Sources, regime: str) -> pd.DataFrame:
     """Rows of the reference and a challenger on one instance; none without such a pair.
 
     Trained methods come before others, and the smaller the mean gap, the earlier. Of the instances whose
-    schedules are kept, the third with gaps nearest to the challenger's median takes part; the one whose
-    loads move most is chosen.
+    schedules are kept, the one whose gap is nearest to the challenger's median is chosen.
     """
-    rows = titled(
-        main_lines(sources.judged[sources.judged["regime"] == regime].dropna(subset=["gap_percent"]))
-    )
-    gaps = rows["gap_percent"].groupby(rows["method"])
-    rows = rows.assign(distance=(rows["gap_percent"] - gaps.transform("median")).abs())
-    kept = where(rows, map(sources.has_schedule, rows["key"]))
+    rows = main_lines(sources.judged[sources.judged["regime"] == regime].dropna(subset=["gap_percent"]))
+    kept = titled(where(rows, map(sources.has_schedule, rows["key"])))
     reference = kept[kept["method"] == sources.reference.method]
-    for method in challengers(gaps.agg(lambda gap: gap.abs().mean()), sources.reference.method):
-        pairs = kept[(kept["method"] == method) & kept["instance"].isin(reference["instance"])]
-        if len(pairs):
-            usual = pairs.nsmallest(-(-len(pairs) // 3), "distance")["instance"]
-            chosen = max(usual, key=lambda name: _movement(sources, name))
-            both = pd.concat([reference, pairs])
-            return where(both, both["instance"] == chosen)
-    return kept.iloc[:0]
-
-
-def challengers(distance: pd.Series[float], reference: str) -> list[str]:
-    """The methods that may stand beside the reference, first choice first; `distance` is their mean gap."""
+    gaps = rows["gap_percent"].groupby(rows["method"])
     trained = {name for name, method in METHODS.items() if method.trainer}
-    others = (str(name) for name in distance.index if name != reference)
-    return sorted(others, key=lambda name: (name not in trained, distance[name], name))
-
-
-def _movement(sources: Sources, name: str) -> float:
-    return float(np.ptp(sources.instances[name].p_load(sources.case), axis=0).sum())
+    distance = gaps.agg(lambda gap: gap.abs().mean())
+    for method in sorted(distance.index, key=lambda name: (name not in trained, distance[name], name)):
+        pairs = kept[(kept["method"] == method) & kept["instance"].isin(reference["instance"])]
+        if method != sources.reference.method and len(pairs):
+            off = (pairs["gap_percent"] - gaps.get_group(method).median()).abs()
+            both = pd.concat([reference, pairs])
+            return where(both, both["instance"] == pairs.loc[off.idxmin(), "instance"])
+    return kept.iloc[:0]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ded_bench.analysis.lines import titled
-from ded_bench.analysis.online_summary import crossed, own_latency, sweeps
-from ded_bench.report.columns import ONLINE, SWEEPS
+from ded_bench.analysis.online_summary import own_latency
+from ded_bench.report.columns import ONLINE
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, folded
 from ded_bench.report.sources import Sources
 
@@ -27,16 +27,10 @@ EXPLANATION = (
 
 def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """Nothing without rows."""
-    own, table = own_latency(sources.online), crossed(sweeps(sources.online))
-    found: list[Block] = []
-    if len(own):
-        caption = "Methods in the closed loop at their own latency, forecasts as announced"
-        found.append(PageTable(titled(own), ONLINE, caption, "online_methods"))
-    if len(table):
-        known = tuple(column for column in SWEEPS if column.name in table or column.name == "title")
-        caption = "What latency costs, by what is known: means over the same scenarios"
-        found.append(PageTable(titled(table), known, caption, "online_latency"))
-    if not found:
+    own = titled(own_latency(sources.online))
+    if not len(own):
         return []
+    caption = "Methods in the closed loop at their own latency, forecasts as announced"
     explained = folded("How to read the closed loop", Items(EXPLANATION))
-    return [Heading("The closed loop"), *found, *explained, *pictures["online"]]
+    table = PageTable(own, ONLINE, caption, "online_methods")
+    return [Heading("The closed loop"), table, *explained, *pictures["online"]]

@@ -10,13 +10,13 @@ import pandas as pd
 from ded_bench.analysis.lines import HEAD, groups, head, titled
 from ded_bench.report.columns import CERTIFICATE, PROVENANCE, TRAINING
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded
-from ded_bench.report.sources import Sources, training_table
+from ded_bench.report.sources import Sources, trainings
 from ded_bench.run.environment import environment, now
 
 
 def trained(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """How policies were trained, and their certificates."""
-    frame = training_table(sources.folder)
+    frame = trainings(sources.results.paths.policies)
     made: list[Block] = [Heading("Training of the policies")]
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()

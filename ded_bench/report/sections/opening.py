@@ -12,9 +12,9 @@ from ded_bench.analysis.paper_numbers import result_lines
 from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
 from ded_bench.problem.case import Case
-from ded_bench.report.columns import TABLE_V, TABLE_VI, front, tabulate, without_paper
+from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate, without_paper
 from ded_bench.report.notes import alarms, data_notes, rows_caption
-from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
 
 #: How the tables are to be read.
@@ -55,21 +55,19 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     five, six = _paper_tables(sources, lines)
     papers = lines["paper_solve_s"].notna()
     shown = papers if papers.any() else lines["settings"] == DEFAULT
-    said = [*findings(case, lines, reference.title), *_against_paper(five.frame, six.frame)]
+    said = [*_fastest(case, lines, reference.title), *_against_paper(five.frame, six.frame)]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     notes = (*data_notes(sources), *sources.notes)
     return [
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
         *(Text(text, note=True) for text in alarms(sources)),
-        PageTable(five.frame[shown], front(five.columns), "Time and increase in objective (Table V)"),
-        PageTable(six.frame[shown], front(six.columns), "Mean of the largest violations (Table VI)"),
+        *usual_first(five, shown),
+        *usual_first(six, shown),
         Items(tuple(said)),
         *pictures["tradeoff"],
         *folded(f"What is missing or mixed: {len(notes)}", *[Items(notes)] * bool(notes)),
-        Heading("Both tables in full"),
-        *folded("All methods, options and verdicts", five, six),
-        *folded("How to read them", Items(EXPLANATION)),
+        *folded("How to read the tables", Items(EXPLANATION)),
         Heading("Schedules and frequencies"),
         *pictures["schedules"],
     ]
@@ -90,22 +88,10 @@ def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:
         yield PageTable(tabulate(own, lines), own, caption, file)
 
 
-def findings(case: Case, lines: pd.DataFrame, reference: str) -> list[str]:
-    """What rows say of speed and feasibility, in a sentence each.
-
-    Args:
-        case: the grid.
-        lines: see `result_lines`.
-        reference: title of the method that gaps are measured against.
-    """
-    ours = lines[lines["rows"] > 0]
-    return [*_fastest(case, ours, reference), *_claims(ours)]
-
-
 def _fastest(case: Case, lines: pd.DataFrame, reference: str) -> Iterator[str]:
-    """The fastest method that keeps every limit in the tightest regime."""
+    """The fastest method that keeps every limit in the tightest regime (lines: see `result_lines`)."""
     tight = min(case.regimes, key=lambda name: case.regimes[name].omega_hz)
-    timed = lines[(lines["regime"] == tight) & lines["solve_s"].notna()]
+    timed = lines[(lines["regime"] == tight) & (lines["rows"] > 0) & lines["solve_s"].notna()]
     good = timed[timed["correct_rate"] == 1].sort_values("solve_s", kind="stable")
     limit = f"{tight} (|ω| ≤ {case.regimes[tight].omega_hz:g} Hz)"
     if len(timed) and not len(good):
@@ -120,23 +106,6 @@ def _fastest(case: Case, lines: pd.DataFrame, reference: str) -> Iterator[str]:
         ratio = timed.loc[timed["is_reference"], "solve_s"].max() / best["solve_s"]
         text += f", {float(f'{ratio:.2g}'):,g} times faster than that" if ratio > 1 else ""
         yield text + "."
-
-
-def _claims(lines: pd.DataFrame) -> Iterator[str]:
-    """Where claims and verdicts differ most."""
-    judged = lines[lines["freq_violation_hz_max"].notna()]
-    apart = judged["success_rate"] - judged["correct_rate"]
-    if not len(judged):
-        return
-    if apart.max() <= 0:
-        yield "**Claimed and verified:** every schedule that its method claims is feasible."
-        return
-    line = judged.iloc[int(apart.argmax())]
-    yield (
-        f"**Claimed and verified:** they differ most for {line['title']} in {line['regime']}, which claims "
-        f"success on {line['success_rate']:.0%} of the instances and is feasible on "
-        f"{line['correct_rate']:.0%}; it exceeds the bound by up to {line['freq_violation_hz_max']:.2g} Hz."
-    )
 
 
 def _against_paper(five: pd.DataFrame, six: pd.DataFrame) -> Iterator[str]:

@@ -1,9 +1,12 @@
-"""After how many schedules has a policy's training paid, beside linear programs that need none?"""
+"""After how many schedules has a policy's training paid, beside linear programs that need none?
 
-from __future__ import annotations
+python studies/break_even.py results/*-reference
+"""
 
 import math
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,6 +14,8 @@ import pandas as pd
 from ded_bench.analysis.lines import GROUP, line_table, records
 from ded_bench.analysis.summary import summary
 from ded_bench.methods.options import DEFAULT
+from ded_bench.report.grids import read_grid
+from ded_bench.report.sources import trainings
 
 #: Methods that need no training, with the surrogates of which the first with rows and a time counts.
 RIVALS = {"ded-ko-knots": ("trajectory", "koopman"), "ded-slp": ("",)}
@@ -62,3 +67,16 @@ def break_even(rows: pd.DataFrame, timing: pd.DataFrame, training_s: Mapping[str
                 own = policy | {"many_s": cost + policy["many_s"], "training_s": cost}
                 found.append(own | compared | {"rival": rival["title"], "paid_after": paid})
     return line_table(found, COLUMNS)
+
+
+def main() -> None:
+    """Print a table for each results folder."""
+    for folder in map(Path, sys.argv[1:]):
+        grid = read_grid(folder)
+        seconds = trainings(grid.results.paths.policies).set_index("name")["seconds"].dropna()
+        cost = {str(name): float(value) for name, value in seconds.items()}
+        print(f"\n{grid.case.id}\n{break_even(grid.judged, grid.timing, cost).to_string(index=False)}")
+
+
+if __name__ == "__main__":
+    main()

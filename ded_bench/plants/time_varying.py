@@ -133,17 +133,6 @@ class TimeVarying:
             deviation[self.points[interval] + r] = state
         return self._outputs(deviation)
 
-    def rollout(self, p_gen: Array) -> tuple[Array, Array]:
-        """ω and P_s as `outputs` gives them, under powers given at all grid points, (n_points, n_gen), pu."""
-        knots = np.arange(len(self.omega))
-        reference = [np.interp(knots, self.points, p) for p in self.p_gen.T]
-        u = p_gen - np.stack(reference, axis=1)
-        change, deviation = np.diff(u, axis=0), np.zeros((len(u), self.step.f.shape[1]))
-        for k, j in enumerate(self._intervals[:-1]):
-            inputs = self.step.g[j] @ u[k] + self.step.h[j] @ change[k]
-            deviation[k + 1] = self.step.f[j] @ deviation[k] + inputs
-        return self._outputs(deviation)
-
     @property
     def _intervals(self) -> Indices:
         """In which interval each grid point lies; the point at a knot belongs to the one after it."""

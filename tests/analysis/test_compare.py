@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
 
 from ded_bench.analysis.compare import Tolerance, compare
-from ded_bench.cli.comparison import to_json, to_text
+from ded_bench.cli.comparison import to_text
 from ded_bench.files.errors import InputError
 from ded_bench.results.rows import Results, Row
-from ded_bench.results.timing import TIMING, TimingRow
 
 
 def row(instance: str, method: str = "ded-radau", objective: float | None = 100.0, **changes) -> Row:
@@ -137,34 +135,6 @@ def test_other_problems_cannot_be_compared(folders) -> None:
         in (found.incomparable)
     )
     assert to_text(found).splitlines()[-1].startswith("not comparable: ")
-
-
-def test_folders_without_a_common_row_cannot_either(folders) -> None:
-    assert compare(*folders([row("z")])).incomparable == "no row is in both"
-
-
-def test_times_taken_alone_are_told_where_both_have_them(folders) -> None:
-    a, b = folders(BASE)
-    for folder, seconds in ((a, 2.0), (b, 5.0)):
-        timed = TimingRow(
-            "run", 1, "TO", "ded-radau", "default", "a", "Optimal", solve_s=seconds, case="grid"
-        )
-        TIMING.write(folder / "timing.csv", [timed])
-    summary = compare(a, b).summary.set_index("method")
-    assert summary.loc["ded-radau", "time_ratio_alone"] == 2.5
-    assert summary["time_ratio_alone"].isna().to_list() == [False, True]
-
-
-def test_json_is_one_object(folders) -> None:
-    told = json.loads(to_json(compare(*folders(altered(2, status="Failed", objective=None, feasible=None)))))
-    assert told["same"] is False
-    assert [(c["column"], c["before"], c["after"]) for c in told["changes"]] == [
-        ("status", "Optimal", "Failed"),
-        ("feasible", True, None),
-        ("objective", 101.0, None),
-    ]
-    assert told["summary"][1]["gap_percent_b"] == pytest.approx(3.0)
-    assert told["summary"][0]["time_ratio_alone"] is None
 
 
 def test_a_folder_without_rows_is_bad_input(folders, tmp_path) -> None:

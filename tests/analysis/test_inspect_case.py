@@ -14,7 +14,6 @@ from ded_bench.files.strict import write_record
 from ded_bench.methods import ed
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.score import score
-from ded_bench.problem.benchmark import load_split
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instances
 
@@ -99,20 +98,3 @@ def test_the_command_checks_a_case(threebus: Case, alter, tmp_path: Path, capsys
         assert problem in capsys.readouterr().err
     assert main(["cases", str(tmp_path / "nowhere")]) == 2
     assert "no such case" in capsys.readouterr().err
-
-
-def test_instances_are_drawn_as_many_as_before(threebus: Case, tmp_path: Path) -> None:
-    """Without options, a split that is there says how many, how many for testing, and from which seed."""
-    write_record(threebus, tmp_path / "case.json")
-    command = ["instances", "--case", str(tmp_path)]
-    assert main([*command, "--count", "7", "--test", "3", "--seed", "11"]) == 0
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
-    assert len(load_split(tmp_path).test) == 3
-    assert main(command) == 0
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
-    assert main([*command, "--count", "10"]) == 2  # it would replace what is there
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
-    assert main([*command, "--count", "10", "--force"]) == 0
-    split = load_split(tmp_path)
-    assert (len(split.train), len(split.test), split.seed) == (8, 2, 11)
-    assert main([*command, "--count", "2", "--test", "3"]) == 2

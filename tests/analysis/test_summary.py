@@ -80,12 +80,6 @@ def test_gaps_are_signed_percent_of_ded(table: pd.DataFrame) -> None:
     assert (ours["ded"].dropna() == 0).all()
 
 
-def test_no_gap_where_ded_costs_nothing() -> None:
-    frame = frame_of(row("a", "ded", 0.0), row("a", "ed", 1.0))
-    assert with_gaps(frame)["gap_percent"].isna().all()
-    assert summary(with_gaps(frame))["unpaired"].to_list() == [1, 1]
-
-
 def test_summary_counts_and_spreads(table: pd.DataFrame) -> None:
     ko = summary(with_gaps(table)).set_index("method").loc["ded-ko"]
     assert (ko["rows"], ko["n"], ko["failures"], ko["unpaired"]) == (5, 3, 1, 1)
@@ -95,11 +89,6 @@ def test_summary_counts_and_spreads(table: pd.DataFrame) -> None:
     assert ko["gap_percent_p95"] == pytest.approx(np.quantile([1, -1, 4], 0.95))
     assert ko["freq_violation_hz_mean"] == pytest.approx((2e-4 + 1e-5) / 4)
     assert ko["freq_violation_hz_max"] == pytest.approx(2e-4)
-
-
-def test_ratio_of_summed_costs_weighs_instances_by_cost(table: pd.DataFrame) -> None:
-    """The mean of ratios is 1.0133; of the sums it is 1339 / 1300."""
-    ko = summary(with_gaps(table)).set_index("method").loc["ded-ko"]
     assert ko["cost_ratio"] == pytest.approx((101 + 198 + 1040) / (100 + 200 + 1000))
 
 
@@ -109,26 +98,10 @@ def test_claims_and_verdicts_are_separate_rates(table: pd.DataFrame) -> None:
     assert ko["correct_rate"] == pytest.approx(3 / 5)
     assert ko["strict_rate"] == pytest.approx(2 / 5)
     counts = claims(table).set_index(["method", "status"])
-    assert counts.loc[
-        ("ded-ko", "Optimal"), ["rows", "feasible", "feasible_strict", "infeasible"]
-    ].to_list() == [
-        4,
-        3,
-        2,
-        1,
-    ]
+    found = counts.loc[("ded-ko", "Optimal"), ["rows", "feasible", "feasible_strict", "infeasible"]]
+    assert found.to_list() == [4, 3, 2, 1]
     assert counts.loc[("ded-ko", "TimeLimit"), "not_scored"] == 1
     assert counts["rows"].sum() == len(table)
-
-
-@pytest.mark.parametrize(
-    ("status", "rate"),
-    [("Optimal", 1), ("Feasible", 1), ("Policy", 1), ("TimeLimit", 0), ("Failed", 0), ("Infeasible", 0)],
-)
-def test_a_time_limit_is_no_success(status: str, rate: int) -> None:
-    assert summary(with_gaps(frame_of(row("a", "ded", 1.0, status=status))))["success_rate"].to_list() == [
-        rate
-    ]
 
 
 def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:
@@ -185,11 +158,3 @@ def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
     assert points.loc["ded-ko", "alone"]
     assert points.loc["ded", "seconds"] == 1.0
     assert not points.loc["ded", "alone"]
-
-
-def test_an_empty_table_has_its_columns() -> None:
-    empty = with_gaps(frame_of())
-    for made in (summary(empty), claims(empty), worst(empty), tradeoff(empty, NO_TIMES)):
-        assert len(made) == 0
-        assert {"regime", "method", "settings", "title"} <= set(made.columns)
-    assert len(performance_profile(empty, "solve_s")) == 0

@@ -155,15 +155,6 @@ def test_cost_is_of_what_is_delivered(case, instance, still):
 # Schedules through the simulator.
 
 
-def test_objective_of_an_equilibrium_in_closed_form(case, instance, constant):
-    """(n + 1) times the static cost: 101 points for 100 steps."""
-    verdict = score(case, instance, constant(instance, case.p_nominal), "TO")
-    p_slack = -case.p_nominal.sum() - case.load_nominal.sum()
-    static = case.p_nominal @ instance.cost_gen(case) + 0.7 * abs(p_slack)
-    assert verdict.objective == pytest.approx((instance.steps + 1) * static, rel=1e-11)
-    assert verdict.feasible_strict
-
-
 def test_slow_loads_approach_static_dispatch(case, quiet_instance):
     """With P = P_opt of the loads at each t_k, the objective exceeds the static one by O(rate).
 

@@ -9,7 +9,6 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import plant_of, servable
-from ded_bench.problem.benchmark import load_manifest, write_benchmark
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
@@ -61,18 +60,6 @@ def test_what_cannot_be_served_is_drawn_again(weak: Case) -> None:
         assert (instance == before) == (redraws == 0) == kept
         assert (instance.id, instance.seed) == (before.id, before.seed)
     assert list(drawn_with_redraws(weak, 1, 5, first=150, servable=servable)) == drawn[150:155]
-
-
-def test_the_manifest_counts_redraws(weak: Case, threebus: Case, tmp_path) -> None:
-    """Only where there are any: what was written before there was a rule stays as it is."""
-    expected = sum(redraws for _, redraws in drawn_with_redraws(weak, 3, 10, servable=servable))
-    assert expected > 0
-    write_benchmark(weak, 10, 3, tmp_path / "weak", servable=servable)
-    manifest = load_manifest(tmp_path / "weak")
-    assert manifest is not None
-    assert manifest.redraws == expected
-    write_benchmark(threebus, 10, 3, tmp_path / "strong", servable=servable)
-    assert "redraws" not in (tmp_path / "strong" / "MANIFEST.json").read_text()
 
 
 def test_shipped_draws_of_the_paper_are_servable(ninebus: Case) -> None:

@@ -72,14 +72,6 @@ def test_files_know_their_split_and_version(folder: Path, tmp_path: Path, threeb
     assert chosen.version == ""
 
 
-def test_a_folder_of_results_does_not_hide_the_shipped_case(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "two-area" / "tables").mkdir(parents=True)
-    chosen = select_split("two-area", "test", 1)
-    assert chosen.case.id == "two-area"
-    assert len(chosen.instances) == 1
-
-
 def test_an_edited_copy_needs_a_name_of_its_own(
     threebus: Case, quiet_instance, alter, tmp_path: Path
 ) -> None:

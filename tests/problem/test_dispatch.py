@@ -81,19 +81,3 @@ def test_merit_order_of_one_generator_in_closed_form(threebus):
     np.testing.assert_allclose(cheap[:, 0], [0.3, 0.3, 0.55, 0.9, 0.9], rtol=0, atol=1e-15)
     dear = merit_order(threebus, np.array([0.2]), 0.1, p_load)
     np.testing.assert_array_equal(dear[:, 0], 0.3)
-
-
-def test_leading_dimensions_broadcast(case):
-    """Costs of one instance against loads over time, and batches of both."""
-    rng = np.random.default_rng(4)
-    n_gen, n_load = len(case.generators), len(case.loads)
-    cost_gen, cost_slack = rng.random((3, 1, n_gen)), rng.random((3, 1))
-    p_load = -rng.random((3, 7, n_load))
-    batch = merit_order(case, cost_gen, cost_slack, p_load)
-    assert batch.shape == (3, 7, n_gen)
-    for i in range(3):
-        over_time = merit_order(case, cost_gen[i, 0], cost_slack[i, 0], p_load[i])
-        np.testing.assert_array_equal(over_time, batch[i])
-        for k in range(7):
-            one = merit_order(case, cost_gen[i, 0], cost_slack[i, 0], p_load[i, k])
-            np.testing.assert_array_equal(one, batch[i, k])

@@ -72,28 +72,16 @@ def test_reading_is_tolerant_of_form(ninebus, tmp_path, text):
 BAD = {
     "empty": ("", "t", "is empty"),
     "header only": ("t,P_2,P_3\n", "t", "at least two rows"),
-    "one row": ("t,P_2,P_3\n0,1,1\n", "t", "at least two rows"),
-    "no header": ("0,1,1\n60,1,1\n", "t", "is missing (expected t,P_2,P_3, found 0,1,1)"),
     "missing column": ("t,P_2\n0,1\n60,1\n", "P_3", "is missing (expected t,P_2,P_3, found t,P_2)"),
     "column twice": ("t,P_2,P_2,P_3\n0,1,1,1\n60,1,1,1\n", "P_2", "is there twice"),
     "unknown column": ("t,P_2,P_3,P_4\n0,1,1,1\n60,1,1,1\n", "P_4", "P_3, found t,P_2,P_3,P_4"),
     "short row": ("t,P_2,P_3\n0,1,1\n60,1\n", "line 3", "2 values for 3 columns"),
-    "long row": ("t,P_2,P_3\n0,1,1,1\n60,1,1\n", "line 2", "4 values for 3 columns"),
-    "row after a blank line": ("t,P_2,P_3\n0,1,1\n\n60,1\n", "line 4", "2 values for 3 columns"),
     "word": ("t,P_2,P_3\n0,1,1\n60,1,much\n", "line 3, P_3", "'much' is not a finite number"),
-    "empty cell": ("t,P_2,P_3\n0,,1\n60,1,1\n", "line 2, P_2", "is not a finite number"),
     "nan": ("t,P_2,P_3\n0,1,nan\n60,1,1\n", "line 2, P_3", "'nan' is not a finite number"),
-    "inf": ("t,P_2,P_3\n0,1,1\n60,-inf,1\n", "line 3, P_2", "'-inf' is not a finite number"),
-    "overflow": ("t,P_2,P_3\n0,1,1\n60,1e999,1\n", "line 3, P_2", "'1e999' is not a finite number"),
     "underscore": ("t,P_2,P_3\n0,1_0,1\n60,1,1\n", "line 2, P_2", "'1_0' is not a finite number"),
-    "semicolons": ("t;P_2;P_3\n0;1;1\n60;1;1\n", "t", "is missing (expected t,P_2,P_3, found t;P_2;P_3)"),
-    "blank header": (",,\n0,1,1\n60,1,1\n", "t", "found ,,"),
     "time repeats": ("t,P_2,P_3\n0,1,1\n5,1,1\n5,1,1\n60,1,1\n", "t", "5.0 follows 5.0"),
-    "time goes back": ("t,P_2,P_3\n0,1,1\n60,1,1\n30,1,1\n", "t", "30.0 follows 60.0"),
     "starts late": ("t,P_2,P_3\n0.01,1,1\n60,1,1\n", "t", "must start at 0, not 0.01"),
-    "starts early": ("t,P_2,P_3\n-1,1,1\n60,1,1\n", "t", "must start at 0, not -1.0"),
     "ends early": ("t,P_2,P_3\n0,1,1\n59.99,1,1\n", "t", "horizon 60.0, not 59.99"),
-    "ends late": ("t,P_2,P_3\n0,1,1\n60.00001,1,1\n", "t", "horizon 60.0, not 60.00001"),
 }
 
 

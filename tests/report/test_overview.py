@@ -12,7 +12,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.files.arrays import write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.report.grids import read_grid, slopes
+from ded_bench.report.grids import read_grid
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import TIMING, TimingRow
@@ -84,19 +84,3 @@ def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_pa
     assert main(["overview", "--results", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
     assert "typo/results.csv: is missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def points(**values: list[float]) -> pd.DataFrame:
-    """Rows of one method in one regime on three grids."""
-    facts = {"case": list("abc"), "generators": [2, 4, 8], "regime": "TO", "method": "ed", "title": "ED"}
-    facts |= {"settings": "default", "model": "", "correct_rate": [1.0, 0.5, 1.0]}
-    return pd.DataFrame(facts | values)
-
-
-def test_exponents_of_a_power_law() -> None:
-    table = points(solve_s=[3.0, 3.0 * 2**1.5, 3.0 * 4**1.5], peak_memory_mib=[1.0, 2.0, np.nan])
-    (row,) = slopes(table, ["solve_s", "peak_memory_mib"]).to_dict("records")
-    assert row["solve_s"] == pytest.approx(1.5)
-    assert row["solve_s_grids"] == 3
-    assert np.isnan(row["peak_memory_mib"])  # two grids have no exponent
-    assert row["peak_memory_mib_grids"] == 2

@@ -85,23 +85,6 @@ def test_what_was_not_run_is_an_empty_row_beside_the_papers() -> None:
     assert made(TABLE_V, frame_of()).loc[("NO", "ded-dpc-paper", "default"), "paper_increase_percent"] == 1.05
 
 
-def test_the_papers_rows_come_first_then_all_others() -> None:
-    frame = frame_of(
-        row("a", "mine", 1.0),
-        row("a", "ed", 1.0),
-        row("a", "ded-dpc", 1.0),
-        row("a", "ded", 1.0, settings="fast"),
-        row("a", "ded", 1.0),
-    )
-    order = [key[1:] for key in made(TABLE_V, frame).loc[["TO"]].index]
-    assert order == [
-        *((name, "default") for name in OURS),
-        ("ded", "fast"),
-        ("ed", "default"),
-        ("mine", "default"),
-    ]
-
-
 def test_table_vi_means_the_maxima_and_knows_equal(table: pd.DataFrame) -> None:
     ko = made(TABLE_VI, table).loc[("TO", "ded-ko", "default")]
     assert ko["freq_violation_hz"] == pytest.approx((2e-4 + 1e-5) / 4)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib.util
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,16 +69,15 @@ def _train_ko(a: argparse.Namespace) -> int:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
-    is_paper = a.kind == TRAINED[1]
-    if is_paper:
+    if is_paper := a.kind == TRAINED[1]:
         _find_torch()
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
     from ded_bench.plants.lossless.network import Network
     from ded_bench.surrogates.identify import held_out, identify, rollout_errors
 
     if is_paper:
-        with _needing_torch():
-            from ded_bench.surrogates.koopman_paper import identify_paper
+        from ded_bench.surrogates.koopman_paper import identify_paper
+
         model = identify_paper(case, a.seed, a.count)
     else:
         model = identify(case, a.seed, a.count)
@@ -137,8 +134,6 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     out: Path = a.out or policy_file(results, name, regime, a.model)
     if out.exists() and not (a.force or a.resume):
         return f"{out} is there already (--force trains anew)"
-    with _needing_torch():
-        train = get_method(name).train
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)
     options = TrainingOptions(
@@ -153,24 +148,16 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
         version=version(),
         commit=commit(),
     )
-    facts = train(case, regime, instances, out, options).training
+    facts = get_method(name).train(case, regime, instances, out, options).training
     losses = [f", {loss.replace('_', ' ')} {facts[loss]:.6g}" for loss in LOSSES if loss in facts]
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
 
 
 def _find_torch() -> None:
-    """Fail as an import of torch would, without the seconds that one takes."""
-    with _needing_torch():
-        if importlib.util.find_spec("torch") is None:
-            raise ModuleNotFoundError("No module named 'torch'", name="torch")
-
-
-@contextlib.contextmanager
-def _needing_torch() -> Iterator[None]:
-    """Say what to install where an import fails for want of PyTorch; only training needs it."""
+    """Say what to install where PyTorch is not, without the seconds that its import takes."""
     try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise InputError("torch", "", "training needs PyTorch: pip install 'ded-bench[train]'") from None
+        missing = importlib.util.find_spec("torch") is None
+    except ModuleNotFoundError:  # a finder may say so itself
+        missing = True
+    if missing:
+        raise InputError("torch", "", "training needs PyTorch: pip install 'ded-bench[train]'")

@@ -32,6 +32,8 @@ from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
+#: Instances answered at a time.
+CHUNK = 50
 SOLVER_VERSION = f"numba {numba.__version__}, numpy {np.__version__}"
 
 
@@ -78,7 +80,8 @@ class TrainedPolicy(abc.ABC):
         """
         batch = [instances] if isinstance(instances, Instance) else list(instances)
         self.scope.check(batch)
-        return [Schedule(self.knots, p) for p in self.answers(batch)] if batch else []
+        parts = (batch[i : i + CHUNK] for i in range(0, len(batch), CHUNK))
+        return [Schedule(self.knots, p) for part in parts for p in self.answers(part)]
 
     def save(self, path: Path) -> None:
         """Write weights and header."""
@@ -104,10 +107,10 @@ class TrainedPolicy(abc.ABC):
         return cls.load(find_policy_file(cls.method, case, regime, settings), case, regime)
 
     @classmethod
-    def artifact(cls, case: Case, regime: str, settings: Settings) -> Artifact:
+    def artifacts(cls, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
         """The policy that `find` loads; raises as it does."""
         path = find_policy_file(cls.method, case, regime, settings)
-        return Artifact("policy", cls.method, cls.load(path, case, regime).fingerprint, path)
+        return (Artifact("policy", cls.method, cls.load(path, case, regime).fingerprint, path),)
 
 
 def as_solver(scope: Scope, answer: Callable[[Instance], Schedule], iterations: int | None = None) -> Solver:

@@ -22,10 +22,6 @@ from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, 
 
 #: Fractions of a training: warm-up of the learning rate, then a cosine down to `LAST` of it.
 WARM_UP, LAST = 0.02, 1e-3
-CLIP_NORM = 1.0  # of gradients
-AVERAGE = 0.998  # of the weights, exponentially
-#: Most looks at the loss.
-LOOKS = 40
 
 
 class TrainingRun(abc.ABC):
@@ -36,7 +32,8 @@ class TrainingRun(abc.ABC):
 
     #: What a checkpoint holds beside the states of network, average, optimiser and generator.
     progress: tuple[str, ...] = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
-    clip_norm, average_decay, looks = CLIP_NORM, AVERAGE, LOOKS
+    clip_norm, average_decay = 1.0, 0.998  # of gradients; of the weights, exponentially
+    looks = 40  # at the loss, at most
 
     def __init__(self, network: nn.Module, optimiser: torch.optim.Optimizer, seed: int, out: Path) -> None:
         self.network, self.optimiser, self.generator = network, optimiser, torch.Generator().manual_seed(seed)

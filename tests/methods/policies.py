@@ -12,8 +12,7 @@ from ded_bench.methods.admm.torch_iterations import TorchIterations
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
-from ded_bench.methods.dpc_paper.paper_inference import n_channels
-from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy
+from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy, n_channels
 from ded_bench.methods.dpc_paper.paper_training import PaperNetwork
 from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.stacked_instances import StackedInstances

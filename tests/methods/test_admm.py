@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,35 +16,30 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_slp
 from ded_bench.methods.admm import admm_training
 from ded_bench.methods.admm.admm_inference import (
+    PRICE,
     CompiledIterations,
     mean_modes_of,
     settings_of,
     starting_settings,
-    weight_shapes,
 )
-from ded_bench.methods.admm.admm_kernels import PRICE
-from ded_bench.methods.admm.admm_policy import AdmmPolicy, prepare
+from ded_bench.methods.admm.admm_policy import prepare
 from ded_bench.methods.admm.admm_training import read_start, with_margin
-from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
-from ded_bench.methods.admm.modal_kernels import oscillators
+from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, oscillators
 from ded_bench.methods.admm.problems import POINTS, Problems
-from ded_bench.methods.admm.quadratic_kernels import interval_maps, modal_change
 from ded_bench.methods.admm.torch_iterations import (
     ModalChange,
-    Respond,
     ScheduleLoss,
     TorchIterations,
     Transposed,
 )
-from ded_bench.methods.policy_file import Scope, write_policy
+from ded_bench.methods.policy_file import write_policy
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from tests.methods.policies import (
-    HORIZON,
     modal_grid,
     random_policy,
     short_instances,
@@ -90,7 +84,7 @@ def test_quadratic_model_is_minimised_by_its_recursion() -> None:
 def test_mean_modes_say_what_a_mode_does_alone(case: Case) -> None:
     """Against the response to one mode's constant powers, from rest, where stiffness keeps its mean."""
     grid = modal_grid(case)
-    start, linear = started(grid, 1)
+    _, linear = started(grid, 1)
     mean = mean_modes_of(grid, linear)
     network = grid.network
     into, maps, outputs = (part[0] for part in mean)
@@ -156,80 +150,6 @@ def test_transposed_response_and_the_response_are_each_others_gradient(case: Cas
     )
 
 
-def test_gradient_of_the_response_is_its_transpose(case: Case) -> None:
-    """The response is affine in the powers, so that differences are exact but for round-off."""
-    grid = modal_grid(case)
-    start, linear = started(grid)
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal(start.schedule.shape)
-    before, after = (
-        grid.respond(powers, start, linear)[1:] for powers in (start.schedule, start.schedule + direction)
-    )
-    weights = [rng.standard_normal(part.shape) for part in before]
-    powers = torch.tensor(start.schedule, dtype=torch.float32, requires_grad=True)
-    answer = Respond.apply(powers, grid, start, linear)
-    sum((torch.tensor(w) * part).sum() for w, part in zip(weights, answer, strict=True)).backward()
-    along = float((powers.grad.double().numpy() * direction).sum())
-    terms = [w * (b - a) for w, a, b in zip(weights, before, after, strict=True)]
-    size = sum(float(np.abs(term).sum()) for term in terms)
-    assert along == pytest.approx(sum(float(term.sum()) for term in terms), abs=1e-5 * size)  # float32
-
-
-def optimum(grid: ModalGrid, start: Start, linear: ModalLinearisation) -> float:
-    """Least mean cost along the trajectory of a single problem, by HiGHS over the dense response."""
-    n, n_gen = start.schedule.shape[1:]
-    base = np.repeat(start.problems.p_initial[:, None], n, axis=1)
-    _, free, slack = (part[0] for part in grid.respond(base, start, linear))
-    columns = []
-    for j in range(1, n):
-        for g in range(n_gen):
-            moved = base.copy()
-            moved[0, j, g] += 1.0
-            _, omega, p_slack = (part[0] for part in grid.respond(moved, start, linear))
-            columns.append(np.concatenate([(omega - free).ravel(), p_slack - slack]))
-    response = np.stack(columns, axis=1)
-    speeds, slacks = response[: free.size], response[free.size :]
-    n_points, (case, cost) = len(slack), (grid.case, start.problems.cost[0])
-    at_knots, at_points = mean_weights(n), mean_weights(n_points)
-    ramps = np.kron(np.diff(np.eye(n), axis=0)[:, 1:], np.eye(n_gen))
-    rows = [
-        np.hstack([sign * part, np.zeros((len(part), n_points))])
-        for part in (speeds, ramps)
-        for sign in (1, -1)
-    ]
-    rows += [np.hstack([sign * slacks, -np.eye(n_points)]) for sign in (1, -1)]
-    steps = np.tile(grid.ramp, n - 1)
-    right = [grid.bound - free.ravel(), grid.bound + free.ravel(), steps, steps, -slack, slack]
-    below = np.tile(case.p_min - base[0, 0], n - 1)
-    above = np.tile(case.p_max - base[0, 0], n - 1)
-    bounds = [*zip(below, above, strict=True), *[(0.0, None)] * n_points]
-    price = np.concatenate([(at_knots[1:, None] * cost[1:]).ravel(), cost[0] * at_points])
-    found = scipy.optimize.linprog(price, np.vstack(rows), np.concatenate(right), bounds=bounds)
-    assert found.success
-    return float(found.fun + base[0, 0] @ cost[1:])
-
-
-def mean_weights(n: int) -> Array:
-    weights = np.full(n, 1.0 / (n - 1))
-    weights[[0, -1]] *= 0.5
-    return weights
-
-
-def test_many_iterations_find_the_optimum(threebus: Case) -> None:
-    """What a dozen iterations approach is the optimum of the linear program: 0.1 %, within the bound."""
-    grid = modal_grid(threebus)
-    for seed in range(3):
-        start, linear = started(grid, 1, seed)
-        answer = CompiledIterations(grid, grid.bound, np.zeros((4, 8)), 4000)(start, linear, start.schedule)
-        _, omega, p_slack = grid.respond(answer, start, linear)
-        cost = start.problems.cost[0]
-        found = mean_weights(answer.shape[1]) @ (answer[0] @ cost[1:])
-        found += cost[0] * mean_weights(p_slack.shape[1]) @ np.abs(p_slack[0])
-        least = optimum(grid, start, linear)
-        assert found == pytest.approx(least, rel=1e-3)
-        assert np.abs(omega).max() < 1.002 * grid.bound
-
-
 def test_weights_move_settings_within_their_range(ninebus: Case) -> None:
     """0 is where training starts; whatever the weights are, penalties are positive, and torch agrees."""
     np.testing.assert_array_equal(settings_of(np.zeros((4, 8)), 9), starting_settings(9))
@@ -263,25 +183,6 @@ def test_compiled_iterations_are_those_of_torch(case: Case) -> None:
     np.testing.assert_allclose(policy.powers(start.problems)[clear], expected[clear], atol=2e-4)
 
 
-def test_order_of_generators_does_not_matter(case: Case) -> None:
-    """Buses in another order: the same schedules."""
-    data = json.loads(case.model_dump_json(by_alias=True))
-    data["buses"] = data["buses"][::-1]
-    other = Case.model_validate_json(json.dumps(data))
-    assert other.generators == case.generators[::-1]
-    policy = random_policy("ded-admm", case)
-    same = AdmmPolicy(Scope(other, policy.scope.regime, HORIZON), policy.weights, policy.training)
-    (instance,) = short_instances(case, 1, 6)
-    np.testing.assert_allclose(same(instance)[0].p[:, ::-1], policy(instance)[0].p, atol=1e-5)
-
-
-def test_one_set_of_weights_serves_every_grid(ninebus: Case, threebus: Case) -> None:
-    policy = random_policy("ded-admm", ninebus)
-    other = AdmmPolicy(Scope(threebus, "TO", HORIZON), policy.weights, policy.training)
-    assert other(short_instances(threebus, 1))[0].p.shape == (threebus.n_knots, len(threebus.generators))
-    assert {name: value.shape for name, value in policy.weights.items()} == weight_shapes()
-
-
 def test_loss_is_the_scorers(ninebus: Case) -> None:
     """Cost within 0.05 %, largest excess within 2 % of the bound, of what the simulation says."""
     grid = modal_grid(ninebus, 60.0)
@@ -296,27 +197,6 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     assert cost == pytest.approx(truth.objective, rel=5e-4)
     excess = truth.freq_violation_hz * 2 * np.pi / grid.bound
     assert float(judged.excess[0]) == pytest.approx(excess, abs=0.02)
-
-
-def test_gradient_of_the_loss_by_differences(threebus: Case) -> None:
-    """Along the gradient's own direction; float32 and kinks leave 5 %."""
-    grid = modal_grid(threebus)
-    start, network, loss = started(grid)[0], torch_iterations(grid), ScheduleLoss(grid)
-
-    def value() -> torch.Tensor:
-        judged = loss(start, network(start), 0.5)
-        return (judged.cost + 0.05 * judged.penalty).mean()
-
-    torch.autograd.backward(value())
-    gradient = network.nodes.grad
-    direction = gradient / gradient.norm()
-    size = 2e-3
-    with torch.no_grad():
-        network.nodes.add_(size * direction)
-        above = float(value())
-        network.nodes.sub_(2 * size * direction)
-        below = float(value())
-    assert (above - below) / (2 * size) == pytest.approx(float(gradient.norm()), rel=0.05)
 
 
 def test_training_starts_from_weights_of_another_grid(ninebus: Case, threebus: Case, tmp_path: Path) -> None:

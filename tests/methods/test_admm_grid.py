@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods.admm.admm_training import LOOSE, TIGHT, iterations_of
 from ded_bench.methods.admm.modal_grid import SMALLEST_COST
 from ded_bench.methods.admm.network_kernels import (
     MISMATCH,
@@ -60,20 +59,6 @@ def test_what_is_drawn_for_training_is_of_both_kinds(case: Case) -> None:
     assert np.isfinite(problems.load).all()
     if case.schema_ != "ded-bench/case/1":
         assert (problems.load[~moved] * case.load_nominal >= 0).all()
-
-
-def test_elimination_of_a_ring_makes_its_mesh_lines() -> None:
-    """Four buses in a ring, one kept: each elimination leaves a smaller ring, and no line twice."""
-    ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [0, 1]])  # two lines in parallel
-    plan = plan_elimination(ends, 4, [3])
-    assert set(plan.buses.tolist()) == {0, 1, 2}
-    edges = [
-        {bus, int(other)}
-        for bus, first, last in zip(plan.buses.tolist(), plan.first[:-1], plan.first[1:], strict=True)
-        for other in plan.neighbours[first:last]
-    ]
-    assert len(edges) == len({frozenset(edge) for edge in edges}) == 5  # four of the ring and one mesh line
-    assert [edges[e] for e in plan.of_line] == [set(line) for line in ends.tolist()]
 
 
 @pytest.mark.parametrize("name", GRIDS)
@@ -133,31 +118,6 @@ def test_first_schedules_follow_a_dispatch_within_ramps(name: str) -> None:
     np.testing.assert_array_equal(start.schedule[:, 0], problems.p_initial)
     assert (np.abs(np.diff(start.schedule, axis=1)) <= grid.ramp + 1e-12).all()
     assert ((start.schedule >= case.p_min) & (start.schedule <= case.p_max))[:, 1:].all()
-
-
-def test_iterations_by_size_and_bound() -> None:
-    """Fewer on large grids, and where the bound is loose."""
-    found = {}
-    for name in ("9bus", "39bus"):
-        case = Case.load(name)
-        grid = modal_grid(case)
-        for regime in case.regimes:
-            grid.bound = case.omega_bound(regime)
-            found[name, regime] = iterations_of(grid)
-    assert found["39bus", "TO"] == TIGHT[0] > found["39bus", "NO"] == LOOSE[0]
-    assert found["9bus", "TO"] == TIGHT[1] // 2 > found["9bus", "NO"] == LOOSE[1] // 2
-
-
-def test_trajectory_is_averaged_before_the_network_is_asked(ninebus: Case) -> None:
-    """A fast swing leaves no trace at the knots."""
-    grid = modal_grid(ninebus, 60.0)
-    start, linear = started(grid, 2)
-    x = grid.respond(start.schedule, start, linear)[0]
-    k = np.arange(x.shape[1])
-    swing = 0.01 * np.cos(np.pi * k / POINTS * 2)[None, :, None]
-    swing[:, [0, -1]] = 0.0
-    calm, swung = grid.along(start, x), grid.along(start, x + swing)
-    np.testing.assert_allclose(swung.offset[:, POINTS:-POINTS], calm.offset[:, POINTS:-POINTS], atol=3e-3)
 
 
 @pytest.mark.parametrize("far", [np.inf, np.nan, 1e300])

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
-from ded_bench.methods.dpc import training
 from ded_bench.methods.dpc.channels import Channels, Response, n_channels
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.refinement import coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.training import SPACING_S, Pool, RolloutLoss
+from ded_bench.methods.dpc.training import SPACING_S
 from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, LoadPoints
-from ded_bench.problem.schedule import Schedule
-from ded_bench.surrogates.condensed import CondensedRollout, free_response
+from ded_bench.surrogates.condensed import free_response
 from ded_bench.surrogates.linear import linear_model
-from tests.methods.policies import random_policy, short_instances, staged_network
+from tests.methods.policies import short_instances, staged_network
 
 HORIZON = 4.0
 
@@ -116,35 +112,6 @@ def test_the_response_is_the_linear_models(case: Case) -> None:
         assert np.ptp(outputs, axis=0).min() > 1e-2
 
 
-def test_angles_off_equilibrium_enter_the_response(case: Case, quiet_instance) -> None:
-    """Released a little off the nominal equilibrium, the true grid swings as the response says."""
-    knots = case.knot_times(HORIZON)
-    network = Network(case)
-    angles = network.power_flow(case.p_nominal, case.load_nominal)[network.generators]
-    power = dict(zip(case.generators, case.p_nominal.tolist(), strict=True))
-    initial = {"power": power, "omega": dict.fromkeys(case.generators, 0.0)}
-    theta = dict(zip(case.generators, (angles + 1e-4).tolist(), strict=True))
-    changes = {"schema": "ded-bench/instance/2", "initial": initial | {"theta": theta}, "horizon_s": HORIZON}
-    instance = quiet_instance(case, **changes)
-    inputs, response = StackedInstances.of(case, [instance]), response_of(case)
-    n_gen = len(case.generators)
-    np.testing.assert_allclose(inputs.delta, 1e-4, rtol=1e-6)
-    p_gen = np.tile(case.p_nominal, (1, case.n_knots, 1))
-    seen = response(Channels.of(case, inputs, response).free_response, p_gen)[0, :, :n_gen]
-    run = simulate(case, instance, Schedule(knots, p_gen[0]))
-    true = np.stack([np.interp(knots, instance.grid, column) for column in run.omega.T], axis=1)
-    peak = np.abs(true).max()
-    assert peak > 1e-5
-    np.testing.assert_allclose(seen, true, atol=0.02 * peak)
-    at_rest = quiet_instance(case, horizon_s=HORIZON)
-    assert not StackedInstances.of(case, [at_rest]).delta.any()
-    model, stride = linear_model(case), 10
-    free = coarse_free_response(network, model, inputs, instance.grid, stride)
-    p_load = instance.p_load(case)[None]
-    expected = free_response(model, model.initial(network, [instance]), p_load, stride)
-    np.testing.assert_allclose(free, expected, atol=1e-7)
-
-
 def test_a_ramp_and_its_points_are_the_same_load(case: Case) -> None:
     """Every kind of load path gives the same channels, however its segments are written down."""
     ramps = some_instances(case, 4)
@@ -169,7 +136,6 @@ def test_a_ramp_and_its_points_are_the_same_load(case: Case) -> None:
 
 
 def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
-    knots = case.knot_times(HORIZON)
     model, instances = linear_model(case), some_instances(case, 3)
     network, grid = Network(case), instances[0].grid
     inputs = StackedInstances.of(case, instances)
@@ -179,54 +145,3 @@ def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
     fine = free_response(model, model.initial(network, instances), p_load)
     coarse = coarse_free_response(network, model, inputs, grid, stride)
     np.testing.assert_allclose(coarse, fine[:, :, ::stride], atol=1e-6)
-
-    p_gen = torch.as_tensor(random_policy("ded-dpc", case, horizon=HORIZON).powers(inputs))
-    cost = torch.as_tensor(inputs.cost)
-    values = []
-    for step, free in ((1, fine), (stride, fine[:, :, ::stride])):
-        loss = RolloutLoss(CondensedRollout.make(case, model, grid, knots, step), 1.0, "cpu", torch.float64)
-        omega, p_slack = loss.rollout(torch.as_tensor(free.copy()), p_gen)
-        values.append((loss.cost(p_gen, p_slack, cost), omega.abs().amax(dim=(1, 2))))
-    torch.testing.assert_close(values[0][0], values[1][0], rtol=1e-3, atol=0.0)
-    torch.testing.assert_close(values[0][1], values[1][1], rtol=1e-2, atol=0.0)
-    # the fine cost is the sum that the scorer takes
-    powers = np.stack([np.interp(grid, knots, p_gen[0, :, g]) for g in range(p_gen.shape[2])], axis=1)
-    one = RolloutLoss(CondensedRollout.make(case, model, grid, knots), 1.0, "cpu", torch.float64)
-    _, slack = one.rollout(torch.as_tensor(fine[:1].copy()), p_gen[:1])
-    total = (powers @ inputs.cost[0, 1:]).sum() + inputs.cost[0, 0] * np.abs(slack.numpy()).sum()
-    assert float(values[0][0][0]) == pytest.approx(total, rel=1e-12)
-
-
-def test_gradient_of_the_loss_matches_finite_differences(threebus: Case) -> None:
-    model, instances = linear_model(threebus), some_instances(threebus, 3)
-    inputs, grid = StackedInstances.of(threebus, instances), instances[0].grid
-    pool = Pool.of(channels_of(threebus, inputs), inputs, model, Network(threebus), grid)
-    pool = Pool(*(getattr(pool, name).double() for name in pool.__dataclass_fields__))
-    condensed = CondensedRollout.make(threebus, model, grid, threebus.knot_times(HORIZON), 10)
-    loss = RolloutLoss(condensed, 1e-3, "cpu", torch.float64)
-    network = staged_network(threebus, 0.003, HORIZON).double()
-    network.step.fill_(1.0)
-    for limit in (network.low.sub_, network.high.add_):  # clipping is tested apart
-        limit(5.0)
-
-    def total() -> torch.Tensor:
-        cost, excess = loss(loss.powers(network, pool), pool, 0.03)
-        return cost.sum() + training._penalty(excess).sum()
-
-    total().backward()
-    first, second = network.stages
-    for weight, index in (
-        (second.last.bias, (0,)),
-        (first.mix[2].bias, (3,)),
-        (first.last.bias, (0,)),
-        (second.embed[2].bias, (40,)),
-    ):
-        with torch.no_grad():
-            weight[index] += 1e-6
-            above = total()
-            weight[index] -= 2e-6
-            below = total()
-            weight[index] += 1e-6
-        numeric = float(above - below) / 2e-6
-        assert abs(numeric) > 1e-3
-        assert float(weight.grad[index]) == pytest.approx(numeric, rel=1e-3)

@@ -34,7 +34,7 @@ def static_schedules(case: Case, count: int) -> tuple[list[Instance], StackedIns
 
 def refiner_of(case: Case, instance: Instance) -> Refiner:
     knots = case.knot_times(instance.horizon_s)
-    return Refiner.make(case, linear_model(case), tightest(case), instance.grid, knots)
+    return Refiner(case, linear_model(case), tightest(case), instance.grid, knots)
 
 
 def optimum(case: Case, regime: str, instance: Instance) -> float:
@@ -80,7 +80,7 @@ def condensed_cost(refiner: Refiner, instances: list[Instance], p_gen: np.ndarra
     free = coarse_free_response(refiner.network, refiner.model, inputs, refiner.grid, refiner.stride)
     knots = case.knot_times(refiner.grid[-1])
     condensed = CondensedRollout.make(case, refiner.model, refiner.grid, knots, refiner.stride)
-    p_slack = free[:, n_gen] + condensed.apply(p_gen)[:, n_gen]
+    p_slack = free[:, n_gen] + p_gen.reshape(len(p_gen), -1) @ condensed.gamma[n_gen].T
     generators = (np.einsum("bkg,k->bg", p_gen, condensed.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
     return generators + inputs.cost[:, 0] * (np.abs(p_slack) @ condensed.quadrature_weights)
 

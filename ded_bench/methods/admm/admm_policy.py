@@ -17,7 +17,6 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
 from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import Problems
-from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Settings, Solver
@@ -28,8 +27,6 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
 VERSION = 1
-#: Instances answered at a time.
-CHUNK = 50
 #: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
 #: linearised grid errs (docs/model.md).
 MARGIN = 0.01
@@ -70,8 +67,7 @@ class AdmmPolicy(TrainedPolicy):
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
-        parts = (instances[i : i + CHUNK] for i in range(0, len(instances), CHUNK))
-        return np.concatenate([self.powers(self.problems(part)) for part in parts])
+        return self.powers(self.problems(instances))
 
     def problems(self, instances: Sequence[Instance]) -> Problems:
         """Instances as arrays; InputError if the policy is not for them, or they cannot be served."""
@@ -109,9 +105,7 @@ class AdmmPolicy(TrainedPolicy):
         return weight_shapes()
 
 
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The policy that `prepare` would use."""
-    return (AdmmPolicy.artifact(case, regime, settings),)
+artifacts = AdmmPolicy.artifacts
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.admm.admm_inference import weight_shapes
-from ded_bench.methods.admm.admm_kernels import PRICE
+from ded_bench.methods.admm.admm_inference import PRICE, weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, Start
 from ded_bench.methods.admm.problems import Problems, draw

@@ -17,16 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.admm.dispatch_kernels import ramp_limited_schedules
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.network_kernels import (
     Lines,
     follow_trajectory,
-    modal_inputs,
     plan_elimination,
     start_angles,
 )
-from ded_bench.methods.admm.problems import POINTS, Problems, time_grid
+from ded_bench.methods.admm.problems import POINTS, Problems, ramp_limited_schedules, time_grid
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 
@@ -124,18 +122,15 @@ class ModalGrid:
             served[b] = start_angles(self.lines, self._to_slack, self.theta, wanted[b], theta[b])
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
-        n_gen = len(self.gain)
-        mean_cost, schedule = np.empty(batch), np.empty((batch, len(self.knots), n_gen))
-        ramp_limited_schedules(
+        mean_cost, schedule = ramp_limited_schedules(
             (problems.load, problems.cost, problems.p_initial),
             taken,
             (self.compliance, self.stiffness),
             (self.case.p_min, self.case.p_max, self.ramp),
             FIRST_RATE * self.bound * self.spacing,
-            mean_cost,
-            schedule,
+            len(self.knots),
         )
-        scale = np.maximum(mean_cost, SMALLEST_COST * max(1.0, n_gen / 2))
+        scale = np.maximum(mean_cost, SMALLEST_COST * max(1.0, len(self.gain) / 2))
         return Start(problems, served, theta, state, taken, scale, schedule)
 
     def along_first(self, start: Start) -> ModalLinearisation:
@@ -177,11 +172,13 @@ class ModalGrid:
             f[bad], stiffness[bad] = problems.p_initial[bad][:, None], self.stiffness
             slow = np.where(bad[:, None, None], 0.0, slow)
         change = stiffness - self.stiffness
-        offset, modal = np.empty((batch, len(self.points), n_gen)), np.empty_like(change)
-        slack = np.empty(offset.shape[:2])
-        constants = self.stiffness, self.between, self.gain, self.shape
-        modal_inputs(slow, f, change, start.taken, problems.load, constants, offset, modal, slack)
-        return ModalLinearisation(offset, modal, slack, change)
+        rest = f - slow @ self.stiffness
+        for s, shares in enumerate(self.between[::points].T):
+            rest -= shares[:, None] * (slow @ change[:, s])
+        whole = start.taken + linear_between(rest - start.taken[:, ::points], points)
+        modal = self.gain.T @ change @ self.shape.T
+        slack = -(whole.sum(axis=2) + problems.load.sum(axis=2))
+        return ModalLinearisation(-(whole @ self.gain), modal, slack, change)
 
     def respond(self, powers: Array, start: Start, linear: ModalLinearisation) -> tuple[Array, Array, Array]:
         """What the linearised grid does under powers at the knots, (batch, n_knots, n_gen), pu.

@@ -1,4 +1,4 @@
-"""The network along a trajectory, compiled: power flow, electrical power, stiffness, inputs of the modes.
+"""The network along a trajectory, compiled: power flow, electrical power, stiffness.
 
 Power flow and Kron reduction eliminate buses. A bus whose lines have weights w_i is a star; without it there
 is a mesh of lines of weights w_i w_j / Σ w. Buses of few lines go first (minimum degree), so that networks of
@@ -305,56 +305,3 @@ def _reduce(
                     h = own[plan.neighbours[other]]
                     if h >= 0:
                         stiffness[g, h] -= share * weights[other]
-
-
-@compiled
-def modal_inputs(
-    x: Array,
-    f: Array,
-    change: Array,
-    taken: Array,
-    load: Array,
-    constants: tuple[Array, Array, Array, Array],
-    offset: Array,
-    modal: Array,
-    slack: Array,
-) -> None:
-    """What is not P in the modes' inputs, once the power flow along the trajectories is known.
-
-    What f says that neither S nor ΔS do is linear between two power flows.
-
-    Args:
-        x: angles of the trajectory at the power flows, (batch, n_flows, n_gen), rad.
-        f: electrical powers there, likewise, pu.
-        change: ΔS, (batch, n_stiffness, n_gen, n_gen), pu/rad.
-        taken: T (L - L_0) on the time grid, (batch, n_points, n_gen), pu.
-        load: there, (batch, n_points, n_load), pu.
-        constants: S (n_gen, n_gen), pu/rad, linear interpolation of ΔS on the time grid
-            (n_points, n_stiffness), `gain` and `shape` of `ModalGrid`.
-        offset: receives the inputs, (batch, n_points, n_modes).
-        modal: receives ΔS of the modes, (batch, n_stiffness, n_modes, n_modes), 1/s².
-        slack: receives P_s at x = 0, (batch, n_points), pu.
-    """
-    stiffness, between, gain, shape = constants
-    n_flows, n_points = x.shape[1], taken.shape[1]
-    points = (n_points - 1) // (n_flows - 1)
-    for b in range(len(x)):
-        rest, whole = f[b] - np.dot(x[b], stiffness), taken[b].copy()
-        for s in range(len(change[b])):
-            moved = np.dot(x[b], change[b, s])
-            for k in range(n_flows):
-                rest[k] -= between[k * points, s] * moved[k]
-            modal[b, s] = np.dot(np.dot(gain.T, change[b, s]), shape.T)
-        for k in range(n_flows):
-            rest[k] -= taken[b, k * points]
-        for k in range(n_points):
-            flow = min(k // points, n_flows - 2)
-            later = (k - flow * points) / points
-            total = 0.0
-            for g in range(whole.shape[1]):
-                whole[k, g] += (1.0 - later) * rest[flow, g] + later * rest[flow + 1, g]
-                total += whole[k, g]
-            for i in range(load.shape[2]):
-                total += load[b, k, i]
-            slack[b, k] = -total
-        offset[b] = -np.dot(whole, gain)

@@ -1,4 +1,4 @@
-"""Problems on the time grid: of instances, and drawn for training without files.
+"""Problems on the time grid: of instances, and drawn for training without files; their first schedules.
 
 Those drawn are of the benchmark's kind, or like those of a closed loop.
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
@@ -55,13 +56,6 @@ class Problems:
 def time_grid(knots: Array) -> Array:
     """The knots and equidistant points between them, (n_points,), s."""
     return np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
-
-
-def sampled(segments: Array, points: Array) -> Array:
-    """Loads on a time grid, (batch, n_points, n_load), pu; see `load_segments`."""
-    values = np.empty((len(segments), len(points), segments.shape[1]))
-    sample_loads(segments, float(points[1]), values)
-    return values
 
 
 def draw(case: Case, bound: float, points: Array, count: int, generator: np.random.Generator) -> Problems:
@@ -137,14 +131,17 @@ def _uniform(generator: np.random.Generator, ends: tuple[float, float], shape: t
 
 
 @compiled
-def sample_loads(segments: Array, spacing: float, values: Array) -> None:
-    """Loads on the time grid; around a kink as means weighted by hat functions, which keep the area.
+def sampled(segments: Array, points: Array) -> Array:
+    """Loads on a time grid; around a kink as means weighted by hat functions, which keep the area.
 
     Args:
         segments: see `load_segments`, (batch, n_load, n_segments, 3).
-        spacing: of the time grid, s.
-        values: receives the loads, (batch, n_points, n_load), pu.
+        points: the time grid, (n_points,), s.
+
+    Returns:
+        Shape (batch, n_points, n_load), pu.
     """
+    spacing, values = points[1], np.empty((len(segments), len(points), segments.shape[1]))
     for b in range(len(values)):
         for i in range(values.shape[2]):
             path, last = segments[b, i], len(segments[b, i]) - 1
@@ -160,3 +157,68 @@ def sample_loads(segments: Array, spacing: float, values: Array) -> None:
                     u = (k * spacing - start) / spacing
                     mean = (max(u + 1.0, 0.0) ** 3 - 2.0 * max(u, 0.0) ** 3) / 6.0
                     values[b, k, i] += bend * spacing * (mean - max(u, 0.0))
+    return values
+
+
+@compiled
+def ramp_limited_schedules(
+    problem: tuple[Array, Array, Array],
+    taken: Array,
+    grid: tuple[Array, Array],
+    limits: tuple[Array, Array, Array],
+    rate: float,
+    n: int,
+) -> tuple[Array, Array]:
+    """Schedules whose steady angles go to those of the ramp-limited dispatch, at a limited rate.
+
+    That dispatch is a merit order at every knot, as in `problem.dispatch`, with powers no farther from those
+    of the knot before than ramps allow: while a cheap generator rises, a dearer one delivers the rest.
+
+    Args:
+        problem: loads at the grid points (batch, n_points, n_load), pu; costs of slack and generators
+            (batch, 1 + n_gen); P_0 (batch, n_gen), pu.
+        taken: T (L - L_0) at the grid points, (batch, n_points, n_gen), pu.
+        grid: inverse of the stiffness, and the stiffness, (n_gen, n_gen), rad/pu and pu/rad.
+        limits: of powers, from below and above, and of their change between two knots, (n_gen,), pu.
+        rate: most that an angle moves between two knots, rad.
+        n: how many knots there are.
+
+    Returns:
+        Mean cost of the dispatch over the knots, (batch,), and the schedules, (batch, n, n_gen), pu.
+    """
+    (load, cost, p_initial), (compliance, stiffness), (low, high, step) = problem, grid, limits
+    batch, n_gen = p_initial.shape
+    mean_cost, start = np.empty(batch), np.empty((batch, n, n_gen))
+    points = (load.shape[1] - 1) // (n - 1)  # of the time grid, from one knot to the next
+    least, room, dispatch = np.empty(n_gen), np.empty(n_gen), np.empty(n_gen)
+    for b in range(batch):
+        order, angles = np.argsort(cost[b, 1:], kind="mergesort"), np.empty((n, n_gen))
+        mean_cost[b] = 0.0
+        dispatch[:] = p_initial[b]
+        for j in range(n):
+            reach = 0.0 if j == 0 else 1.0
+            demand = -load[b, j * points].sum()
+            for g in range(n_gen):
+                least[g] = max(low[g], dispatch[g] - reach * step[g])
+                room[g] = min(high[g], dispatch[g] + reach * step[g]) - least[g]
+                demand -= least[g]
+            price = 0.0
+            for g in order:
+                raised = min(max(demand, 0.0), room[g]) if cost[b, 1 + g] < cost[b, 0] else 0.0
+                demand -= raised
+                dispatch[g] = least[g] + raised
+                price += cost[b, 1 + g] * dispatch[g]
+                angles[j, g] = dispatch[g] - p_initial[b, g] - taken[b, j * points, g]
+            mean_cost[b] += (price + cost[b, 0] * abs(demand)) / n
+        angles = np.dot(angles, compliance)
+        angles[0] = 0.0
+        for j in range(1, n):
+            for g in range(n_gen):
+                angles[j, g] = min(max(angles[j, g], angles[j - 1, g] - rate), angles[j - 1, g] + rate)
+        powers = np.dot(angles, stiffness)
+        start[b, 0] = p_initial[b]
+        for j in range(1, n):
+            for g in range(n_gen):
+                start[b, j, g] = powers[j, g] + p_initial[b, g] + taken[b, j * points, g]
+    track(start, low, high, step)
+    return mean_cost, start

@@ -10,20 +10,20 @@ import torch
 from torch import Tensor, nn
 
 from ded_bench.methods.admm.admm_inference import (
+    DOUBLING,
     MOST,
     PENALTIES,
     SETTINGS,
+    STRAIGHT,
     between_nodes,
     limits_of,
     mean_modes_of,
     starting_settings,
     weight_shapes,
 )
-from ded_bench.methods.admm.admm_kernels import DOUBLING, STRAIGHT
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start, linear_between
-from ded_bench.methods.admm.modal_kernels import swing, swing_adjoint
+from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, modal_products, swing, swing_adjoint
 from ded_bench.methods.admm.problems import POINTS
-from ded_bench.methods.admm.quadratic_kernels import modal_change, modal_products
 from ded_bench.methods.torch_follower import follow_within
 from ded_bench.problem.case import Array
 
@@ -185,7 +185,7 @@ class ModalChange(torch.autograd.Function):
     """Change of powers that minimises the quadratic model of an iteration."""
 
     @staticmethod
-    def forward(ctx: Any, gradient: Tensor, weights: Tensor, modes: tuple[Array, Array, Array]) -> Tensor:
+    def forward(ctx: Any, gradient: Tensor, weights: Tensor, modes: MeanModes) -> Tensor:
         """See `modal_change`; gradient (batch, n_knots, n_gen), weights (4,), modes of `mean_modes_of`."""
         ctx.modes, ctx.weights = modes, _double(weights)
         ctx.change = _changes(_double(gradient), ctx.weights, modes)
@@ -221,7 +221,7 @@ def _transposed(grid: ModalGrid, linear: ModalLinearisation, on_omega: Array, on
     return np.asarray(found @ grid.gain.T)
 
 
-def _changes(gradient: Array, weights: Array, modes: tuple[Array, Array, Array]) -> Array:
+def _changes(gradient: Array, weights: Array, modes: MeanModes) -> Array:
     """`modal_change` of a batch, in powers."""
     into, maps, outputs = modes
     found = np.empty_like(gradient)

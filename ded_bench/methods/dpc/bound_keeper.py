@@ -8,7 +8,6 @@ so that bounds, ramps and P_0 hold after any number of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,37 +42,29 @@ class OmegaModel(NamedTuple):
     of_load: Array  # (n_psi, n_load), likewise
 
 
-@dataclass(frozen=True, eq=False)
 class BoundKeeper:
     """Changes schedules that would take |ω| beyond its bound."""
 
-    case: Case
-    model: OmegaModel
-    spacing_s: float  # of the points
-    limit: Array  # of |ω| at the points, (n_points,), rad/s
-    of_power: Array  # ω at the points by powers at the knots, (n_gen, n_points, n_knots, n_gen), rad/s per pu
-    damping: float  # of steps, (rad/s per pu)²
-    step: Array  # largest change of power between two knots, (n_gen,), pu
-
-    @staticmethod
-    def make(case: Case, regime: str, knots: Array) -> BoundKeeper:
+    def __init__(self, case: Case, regime: str, knots: Array) -> None:
         """Condense the linearisation at the nominal point; knots are equidistant."""
         n_gen = len(case.generators)
         points = np.linspace(knots[0], knots[-1], PARTS * (len(knots) - 1) + 1)
-        linear = linear_model(case, float(points[1]))
+        self.case, self.spacing_s = case, float(points[1])
+        linear = linear_model(case, self.spacing_s)
         of_change = linear.g - linear.b
-        model = OmegaModel(
+        self.model = OmegaModel(
             linear.k,
             np.ascontiguousarray(linear.lift[:, len(case.buses) + Network(case).generators]),
             np.ascontiguousarray(of_change[:, :n_gen]),
             np.ascontiguousarray(of_change[:, n_gen:]),
         )
+        #: Of |ω| at the points, (n_points,), rad/s.
+        self.limit = case.omega_bound(regime) * (1.0 - MARGIN * np.minimum(points / knots[1], 1.0))
         gamma = CondensedRollout.make(case, linear, points, knots).gamma[:n_gen]
-        of_power = gamma.reshape(n_gen, len(points), len(knots), n_gen)
-        limit = case.omega_bound(regime) * (1.0 - MARGIN * np.minimum(points / knots[1], 1.0))
-        damping = DAMPING * float((of_power[:, :, 1:] ** 2).sum(axis=(2, 3)).max())
-        step = case.ramp * (knots[1] - knots[0])
-        return BoundKeeper(case, model, float(points[1]), limit, of_power, damping, step)
+        #: ω at the points by powers at the knots, (n_gen, n_points, n_knots, n_gen), rad/s per pu.
+        self.of_power = gamma.reshape(n_gen, len(points), len(knots), n_gen)
+        self.damping = DAMPING * float((self.of_power[:, :, 1:] ** 2).sum(axis=(2, 3)).max())
+        self.step = case.ramp * (knots[1] - knots[0])  # largest change between two knots, (n_gen,), pu
 
     def __call__(self, inputs: StackedInstances, p_gen: Array) -> Array:
         """Schedules that keep the bound, as far as the linearised grid tells and the limits let them.

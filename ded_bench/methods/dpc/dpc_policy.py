@@ -29,8 +29,6 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import find_model
 
 VERSION = 1
-#: Instances answered at a time.
-CHUNK = 50
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class DispatchPolicy(TrainedPolicy):
 
     @functools.cached_property
     def _keeper(self) -> BoundKeeper:
-        return BoundKeeper.make(self.scope.case, self.scope.regime, self.knots)
+        return BoundKeeper(self.scope.case, self.scope.regime, self.knots)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
@@ -64,8 +62,7 @@ class DispatchPolicy(TrainedPolicy):
 
     def powers(self, inputs: StackedInstances) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
-        parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
-        return np.concatenate([self._keeper(part, self.network_powers(part)) for part in parts])
+        return self._keeper(inputs, self.network_powers(inputs))
 
     def network_powers(self, inputs: StackedInstances) -> Array:
         """What the network alone answers, as `powers`."""
@@ -91,9 +88,9 @@ class DispatchPolicy(TrainedPolicy):
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The policy that `prepare` would use, and the model of the steps that refine its answers."""
-    policy = DispatchPolicy.artifact(case, regime, settings)
+    found = DispatchPolicy.artifacts(case, regime, settings)
     refined = read_options(Options, settings.options).refine > 0
-    return (policy, model_artifact(case, settings, DEFAULT_MODEL)) if refined else (policy,)
+    return (*found, model_artifact(case, settings)) if refined else found
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -113,7 +110,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         policy.scope.check([instance])
         grid = instance.dt_s, instance.steps
         if grid not in refiners:
-            refiners[grid] = Refiner.make(case, model, regime, instance.grid, policy.knots)
+            refiners[grid] = Refiner(case, model, regime, instance.grid, policy.knots)
         inputs = StackedInstances.of(case, [instance])
         return Schedule(policy.knots, refiners[grid](inputs, policy.powers(inputs), steps)[0])
 

@@ -12,7 +12,6 @@ answer passes through the follower, so that bounds, ramps and P_0 hold after any
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,70 +36,44 @@ MARGIN = 0.01
 EXCESS_PRICE = 1.0
 
 
-@dataclass(frozen=True, eq=False)
 class Refiner:
     """The condensed problem of a case, regime and time grid, factorised."""
 
-    case: Case
-    network: Network
-    model: Koopman
-    grid: Array
-    stride: int
-    step: Array  # largest change between two knots, (n_gen,), pu
-    n_slack: int  # rows of y that are P_s
-    rows: Array32  # A, each row weighted, (n_rows, n_knots n_gen)
-    solve: Array32  # (AᵀA)⁻¹ for the knots after the first
-    low: Array32  # limits of the other rows, (n_rows - n_slack,)
-    high: Array32
-    hat_weights: Array  # see `CondensedRollout`, as the next
-    quadrature_weights: Array
-    omega_bound: float
-
-    @staticmethod
-    def make(case: Case, model: Koopman, regime: str, grid: Array, knots: Array) -> Refiner:
+    def __init__(self, case: Case, model: Koopman, regime: str, grid: Array, knots: Array) -> None:
         """Condense and factorise."""
+        self.case, self.network, self.model, self.grid = case, Network(case), model, grid
         n_gen, n_knots = len(case.generators), len(knots)
-        stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
-        condensed = CondensedRollout.make(case, model, grid, knots, stride)
+        self.stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
+        condensed = CondensedRollout.make(case, model, grid, knots, self.stride)
         gamma = condensed.gamma
+        self.hat_weights, self.quadrature_weights = condensed.hat_weights, condensed.quadrature_weights
         root = {name: math.sqrt(value) for name, value in WEIGHTS.items()}
-        bound, step = case.omega_bound(regime), case.ramp * (knots[1] - knots[0])
+        self.omega_bound = case.omega_bound(regime)
+        self.step = case.ramp * (knots[1] - knots[0])  # largest change between two knots, (n_gen,), pu
+        self.n_slack, n_free = gamma.shape[1], (n_knots - 1) * n_gen  # rows of y that are P_s; free powers
         unit = np.eye(n_knots * n_gen)
         rows = np.concatenate(
             [
                 gamma[n_gen] * root["p_slack"],
-                gamma[:n_gen].reshape(-1, n_knots * n_gen) / bound * root["omega"],
+                gamma[:n_gen].reshape(-1, n_knots * n_gen) / self.omega_bound * root["omega"],
                 (unit[n_gen:] - unit[:-n_gen]) * root["ramp"],
                 unit[n_gen:] * root["power"],
             ]
         )
-        n_coarse, n_free = gamma.shape[1], (n_knots - 1) * n_gen
+        free = rows[:, n_gen:]
+        self.rows = rows.astype(np.float32)  # A, each row weighted, (n_rows, n_knots n_gen)
+        self.solve = np.linalg.inv(free.T @ free).astype(np.float32)  # for the knots after the first
         high = np.concatenate(
             [
-                np.full(n_gen * n_coarse, (1.0 - MARGIN) * root["omega"]),
-                np.tile(step, n_knots - 1) * root["ramp"],
+                np.full(n_gen * self.n_slack, (1.0 - MARGIN) * root["omega"]),
+                np.tile(self.step, n_knots - 1) * root["ramp"],
                 np.tile(case.p_max, n_knots - 1) * root["power"],
             ]
         )
         low = -high
         low[-n_free:] = np.tile(case.p_min, n_knots - 1) * root["power"]
-        free = rows[:, n_gen:]
-        return Refiner(
-            case,
-            Network(case),
-            model,
-            grid,
-            stride,
-            step,
-            n_coarse,
-            rows.astype(np.float32),
-            np.linalg.inv(free.T @ free).astype(np.float32),
-            low.astype(np.float32),
-            high.astype(np.float32),
-            condensed.hat_weights,
-            condensed.quadrature_weights,
-            bound,
-        )
+        #: Limits of the other rows, (n_rows - n_slack,).
+        self.low, self.high = low.astype(np.float32), high.astype(np.float32)
 
     def __call__(self, inputs: StackedInstances, p_gen: Array, steps: int) -> Array:
         """Improve schedules.

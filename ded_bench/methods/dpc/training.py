@@ -93,13 +93,11 @@ class Pool:
 class RolloutLoss:
     """Relative cost and frequency excess of schedules, by a surrogate on the coarse points."""
 
-    def __init__(
-        self, condensed: CondensedRollout, omega_bound: float, device: str, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, condensed: CondensedRollout, omega_bound: float, device: str) -> None:
         gamma = condensed.gamma.reshape(-1, condensed.gamma.shape[2])
         arrays = gamma, condensed.hat_weights, condensed.quadrature_weights
         self.gamma, self.hat_weights, self.quadrature_weights = (
-            torch.as_tensor(array, dtype=dtype).to(device) for array in arrays
+            torch.as_tensor(array, dtype=torch.float32).to(device) for array in arrays
         )
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
         self.spacing_s = condensed.stride * condensed.model.dt_s
@@ -111,25 +109,12 @@ class RolloutLoss:
 
     def __call__(self, powers: Tensor, pool: Pool, margin: float = 0.0) -> tuple[Tensor, Tensor]:
         """Cost relative to the scale, (batch,), and relative excess of |ω|, (batch, n_gen, n_coarse)."""
-        omega, p_slack = self.rollout(pool.coarse_free_response, powers)
-        cost = self.cost(powers, p_slack, pool.cost) / pool.scale
-        return cost, (omega.abs() / self.omega_bound - (1.0 - margin)).relu()
-
-    def rollout(self, free: Tensor, p_gen: Tensor) -> tuple[Tensor, Tensor]:
-        """ω (batch, n_gen, n_coarse), rad/s, and P_s (batch, n_coarse), pu, under powers at the knots."""
-        out = free + (p_gen.flatten(1) @ self.gamma.T).view_as(free)
-        return out[:, : self.n_gen], out[:, self.n_gen]
-
-    def cost(self, p_gen: Tensor, p_slack: Tensor, cost: Tensor) -> Tensor:
-        """Σ_k Σ_i c_i P_i + c_s |P_s| over the whole grid, shape (batch,).
-
-        Args:
-            p_gen: at the knots, (batch, n_knots, n_gen), pu.
-            p_slack: at the coarse points, (batch, n_coarse), pu.
-            cost: (slack, generators), (batch, 1 + n_gen).
-        """
-        generators = (torch.einsum("bkg,k->bg", p_gen, self.hat_weights) * cost[:, 1:]).sum(dim=1)
-        return generators + cost[:, 0] * (p_slack.abs() @ self.quadrature_weights)
+        free = pool.coarse_free_response
+        out = free + (powers.flatten(1) @ self.gamma.T).view_as(free)
+        omega, p_slack = out[:, : self.n_gen], out[:, self.n_gen]
+        generators = (torch.einsum("bkg,k->bg", powers, self.hat_weights) * pool.cost[:, 1:]).sum(dim=1)
+        cost = generators + pool.cost[:, 0] * (p_slack.abs() @ self.quadrature_weights)
+        return cost / pool.scale, (omega.abs() / self.omega_bound - (1.0 - margin)).relu()
 
 
 @repeatable()

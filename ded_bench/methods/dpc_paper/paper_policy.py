@@ -1,4 +1,8 @@
-"""DED-DPC with the paper's policy (`ded-dpc-paper`): a network that answers with powers at the knots."""
+"""DED-DPC with the paper's policy (`ded-dpc-paper`): a network that answers with powers at the knots.
+
+It sees ζ = (loads, c, x_0, P_0) of an instance. Answers do without torch, whose overhead would be most of
+their time.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ded_bench.methods.artifact import Artifact
-from ded_bench.methods.dpc_paper.paper_inference import NumpyPaperNetwork, channels, n_channels, weight_shapes
 from ded_bench.methods.options import NoOptions
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Settings, Solver
@@ -20,6 +23,9 @@ from ded_bench.problem.instance import Instance
 
 Options = NoOptions
 VERSION = 1
+#: Output channels of the hidden layers, and the window of each layer (paper, section on the implementation).
+FILTERS, WINDOWS = 30, (5, 10, 5)
+ZERO = np.float32(0.0)
 
 
 class PaperPolicy(TrainedPolicy):
@@ -49,9 +55,7 @@ class PaperPolicy(TrainedPolicy):
         return weight_shapes(n_channels(scope.case), len(scope.case.generators))
 
 
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The policy that `prepare` would use."""
-    return (PaperPolicy.artifact(case, regime, settings),)
+artifacts = PaperPolicy.artifacts
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -62,3 +66,81 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """
     policy = PaperPolicy.find(case, regime, settings)
     return as_solver(policy.scope, lambda instance: policy(instance)[0])
+
+
+def n_channels(case: Case) -> int:
+    """Number of channels: loads, costs with the slack's, x_0 = (θ without the slack's, P_s, ω), P_0."""
+    return len(case.loads) + (1 + len(case.generators)) + len(case.buses) + 2 * len(case.generators)
+
+
+def channels(network: Network, instances: Sequence[Instance], knots: Array) -> Array:
+    """ζ as channels over the knots, constants repeated, in the units of the files.
+
+    Args:
+        network: of the instances' case.
+        knots: times, (n_knots,), s.
+
+    Returns:
+        Shape (batch, n_channels, n_knots): pu, cost per pu, rad, pu, rad/s, pu.
+
+    Raises:
+        PowerFlowError: an instance has no angles at t = 0.
+    """
+    case = network.case
+    theta = np.stack([network.initial_angles(instance) for instance in instances])
+    constant = np.concatenate(
+        [
+            [[i.cost_slack(case), *i.cost_gen(case)] for i in instances],
+            theta[:, network.unknown],
+            network.injections(theta)[:, [network.slack]],
+            [i.omega_initial(case) for i in instances],
+            [i.p_initial(case) for i in instances],
+        ],
+        axis=1,
+    )
+    repeated = np.broadcast_to(constant[:, :, None], (*constant.shape, len(knots)))
+    p_load = np.stack([i.p_load(case, knots) for i in instances])
+    return np.concatenate([p_load.transpose(0, 2, 1), repeated], axis=1)
+
+
+def weight_shapes(n_channels: int, n_gen: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a PaperNetwork's weights, in the order of its state dict."""
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n_channels, 1), "scale": (n_channels, 1)}
+    shapes |= {"p_min": (n_gen, 1), "p_max": (n_gen, 1)}
+    sizes = (n_channels, FILTERS, FILTERS, n_gen)
+    for i, window in enumerate(WINDOWS):
+        place = f"layers.{3 * i + 1}"  # after the padding; a ReLU follows
+        shapes |= {f"{place}.weight": (sizes[i + 1], sizes[i], window), f"{place}.bias": (sizes[i + 1],)}
+    return shapes
+
+
+class NumpyPaperNetwork:
+    """The same function as a PaperNetwork with these weights (see `weight_shapes`)."""
+
+    def __init__(self, state: Mapping[str, np.ndarray]) -> None:
+        self._mean, self._scale = state["mean"], 1.0 / state["scale"]
+        self._low, self._half = state["p_min"], 0.5 * (state["p_max"] - state["p_min"])
+        weights = [value for name, value in state.items() if name.endswith(".weight")]  # (out, in, window)
+        matrices = [w.transpose(0, 2, 1).reshape(len(w), -1) for w in weights]
+        biases = [value[:, None] for name, value in state.items() if name.endswith(".bias")]
+        self._layers = list(zip(WINDOWS, matrices, biases, strict=True))
+
+    def __call__(self, channels: Array) -> Array:
+        """See `PaperNetwork.forward`."""
+        h = (channels.astype(np.float32) - self._mean) * self._scale
+        for i, (window, weight, bias) in enumerate(self._layers):
+            if i:
+                np.maximum(h, ZERO, out=h)
+            h = np.matmul(weight, _windows(h, window))
+            h += bias
+        np.tanh(h, out=h)
+        h += 1.0
+        power = self._low + self._half * h
+        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
+
+
+def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
+    n, before = x.shape[2], (window - 1) // 2
+    padded = np.pad(x, ((0, 0), (0, 0), (before, window - 1 - before)))
+    return np.concatenate([padded[:, :, i : i + n] for i in range(window)], axis=1)

@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ded_bench.methods.dpc_paper.paper_inference import FILTERS, WINDOWS, channels, n_channels
-from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy
+from ded_bench.methods.dpc_paper.paper_policy import FILTERS, WINDOWS, PaperPolicy, channels, n_channels
 from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, repeatable

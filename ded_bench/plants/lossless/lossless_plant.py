@@ -6,6 +6,7 @@ is missing. See `network` for the equations.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -139,6 +140,9 @@ class LosslessPlant:
         times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
         p_load = instance.p_load(case, times)
         p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+        with contextlib.suppress(PowerFlowError):  # all at once is faster, one by one tells where it fails
+            self.network.power_flow(p_gen, p_load)
+            return
         for t, gen, load in zip(times, p_gen, p_load, strict=True):
             try:
                 self.network.power_flow(gen, load)

@@ -83,9 +83,9 @@ def verdicts(
 
 def scored_row(row: Row, verdict: object) -> Row:
     """A row with the scorer's verdict filled in, or with the reason why there is none."""
-    empty = dict.fromkeys((*_SCORE, "feasible", "feasible_strict"))
-    error = "" if row.error.startswith(SCORING_FAILED) else row.error
-    return dataclasses.replace(row, **empty | {"error": error} | score_cells(verdict))
+    cells: dict[str, Any] = dict.fromkeys((*_SCORE, "feasible", "feasible_strict"))
+    cells["error"] = "" if row.error.startswith(SCORING_FAILED) else row.error
+    return dataclasses.replace(row, **cells | score_cells(verdict))
 
 
 def score_cells(verdict: object) -> dict[str, Any]:

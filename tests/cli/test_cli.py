@@ -196,7 +196,6 @@ def test_a_locale_without_arrows(tmp_path: Path) -> None:
     assert b"Optimal ? Infeasible" in done.stdout
 
 
-
 def test_only_policies_that_need_a_koopman_model_ask_for_one(
     problem: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:

@@ -150,7 +150,6 @@ class LosslessPlant:
                 raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
 
 
-
 def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hold:
     """The exact map over one grid step of (δθ, δω).
 

@@ -76,7 +76,7 @@ def verdicts(
     calls = ((score_all, (case, list(map(question, batch)))) for batch in batches)  # read as they are needed
     with tqdm(total=len(rows), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
-            found = answer if isinstance(answer, list) else [answer] * len(batch)
+            found: list[Any] = answer if isinstance(answer, list) else [answer] * len(batch)
             yield list(zip(batch, found, strict=True))
             bar.update(len(batch))
 

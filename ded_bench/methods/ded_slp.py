@@ -16,12 +16,11 @@ import numpy as np
 
 from ded_bench.methods import ed
 from ded_bench.methods.first_schedules import first_schedules
-from ded_bench.methods.knot_program import KnotProgram, Limit
+from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
 from ded_bench.methods.knots import case_knots, is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.methods.step_rules import FullSteps, StepRule, TrustRegion
 from ded_bench.plants.plant import plant_of
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices
@@ -44,16 +43,13 @@ OPEN = ACCEPTED = 2 * np.pi * 5e-7
 REFINEMENT = 0.01
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
-#: Step rules by option.
-FULL, REGION = "full", "trust-region"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Where schedules bend, and how far a program may go."""
+    """Where schedules bend."""
 
     knot_s: float | None = option(None, "distance of knots, s; none: the case's knots", lowest=1e-3)
-    steps: str = option(FULL, "full, or within a radius that shrinks", choices=(FULL, REGION))
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
@@ -92,11 +88,11 @@ class SlpSolver:
         parts = _OnPlant(self.case, instance, bound, points, deadline, soft, near is not None)
         if is_reachable(self.case, instance, points):
             start = ed.dispatch(self.case, instance, 1.0) if near is None else near
-            end = parts.run(start, self.options.steps)
+            end = parts.run(start)
         else:
             end = End(Status.INFEASIBLE, None, None, 0, "")
         status, schedule = parts.verdict(end)
-        claimed = end.answer.prediction if end.answer is not None else None
+        claimed = end.answer.solution if end.answer is not None else None
         is_given = schedule is not None and status != Status.INFEASIBLE
         return Solution(
             status=status,
@@ -127,11 +123,6 @@ class Simulated:
     cost: float
     excess: float  # of |ω| over the bound, rad/s
 
-    @property
-    def over(self) -> float:
-        """Excess beyond what is accepted, rad/s; none is zero."""
-        return max(self.excess - ACCEPTED, 0.0)
-
 
 @dataclass
 class _OnPlant:
@@ -147,19 +138,14 @@ class _OnPlant:
     limits: set[Limit] = field(default_factory=set)
     best: Simulated | None = None  # the cheapest strictly feasible one
 
-    def run(self, start: Schedule, steps: str) -> End[Simulated, Attempt]:
+    def run(self, start: Schedule) -> End[Simulated, Prediction]:
         """Go on until a simulated schedule confirms its program; P_0 replaces the start's first power."""
         wanted = start.at(self.instance.grid[self.points])
         wanted[0] = self.instance.p_initial(self.case)
-        rule: StepRule = FullSteps() if steps == FULL else TrustRegion(self.bound, self._over)
-
-        def solve(around: Simulated, number: int) -> Attempt:
-            return self._solve(around, number, rule.radius)
-
         first = first_schedules(self.case, self.instance, wanted, self.points)
-        return sequence(Parts(self._follow, solve, rule, self._is_confirmed), first, self.deadline)
+        return sequence(Parts(self._follow, self._solve, self._is_confirmed), first, self.deadline)
 
-    def verdict(self, end: End[Simulated, Attempt]) -> tuple[Status, Schedule | None]:
+    def verdict(self, end: End[Simulated, Prediction]) -> tuple[Status, Schedule | None]:
         """What to claim at the end: the confirmed schedule, the best one, or that of least excess."""
         if end.status == Status.OPTIMAL and end.followed is not None:
             return end.status, self._schedule(end.followed.at)
@@ -175,27 +161,22 @@ class _OnPlant:
     def _follow(self, p_gen: Array) -> Simulated:
         trajectory = simulate(self.case, self.instance, self._schedule(p_gen))
         cost = trajectory.cost(self.instance.cost_gen(self.case), self.instance.cost_slack(self.case))
-        found = Simulated(p_gen, trajectory, cost, self._excess(trajectory.omega))
+        # After t_0: x_0 is given, wherever it lies.
+        excess = float(np.abs(trajectory.omega[1:]).max()) - self.bound
+        found = Simulated(p_gen, trajectory, cost, excess)
         if found.excess <= ACCEPTED and (self.best is None or cost < self.best.cost):
             self.best = found
         return found
 
-    def _solve(self, around: Simulated, number: int, radius: float) -> Attempt:
+    def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
-        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model, radius)
+        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
         if self.is_near:
             self.limits |= program.near(around.trajectory.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
         return solve_with_rows_added(program, self.limits, Rows(OPEN, enough, self.soft), self.deadline)
 
-    def _is_confirmed(self, found: Simulated, attempt: Attempt) -> bool:
+    def _is_confirmed(self, found: Simulated, claimed: Prediction) -> bool:
         """Whether a schedule meets the bound and costs what its program said."""
-        claimed = attempt.prediction.objective if attempt.prediction is not None else np.inf
-        return found.excess <= ACCEPTED and abs(found.cost - claimed) <= COST_TOLERANCE * abs(found.cost)
-
-    def _excess(self, omega: Array) -> float:
-        """After t_0: x_0 is given, wherever it lies."""
-        return float(np.abs(omega[1:]).max()) - self.bound
-
-    def _over(self, omega: Array) -> float:
-        return max(self._excess(omega) - ACCEPTED, 0.0)
+        error = abs(found.cost - claimed.objective)
+        return found.excess <= ACCEPTED and error <= COST_TOLERANCE * abs(found.cost)

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.slp import Parts, sequence
-from ded_bench.methods.step_rules import FullSteps
+from ded_bench.methods.slp import Attempt, Parts, sequence
 from ded_bench.plants.lossless.network import Network, PowerFlowError
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Outcome, Status
 
@@ -43,14 +42,6 @@ class Injections:
     def predicted(self, theta: Array) -> Array:
         """f at other angles, linearly."""
         return np.asarray(self.f + np.einsum("nij,nj->ni", self.slope, theta - self.at))
-
-
-@dataclass(frozen=True, eq=False)
-class EulerAnswer(FormAnswer):
-    """The answer of the program around a trajectory."""
-
-    along: Injections
-    wanted: Array  # the generators' angles, (n, n_gen), rad
 
 
 def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injections:
@@ -137,22 +128,21 @@ class EulerPrograms:
             except PowerFlowError as error:
                 raise SimulationError(str(error)) from None
 
-        def solve(along: Injections, _: int) -> EulerAnswer:
+        def solve(along: Injections, _: int) -> Attempt[tuple[Injections, Array]]:
             found = solve_form(self._program(instance, along))
             theta = np.vstack([initial, found.x[self._theta]])
-            said = found.status, found.x, found.iterations, found.version, found.message
-            return EulerAnswer(*said, along, theta)
+            said = found.iterations, found.version, found.message
+            return Attempt(found.status, theta, (along, found.x), *said)
 
-        def is_met(now: Injections, answer: EulerAnswer) -> bool:
-            return bool(np.abs(now.f - answer.along.predicted(now.at)).max() < TOLERANCE)
+        def is_met(now: Injections, solution: tuple[Injections, Array]) -> bool:
+            return bool(np.abs(now.f - solution[0].predicted(now.at)).max() < TOLERANCE)
 
-        rule = FullSteps(most_programs=MAX_PROGRAMS, tries=1)
         deadline = started + (np.inf if time_limit_s is None else time_limit_s)
         still = np.tile(initial, (len(load), 1))
-        end = sequence(Parts(follow, solve, rule, is_met), [still], deadline)
+        end = sequence(Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1), [still], deadline)
         schedule, objective = None, None
-        if end.status == Status.OPTIMAL and end.answer and end.followed:
-            power = np.vstack([instance.p_initial(self._case), end.answer.x[self._p_gen]])
+        if end.status == Status.OPTIMAL and end.answer and end.answer.solution and end.followed:
+            power = np.vstack([instance.p_initial(self._case), end.answer.solution[1][self._p_gen]])
             schedule = Schedule(t=instance.grid, p=power)
             p_slack = np.abs(end.followed.f[:, -1])
             cost = power @ instance.cost_gen(self._case) + instance.cost_slack(self._case) * p_slack

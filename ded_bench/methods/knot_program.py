@@ -76,20 +76,13 @@ class KnotProgram:
         instance: costs and P_0.
         bound: limit of |ω|, rad/s.
         model: a linear model along a trajectory that starts at P_0.
-        radius: how far powers may differ from the trajectory's, pu.
         reserve: that programs with priced excess keep, if any.
     """
 
     def __init__(
-        self,
-        case: Case,
-        instance: Instance,
-        bound: float,
-        model: TimeVarying,
-        radius: float = np.inf,
-        reserve: Reserve | None = None,
+        self, case: Case, instance: Instance, bound: float, model: TimeVarying, reserve: Reserve | None = None
     ) -> None:
-        self.model, self.bound, self._radius, self._reserve = model, bound, radius, reserve
+        self.model, self.bound, self._reserve = model, bound, reserve
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         self.pieces = piece_starts(model.points)
@@ -229,8 +222,7 @@ class KnotProgram:
         p_min, p_max = power_limits(case, self._instance, model.lengths)
         lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
         lower[self._s] = 0.0
-        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self._radius)
-        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self._radius)
+        lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
         return FreeForm(
             cost=self._cost,
             equal=self._dynamics,

@@ -1,9 +1,9 @@
 """Sequential linear programming: one loop for every method that linearises.
 
-What an answer leads to is followed (a schedule is simulated on the case's plant); a linear program around it
-has the next answer; a step rule says how far to go there; and so on until a stop rule is content. `ded-slp`
-runs it until a simulation confirms its program; `ded-ko-knots` and `ded-rti` solve one program along one
-trajectory; `ded` with `accelerated=on` runs it on the Euler equations.
+A place is followed (a schedule is simulated on the case's plant); a linear program around what was found has
+the next place; a step goes there, or half as far where nothing can be followed; and so on until a stop rule
+is content. `ded-slp` runs it until a simulation confirms its program; `ded-ko-knots` and `ded-rti` solve one
+program along one trajectory; `ded` with `accelerated=on` runs it on the Euler equations.
 
 Here are the loop, and how programs on knots get the rows they need.
 """
@@ -13,72 +13,63 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
-from ded_bench.methods.step_rules import Followed, NoStepError, StepRule
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
 
 #: Programs on one linear model; with priced excess a rough answer will do.
 MAX_PROGRAMS, MAX_SOFT_PROGRAMS = 15, 4
+#: A sequence that is longer does not converge.
+SEQUENCE = 15
+#: A step is tried so many times, each half as long.
+TRIES = 6
 #: So many programs in a row without a solution show that there is none.
 PATIENCE = 2
 
-
-class Answer(Protocol):
-    """What a program came to."""
-
-    @property
-    def status(self) -> Status:
-        """`Infeasible` comes with the answer of least excess, all but `Optimal` with none."""
-
-    @property
-    def wanted(self) -> Array:
-        """Where to go."""
-
-    @property
-    def iterations(self) -> int:
-        """Of the solver."""
-
-    @property
-    def version(self) -> str:
-        """Of the solver."""
-
-    @property
-    def message(self) -> str:
-        """The solver's last word."""
-
-
-F = TypeVar("F", bound=Followed)
-A = TypeVar("A", bound=Answer)
+F = TypeVar("F")
+S = TypeVar("S")
 
 
 @dataclass(frozen=True, eq=False)
-class Parts(Generic[F, A]):
+class Attempt(Generic[S]):
+    """What a program came to."""
+
+    status: Status  # `Infeasible` comes with the answer of least excess, all but `Optimal` with none
+    wanted: Array | None  # where to go
+    solution: S | None
+    iterations: int
+    version: str
+    message: str  # the solver's last word
+
+
+@dataclass(frozen=True, eq=False)
+class Parts(Generic[F, S]):
     """What makes a sequence."""
 
     follow: Callable[[Array], F]  # raises SimulationError
-    solve: Callable[[F, int], A]  # the program around what was followed, and its number
-    rule: StepRule
-    stop: Callable[[F, A], bool] | None  # whether what was followed confirms its program; None: one program
+    solve: Callable[[F, int], Attempt[S]]  # the program around what was followed, and its number
+    stop: Callable[[F, S], bool] | None  # whether what was followed confirms its program; None: one program
+    most_programs: int = SEQUENCE
+    tries: int = TRIES
 
 
 @dataclass(frozen=True, eq=False)
-class End(Generic[F, A]):
+class End(Generic[F, S]):
     """How a sequence ended."""
 
     status: Status
     followed: F | None  # the last one
-    answer: A | None  # of the last program
+    answer: Attempt[S] | None  # of the last program
     iterations: int
     message: str
 
 
-def sequence(parts: Parts[F, A], first: Iterable[Array], deadline: float) -> End[F, A]:
+def sequence(parts: Parts[F, S], first: Iterable[Array], deadline: float) -> End[F, S]:
     """Run the loop.
 
     Args:
@@ -90,35 +81,48 @@ def sequence(parts: Parts[F, A], first: Iterable[Array], deadline: float) -> End
         `Optimal` if the stop rule was content, or the one program was solved; `Infeasible` if `PATIENCE`
         programs, or the one, have no solution; `TimeLimit`; else `Failed`, and the message says why.
     """
-    now, answer, iterations, without, reason = None, None, 0, 0, ""
-    for at in first:
-        try:
-            now = parts.follow(at)
-            break
-        except SimulationError as error:
-            reason = str(error)
+    at, now, reason = _followed(parts.follow, first)
+    answer, iterations, without = None, 0, 0
     if now is None:
         return End(Status.FAILED, None, None, 0, reason)
-    for number in range(parts.rule.most_programs):
+    for number in range(parts.most_programs):
         if time.perf_counter() > deadline:
-            return End(
-                Status.TIME_LIMIT, now, answer, iterations, "the time limit passed between two programs"
-            )
+            reason = "the time limit passed between two programs"
+            return End(Status.TIME_LIMIT, now, answer, iterations, reason)
         answer = parts.solve(now, number)
         iterations += answer.iterations
+        without = without + 1 if answer.status == Status.INFEASIBLE else 0
         is_solved = answer.status in (Status.OPTIMAL, Status.INFEASIBLE)
-        is_limited = is_solved and parts.rule.limits(now, answer)
-        without = without + 1 if answer.status == Status.INFEASIBLE and not is_limited else 0
-        if not is_solved or without == PATIENCE or parts.stop is None:
+        if not is_solved or without == PATIENCE or parts.stop is None or answer.wanted is None:
             return End(answer.status, now, answer, iterations, answer.message)
-        try:
-            now, reached = parts.rule.step(now, answer, parts.follow)
-        except NoStepError as error:
-            return End(Status.FAILED, now, answer, iterations, str(error))
-        if reached is not None and not is_limited and parts.stop(reached, answer):
-            return End(Status.OPTIMAL, reached, answer, iterations, "")
-    reason = f"no convergence in {parts.rule.most_programs} programs"
+        wanted, before = answer.wanted, at
+        at, new, reason = _followed(parts.follow, _steps(before, wanted, parts.tries))
+        if new is None:
+            reason = f"no step on the way to the program's answer can be followed: {reason}"
+            return End(Status.FAILED, now, answer, iterations, reason)
+        now = new
+        if at is wanted and answer.solution is not None and parts.stop(now, answer.solution):
+            return End(Status.OPTIMAL, now, answer, iterations, "")
+    reason = f"no convergence in {parts.most_programs} programs"
     return End(Status.FAILED, now, answer, iterations, reason)
+
+
+def _followed(follow: Callable[[Array], F], places: Iterable[Array]) -> tuple[Array, F | None, str]:
+    """The first place that can be followed, and what it leads to; else why the last could not."""
+    at, reason = np.empty(0), ""
+    for at in places:
+        try:
+            return at, follow(at), ""
+        except SimulationError as error:
+            reason = str(error)
+    return at, None, reason
+
+
+def _steps(now: Array, wanted: Array, tries: int) -> Iterable[Array]:
+    """All the way, or half as far again and again."""
+    for _ in range(tries):
+        yield wanted
+        wanted = (now + wanted) / 2
 
 
 @dataclass(frozen=True)
@@ -131,24 +135,9 @@ class Rows:
     soft: bool = False  # every excess has a price from the start
 
 
-@dataclass(frozen=True, eq=False)
-class Attempt:
-    """What solving a program with rows added came to; there is a prediction if it is solved."""
-
-    status: Status
-    prediction: Prediction | None
-    iterations: int
-    version: str
-    message: str
-
-    @property
-    def wanted(self) -> Array:
-        """Powers at the knots, shape (n_knots, n_gen), pu."""
-        assert self.prediction is not None
-        return self.prediction.p_gen
-
-
-def solve_with_rows_added(program: KnotProgram, limits: set[Limit], rows: Rows, deadline: float) -> Attempt:
+def solve_with_rows_added(
+    program: KnotProgram, limits: set[Limit], rows: Rows, deadline: float
+) -> Attempt[Prediction]:
     """Solve, look at all grid points, limit |ω| where it comes near the bound, and again.
 
     Args:
@@ -181,7 +170,8 @@ def solve_with_rows_added(program: KnotProgram, limits: set[Limit], rows: Rows, 
         if not added or (not rows.by_interval if infeasible else excess <= rows.enough):
             break
     if answer.status != Status.OPTIMAL and not (rows.soft and prediction is not None):
-        return Attempt(answer.status, None, iterations, answer.version, answer.message)
+        return Attempt(answer.status, None, None, iterations, answer.version, answer.message)
     is_beyond = infeasible or (rows.soft and excess > rows.open)
     status = Status.INFEASIBLE if is_beyond else Status.OPTIMAL
-    return Attempt(status, prediction, iterations, answer.version, answer.message)
+    wanted = None if prediction is None else prediction.p_gen
+    return Attempt(status, wanted, prediction, iterations, answer.version, answer.message)

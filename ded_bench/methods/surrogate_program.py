@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.methods.first_schedules import corrected, first_schedules, slow_dispatch
-from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knot_program import KnotProgram, Prediction
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.reserve import Reserve
 from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
-from ded_bench.methods.step_rules import FullSteps
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -37,14 +36,6 @@ class Plan:
 
     last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
     reserve: Reserve | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Along:
-    """A surrogate's model along powers at the knots."""
-
-    at: Array
-    model: TimeVarying
 
 
 def solve_on_surrogate(
@@ -81,17 +72,16 @@ def solve_on_surrogate(
     else:
         rows = Rows(SOFT_TOLERANCE * bound, SOFT_TOLERANCE * bound, soft=True)
 
-    def follow(p_gen: Array) -> _Along:
-        exact = plan is None
-        return _Along(p_gen, model_along(case, surrogate, instance, p_gen, points, exact))
+    def follow(p_gen: Array) -> TimeVarying:
+        return model_along(case, surrogate, instance, p_gen, points, exact=plan is None)
 
-    def solve(along: _Along, _: int) -> Attempt:
+    def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
         reserve = None if plan is None else plan.reserve
-        program = KnotProgram(case, instance, bound, along.model, reserve=reserve)
+        program = KnotProgram(case, instance, bound, model, reserve)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
-        limits = program.near(along.model.omega) if is_near else set()
+        limits = program.near(model.omega) if is_near else set()
         return solve_with_rows_added(program, limits, rows, deadline)
 
     if not is_reachable(case, instance, points):
@@ -102,9 +92,9 @@ def solve_on_surrogate(
         else:
             wanted = corrected(case, instance, plan.last, points)
         first = first_schedules(case, instance, wanted, points)
-        end = sequence(Parts(follow, solve, FullSteps(), stop=None), first, np.inf)
+        end = sequence(Parts(follow, solve, stop=None), first, np.inf)
         status, reason, attempt = end.status, end.message, end.answer
-    prediction = attempt.prediction if attempt else None
+    prediction = attempt.solution if attempt else None
     is_optimal = status == Status.OPTIMAL
     is_given = prediction is not None and (is_optimal or soft or plan is not None)
     return Solution(

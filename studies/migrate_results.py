@@ -24,8 +24,7 @@ from ded_bench.analysis.certificate import ROWS as CERTIFICATE_ROWS
 from ded_bench.analysis.certificate import Candidate, read_certificates, read_rows, save_certificate
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import model_artifact, named
-from ded_bench.methods.solution import Settings
+from ded_bench.methods.solution import Settings, model_artifact, named
 from ded_bench.plants.plant import servable
 from ded_bench.plants.score import score
 from ded_bench.problem.benchmark import select_split

@@ -26,10 +26,9 @@ from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
 from ded_bench.files.table import Table, cell
-from ded_bench.methods.artifact import named
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.solution import Settings, Solver, named
 from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score, score
 from ded_bench.problem.case import Case

@@ -16,9 +16,8 @@ import numpy as np
 import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
+from ded_bench.methods.solution import Artifact, Settings, Solution, Solver, answer, model_artifact, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case

@@ -14,10 +14,9 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.knots import case_knots, receding_knots, tightened
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

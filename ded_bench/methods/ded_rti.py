@@ -22,11 +22,10 @@ import dataclasses
 import functools
 from dataclasses import dataclass
 
-from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.knots import receding_knots, tightened
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.reserve import LIMIT, Reserve
-from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
 from ded_bench.methods.surrogate_program import Plan, solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

@@ -39,9 +39,8 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.options import NoOptions
-from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
 from ded_bench.problem.case import LARGEST, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -18,9 +18,8 @@ from typing import Any
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods import plugin
-from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.options import options_text, read_options
-from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solver
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
 
@@ -38,11 +37,6 @@ class Method:
     @property
     def _answering(self) -> Any:
         return plugin.load(self.module) if ":" in self.module else importlib.import_module(self.module)
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it comes with this package."""
-        return ":" not in self.module
 
     @property
     def version(self) -> int:

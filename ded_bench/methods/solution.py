@@ -1,18 +1,21 @@
-"""What a method answers: a frozen Solution, and the settings under which it was found.
+"""What a method answers: a frozen Solution, the settings under which it was found, what it was derived from.
 
 A program that would take too much memory is refused by its size, before it is made (`too_large`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ded_bench.methods.options import DEFAULT
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Outcome, Status
+from ded_bench.surrogates.find import find_model_file, find_surrogate
 
 #: What the program of one worker may take, bytes.
 MAX_BYTES = 4 * 2**30
@@ -46,6 +49,40 @@ class Settings:
     policy: Path | None = None  # a policy's file; None: the trained one
     time_limit_s: float | None = None
     search: tuple[Path, ...] = ()  # folders where trained models and policies may lie
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A model or policy that answers depend on.
+
+    Attributes:
+        kind: a surrogate, a policy, or the code of a method that lies outside this package.
+        name: the model's kind, the method of a policy, or `module:function`.
+        fingerprint: changes whenever the numbers inside (or the code) do.
+        path: the file it was read from; None if it follows from the case or is no file.
+    """
+
+    kind: Literal["model", "policy", "code"]
+    name: str
+    fingerprint: str
+    path: Path | None = None
+
+
+def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> Artifact:
+    """The surrogate that the settings name, else the method's own.
+
+    Raises:
+        InputError: there is no such model, or its file is wrong.
+    """
+    name = settings.model or default
+    model = find_surrogate(case, name, settings.search)
+    path = find_model_file(case, name, settings.search)
+    return Artifact("model", model.kind, model.fingerprint, path)
+
+
+def named(artifacts: Iterable[Artifact], kind: str) -> str:
+    """The models, or the policies, that shaped an answer, as rows say it: `name@fingerprint`, joined by +."""
+    return "+".join(f"{a.name}@{a.fingerprint}" for a in artifacts if a.kind == kind)
 
 
 #: What `prepare(case, regime, settings)` returns.

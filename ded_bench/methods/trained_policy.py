@@ -14,7 +14,6 @@ import numba
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.policy_file import (
     Scope,
     Weights,
@@ -24,7 +23,7 @@ from ded_bench.methods.policy_file import (
     weights_fingerprint,
     write_policy,
 )
-from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

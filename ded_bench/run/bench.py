@@ -28,9 +28,8 @@ import numpy as np
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import named
 from ded_bench.methods.registry import Method, get_method, registered
-from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solution import Settings, Solution, Solver, named
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -10,8 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.artifact import named
-from ded_bench.methods.solution import Solution
+from ded_bench.methods.solution import Solution, named
 from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.cluster import open_workers

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact, named
 from ded_bench.methods.plugin import accept
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solution, Solver, named
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.plants.score import Score, score
 from ded_bench.problem.case import Case

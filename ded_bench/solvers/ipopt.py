@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -75,29 +73,46 @@ class CasadiIpopt:
         start = np.array([0.0 if v.value is None else v.value for v in source.columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
-        started = time.perf_counter()
-        with _silent_failure() as caught:
-            result = self._solver(x0=start, lbg=source.g_lower, ubg=source.g_upper, **arguments)
-        elapsed = time.perf_counter() - started
-        stats = self._solver.stats()
-        message = caught[0] if caught else str(stats["return_status"])
-        status = Status.FAILED if caught else _IPOPT_STATUS.get(message, Status.FAILED)
-        has_values = status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT)
-        if has_values:
-            assign(source.columns, result["x"].full().ravel())
-        objective = float(result["f"]) + constant if has_values else None
-        return Outcome(
-            status, has_values, stats.get("iter_count"), setup, elapsed, objective, _IPOPT_VERSION, message
-        )
+        arguments |= {"x0": start, "lbg": source.g_lower, "ubg": source.g_upper}
+        outcome, x = run_ipopt(self._solver, arguments, constant, setup)
+        if x is not None:
+            assign(source.columns, x)
+        return outcome
 
     def _make(self, time_limit_s: float | None) -> casadi.Function:
-        ipopt: dict[str, Any] = {"print_level": 0, "sb": "yes", **self._options}
-        if time_limit_s is not None:
-            ipopt["max_wall_time"] = time_limit_s
         # Scalar expressions must be expanded, or every evaluation takes several times as long.
-        expand = isinstance(self._source, _Nl)
-        options: dict[str, Any] = {"expand": expand, "print_time": False, "error_on_fail": False}
-        return casadi.nlpsol("ipopt", "ipopt", self._source.nlp, options | {"ipopt": ipopt})
+        options = {"expand": isinstance(self._source, _Nl)}
+        return make_ipopt(self._source.nlp, self._options, time_limit_s, options)
+
+
+def make_ipopt(
+    nlp: dict[str, Any], ipopt: Options, time_limit_s: float | None, options: dict[str, Any]
+) -> casadi.Function:
+    """IPOPT on a program; its own options, a time limit in s, and CasADi's options."""
+    limit = {} if time_limit_s is None else {"max_wall_time": time_limit_s}
+    ipopt = {"print_level": 0, "sb": "yes", **ipopt, **limit}
+    options = {**options, "print_time": False, "error_on_fail": False, "ipopt": ipopt}
+    return casadi.nlpsol("ipopt", "ipopt", nlp, options)
+
+
+def run_ipopt(
+    solver: casadi.Function, arguments: dict[str, Array], constant: float, setup_s: float
+) -> tuple[Outcome, Array | None]:
+    """What IPOPT reports, and x if there is one; `constant` is what its objective leaves out."""
+    started, error = time.perf_counter(), ""
+    try:
+        result = solver(**arguments)
+    except RuntimeError as caught:  # of the library
+        error = str(caught).splitlines()[0][:200]
+    elapsed = time.perf_counter() - started
+    stats = solver.stats()
+    message = error or str(stats["return_status"])
+    status = Status.FAILED if error else _IPOPT_STATUS.get(message, Status.FAILED)
+    x = objective = None
+    if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
+        x, objective = result["x"].full().ravel(), float(result["f"]) + constant
+    said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
+    return Outcome(status, x is not None, *said), x
 
 
 #: What IPOPT is called with, and what its objective leaves out.
@@ -171,13 +186,16 @@ class IpoptExecutable:
                     self._model, options=self._options | limit, load_solutions=False, logfile=str(log)
                 )
             except ApplicationError as error:
-                return self._failed(time.perf_counter() - started, str(error))
+                said = time.perf_counter() - started, None, self._version, str(error)
+                return Outcome(Status.FAILED, False, None, 0.0, *said)
             found = re.search(r"Number of Iterations\.*:\s*(\d+)", log.read_text(errors="replace"))
         message = str(results.solver.message).replace("\\x3a", ":")
         status = _executable_status(results.solver.termination_condition, message)
         has_values = status in (Status.OPTIMAL, Status.FEASIBLE)
+        objective = None
         if has_values:
             self._model.solutions.load_from(results)
+            objective = pyo.value(next(self._model.component_data_objects(pyo.Objective, active=True)))
         solve_s = float(results.solver.time)
         return Outcome(
             status,
@@ -185,13 +203,10 @@ class IpoptExecutable:
             int(found.group(1)) if found else None,
             time.perf_counter() - started - solve_s,
             solve_s,
-            _objective_value(self._model) if has_values else None,
+            objective,
             self._version,
             message,
         )
-
-    def _failed(self, elapsed: float, message: str) -> Outcome:
-        return Outcome(Status.FAILED, False, None, 0.0, elapsed, None, self._version, message)
 
 
 def _executable_status(condition: TerminationCondition, message: str) -> Status:
@@ -203,17 +218,3 @@ def _executable_status(condition: TerminationCondition, message: str) -> Status:
     if condition == TerminationCondition.optimal:
         return Status.FEASIBLE if "acceptable" in message.lower() else Status.OPTIMAL
     return Status.FAILED
-
-
-def _objective_value(model: pyo.ConcreteModel) -> float:
-    return float(pyo.value(next(model.component_data_objects(pyo.Objective, active=True))))
-
-
-@contextlib.contextmanager
-def _silent_failure() -> Iterator[list[str]]:
-    """Turn an exception of the solver library into a message."""
-    caught: list[str] = []
-    try:
-        yield caught
-    except RuntimeError as error:
-        caught.append(str(error).splitlines()[0][:200])

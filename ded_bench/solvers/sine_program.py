@@ -16,8 +16,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.problem.case import Array
-from ded_bench.solvers.ipopt import _IPOPT_STATUS, _IPOPT_VERSION, _silent_failure
-from ded_bench.solvers.status import Options, Outcome, Status
+from ded_bench.solvers.ipopt import make_ipopt, run_ipopt
+from ded_bench.solvers.status import Options, Outcome
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,29 +56,15 @@ class SineProgram:
         started = time.perf_counter()
         if self._solver is None or self._made_for != time_limit_s:
             self._solver, self._made_for = self._make(_sparsity(numbers.a), time_limit_s), time_limit_s
-        setup = time.perf_counter() - started
-        started = time.perf_counter()
-        with _silent_failure() as caught:
-            result = self._solver(
-                x0=numbers.start,
-                lbx=numbers.lower,
-                ubx=numbers.upper,
-                lbg=numbers.row_lower,
-                ubg=numbers.row_upper,
-                p=np.concatenate([numbers.a.data, numbers.cost]),
-            )
-        elapsed = time.perf_counter() - started
-        stats = self._solver.stats()
-        message = caught[0] if caught else str(stats["return_status"])
-        status = Status.FAILED if caught else _IPOPT_STATUS.get(message, Status.FAILED)
-        x = objective = None
-        if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
-            x, objective = result["x"].full().ravel(), float(result["f"]) + numbers.constant
-        iterations = stats.get("iter_count")
-        outcome = Outcome(
-            status, x is not None, iterations, setup, elapsed, objective, _IPOPT_VERSION, message
-        )
-        return outcome, x
+        arguments = {
+            "x0": numbers.start,
+            "lbx": numbers.lower,
+            "ubx": numbers.upper,
+            "lbg": numbers.row_lower,
+            "ubg": numbers.row_upper,
+            "p": np.concatenate([numbers.a.data, numbers.cost]),
+        }
+        return run_ipopt(self._solver, arguments, numbers.constant, time.perf_counter() - started)
 
     def _make(self, pattern: casadi.Sparsity, time_limit_s: float | None) -> casadi.Function:
         """IPOPT with g(x) = A x + C sin(D x), its Jacobian A + C diag(cos(D x)) D, and the Hessian of λ·g."""
@@ -93,9 +79,6 @@ class SineProgram:
         curvature = -casadi.sin(argument) * casadi.mtimes(outer.T, weight_g)
         hessian = casadi.triu(casadi.mtimes(inner.T, casadi.mtimes(casadi.diag(curvature), inner)))
         given, both = ([x, parameters], ["x", "p"]), [x, parameters, weight_f, weight_g]
-        ipopt: dict[str, Any] = {"print_level": 0, "sb": "yes", **self._options}
-        if time_limit_s is not None:
-            ipopt["max_wall_time"] = time_limit_s
         # Names of functions, arguments and results are those that CasADi expects.
         options: dict[str, Any] = {
             "grad_f": casadi.Function("nlp_grad_f", given[0], [f, cost], given[1], ["f", "grad_f_x"]),
@@ -103,12 +86,9 @@ class SineProgram:
             "hess_lag": casadi.Function(
                 "nlp_hess_l", both, [hessian], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
             ),
-            "print_time": False,
-            "error_on_fail": False,
-            "ipopt": ipopt,
         }
         nlp: dict[str, Any] = {"x": x, "p": parameters, "f": f, "g": g}
-        return casadi.nlpsol("ipopt", "ipopt", nlp, options)
+        return make_ipopt(nlp, self._options, time_limit_s, options)
 
 
 def _sparsity(matrix: sp.csc_matrix) -> casadi.Sparsity:

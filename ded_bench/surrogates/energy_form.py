@@ -48,15 +48,6 @@ class EnergyForm:
         return result[:n, :n], b + result[:n, n:] @ (self.feedthrough - b)
 
 
-def injection_rows(case: Case) -> Array:
-    """W, shape (n_gen, n_bus): (P_s, N) = W f, the slack and all generators but the last."""
-    network = Network(case)
-    rows = np.zeros((len(case.generators), network.n_bus))
-    rows[0, network.slack] = 1.0
-    rows[np.arange(1, len(rows)), network.generators[:-1]] = 1.0
-    return rows
-
-
 def injections_from_generators(n_gen: int) -> Array:
     """The matrix of (P_s, N) = matrix @ f_gen - (Σ loads, 0), shape (n_gen, n_gen)."""
     return np.vstack([-np.ones((1, n_gen)), np.eye(n_gen)[:-1]])
@@ -93,8 +84,8 @@ def energy_form(case: Case, theta: Array) -> EnergyForm:
 
 def injection_lift(case: Case) -> Array:
     """The lift ψ = (ω, P_s, N) that makes equilibria of the nonlinear system exact."""
-    n, n_bus = len(case.generators), len(case.buses)
-    lift = np.zeros((2 * n, 2 * n_bus + n + len(case.loads) + 1))
-    lift[:n, 2 * n_bus : 2 * n_bus + n] = np.eye(n)
-    lift[n : 2 * n, :n_bus] = injection_rows(case)
+    network, n = Network(case), len(case.generators)
+    lift = np.zeros((2 * n, 2 * network.n_bus + n + len(case.loads) + 1))
+    lift[:n, 2 * network.n_bus : 2 * network.n_bus + n] = np.eye(n)
+    lift[np.arange(n, 2 * n), [network.slack, *network.generators[:-1]]] = 1.0
     return lift

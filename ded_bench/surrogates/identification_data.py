@@ -39,20 +39,6 @@ class Trajectories:
         """(ω, P_s), shape (n_points, batch, n_gen + 1)."""
         return np.concatenate([self.omega, self.p_slack[..., None]], axis=-1)
 
-    def take(self, part: slice) -> Trajectories:
-        """Some of them."""
-        arrays = (a[:, part] for a in (self.theta, self.omega, self.p_slack))
-        initial = self.theta_initial[part]
-        return Trajectories(self.instances[part], self.kinds[part], self.inputs[:, part], initial, *arrays)
-
-
-def trajectories(
-    case: Case, instances: list[Instance], schedules: list[Schedule], kinds: list[str]
-) -> Trajectories:
-    """Simulate schedules and stack the result; raises SimulationError where the system cannot follow one."""
-    pairs = zip(instances, schedules, strict=True)
-    return _stacked(instances, kinds, [_signals(simulate(case, *pair)) for pair in pairs])
-
 
 def _signals(run: Trajectory) -> tuple[Array, ...]:
     """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""

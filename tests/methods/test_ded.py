@@ -7,12 +7,12 @@ import pyomo.environ as pyo
 import pytest
 
 from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
-from ded_bench.methods.euler_program import EulerPrograms, injections_along
+from ded_bench.methods.euler_program import injections_along
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -105,40 +105,6 @@ def test_the_model_is_backward_euler_of_the_true_system(case: Case) -> None:
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.15)
 
 
-def decay_rate(omega: Array, dt: float) -> float:
-    """Decay of a free oscillation x_k+2 = a x_k+1 - b x_k about zero, 1/s: its modes have |z|² = b."""
-    (_, b), *_ = np.linalg.lstsq(np.stack([omega[1:-1], -omega[:-2]], axis=1), omega[2:], rcond=None)
-    return float(-np.log(b) / (2 * dt))
-
-
-def test_euler_adds_half_a_step_times_omega_squared_to_the_decay_of_a_mode(
-    threebus: Case, quiet_instance, alter
-) -> None:
-    """A machine that swings at 1.5 Hz and decays with 0.15 1/s does so with 0.59 1/s in the model."""
-    linear = Network(threebus).linearise(
-        Network(threebus).power_flow(threebus.p_nominal, threebus.load_nominal)
-    )
-    m = float(linear.stiffness[0, 0]) / (2 * np.pi * 1.5) ** 2
-    machine = threebus.machines["plant"].model_dump(exclude_none=True) | {"m": m, "d": 0.3 * m}
-    case = alter(threebus, machines={"plant": machine})
-    initial = {"power": {"plant": float(case.p_nominal[0])}, "omega": {"plant": 1e-3}}
-    instance = quiet_instance(case, horizon_s=HORIZON, initial=initial)
-    model = build_ded(case, instance.steps, instance.dt_s)
-    set_instance(model, case, instance, "NO")
-    for t in model.t:
-        model.p_gen["plant", t].fix(initial["power"]["plant"])
-    assert CasadiIpopt(model).solve().status == Status.OPTIMAL
-    claimed = np.array([model.omega["plant", t].value for t in model.t])
-    truth = simulate(case, instance, schedule_of(model, case, instance))
-    true_rate, claimed_rate = (decay_rate(w, instance.dt_s) for w in (truth.omega[:, 0], claimed))
-    assert true_rate == pytest.approx(0.15, rel=1e-3)
-    mode = -0.15 + 1j * np.sqrt((2 * np.pi * 1.5) ** 2 - 0.15**2)
-    assert claimed_rate == pytest.approx(np.log(abs(1 - instance.dt_s * mode)) / instance.dt_s, rel=1e-3)
-    added = instance.dt_s * abs(mode) ** 2 / 2
-    assert added == pytest.approx(0.44, abs=0.005)
-    assert claimed_rate - true_rate == pytest.approx(added, rel=0.03)
-
-
 def test_impossible_instances_are_reported_as_such(case: Case) -> None:
     instance = short(case, 0)
     outside = dict(zip(case.generators, (case.p_max + 0.05).tolist(), strict=True))
@@ -170,24 +136,6 @@ def test_accelerated_finds_the_same_optimum(case: Case) -> None:
             assert verdict.objective == pytest.approx(
                 score(case, instance, usual.schedule, regime).objective, rel=1e-6
             )
-
-
-def test_accelerated_meets_the_equations_of_the_model(case: Case) -> None:
-    """Its inputs, fixed in the Pyomo model, leave IPOPT nothing to do but to find the same states."""
-    instance = short(case, 1)
-    outcome, schedule = EulerPrograms(case, "TO", instance.steps, instance.dt_s).solve(instance)
-    model = build_ded(case, instance.steps, instance.dt_s)
-    set_instance(model, case, instance, "TO")
-    for j, g in enumerate(case.generators):
-        for t, value in list(zip(model.t, schedule.p[:, j].tolist(), strict=True))[1:]:
-            model.p_gen[g, t].setlb(value)
-            model.p_gen[g, t].setub(value)
-            model.omega[g, t].setlb(model.omega[g, t].lb - 1e-7)  # both solvers' own tolerances
-            model.omega[g, t].setub(model.omega[g, t].ub + 1e-7)
-    model.ineq_ramp.deactivate()
-    found = CasadiIpopt(model).solve()
-    assert found.status == Status.OPTIMAL
-    assert found.objective == pytest.approx(outcome.objective, rel=1e-8)
 
 
 def test_a_linear_program_has_the_derivatives_of_the_network(case: Case) -> None:

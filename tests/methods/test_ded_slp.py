@@ -12,8 +12,8 @@ from ded_bench.methods import ded_slp, ed, knot_program
 from ded_bench.methods.ded_slp import MARGIN, prepare
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import PIECE, knot_weights, piece_starts
+from ded_bench.methods.slp import Parts
 from ded_bench.methods.solution import Settings
-from ded_bench.methods.step_rules import FullSteps
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
@@ -23,17 +23,14 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
 from ded_bench.solvers.status import Status
+from tests.methods import on_surrogates
 from tests.methods.pyomo_models import build_ded_slp
 
 HORIZON = 4.0
 POINTS = np.array([0, 60, 121, 130, 205, 300, 400])
 
 
-def short(case: Case, index: int, **changes) -> Instance:
-    """An instance whose loads ramp from the start and whose slack costs differ with the index."""
-    instance = sample_instance(case, 77, index)
-    load = {bus: ramp.model_copy(update={"start": 0.5}) for bus, ramp in instance.load.items()}
-    return instance.model_copy(update={"horizon_s": HORIZON, "load": load, **changes})
+short = functools.partial(on_surrogates.short, horizon_s=HORIZON)
 
 
 def program(case: Case, instance: Instance, bound: float, points=POINTS) -> KnotProgram:
@@ -105,7 +102,7 @@ def test_claims_are_what_the_scorer_finds(case, regime, index):
 def test_what_does_not_converge_says_so(case, monkeypatch):
     """No trajectory counts as one that keeps the bound."""
     monkeypatch.setattr(ded_slp, "ACCEPTED", -np.inf)
-    monkeypatch.setattr(ded_slp, "FullSteps", functools.partial(FullSteps, most_programs=2))
+    monkeypatch.setattr(ded_slp, "Parts", functools.partial(Parts, most_programs=2))
     solution = prepare(case, "NO", Settings())(short(case, 1))
     assert (solution.status, solution.schedule) == (Status.FAILED, None)
     assert solution.error == "no convergence in 2 programs"

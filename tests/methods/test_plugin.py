@@ -27,8 +27,6 @@ from ded_bench.methods.options import read_options
 class Options:
     share: float = 1.0
 
-weights = "w1"
-
 def flat(instance, power):
     return Schedule(t=np.array([0.0, instance.horizon_s]), p=np.array([power, power]))
 
@@ -37,9 +35,6 @@ def solve(instance, regime):
 
 def with_case(instance, regime, case):
     return flat(instance, case.p_nominal)
-
-def with_option(instance, regime, gain=2.0):
-    return flat(instance, list(instance.initial.power.values()))
 
 def prepare(case, regime, settings):
     share = read_options(Options, settings.options).share
@@ -90,15 +85,11 @@ def answer(name: str, case: Case, instance, settings: Settings | None = None) ->
     return get_method(name).prepare(case, "NO", settings or Settings())(instance)
 
 
-def test_a_function_of_instance_and_regime_is_a_method(theirs, threebus, instance) -> None:
+def test_a_function_of_instance_and_regime_or_case_is_a_method(theirs, threebus, instance) -> None:
     solution = answer(f"{theirs}:solve", threebus, instance)
     assert solution.status is Status.FEASIBLE
     assert solution.schedule.p.tolist() == [[0.6], [0.6]]
     assert 0 < solution.solve_s < 1
-    assert answer(f"{theirs}:with_option", threebus, instance).status is Status.FEASIBLE
-
-
-def test_it_gets_the_case_if_it_asks(theirs, threebus, instance) -> None:
     assert answer(f"{theirs}:with_case", threebus, instance).schedule.p.tolist() == [[0.6], [0.6]]
 
 
@@ -140,9 +131,6 @@ def test_its_name_in_the_rows_leads_back_to_it(theirs) -> None:
         ("{}:alone", "takes other arguments than solve(instance, regime)"),
         ("{}:bent", "takes other arguments than"),
         ("{}:solve()", "not of the form module:function"),
-        ("../{}:solve", "not of the form"),
-        (":solve", "not of the form"),
-        ("{}:", "not of the form"),
         ("nowhere.at_all", "cannot be imported"),
         ("magic", "unknown method (known: "),
         ("x" * 70 + ":solve", "cannot be imported"),
@@ -196,17 +184,14 @@ END = np.array([0.0, 1.0])
     [
         (None, "returned nothing, not a Schedule"),
         ([[0.6], [0.6]], "an object of type list"),
-        (Schedule, "an object of type type"),
         (Schedule(END, np.array([[0.6], [np.nan]])), "finite numbers"),
         (Schedule(END, np.array([0.6, 0.6])), "shapes (2,) and (2,), wanted"),
         (Schedule(END, np.full((2, 2), 0.6)), "shapes (2,) and (2, 2)"),
         (Schedule(END[:1], np.full((1, 1), 0.6)), "at least two rows"),
         (Schedule(0.5 * END, np.full((2, 1), 0.6)), "must end at the horizon 1.0, not 0.5"),
-        (Schedule(60 * END, np.full((2, 1), 0.6)), "must end at the horizon 1.0, not 60.0"),
         (Schedule(END[::-1], np.full((2, 1), 0.6)), "increase strictly"),
         (Schedule("ab", np.full((2, 1), 0.6)), "wrong schedule"),
         (Schedule(END, np.full((2, 1), 1j)), "must be real numbers"),
-        (Schedule(None, None), "wrong schedule"),
         (Solution(Status.OPTIMAL, "soon"), "wrong schedule"),
         (Solution(Status.OPTIMAL), "claims Optimal but returned no schedule"),
         (Solution("Splendid", GOOD), "unknown status 'Splendid'"),

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact
 from ded_bench.methods.options import option
 from ded_bench.methods.registry import METHODS, Method
-from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.solution import Artifact, Settings, Solution
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

@@ -18,9 +18,8 @@ import psutil
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.artifact import Artifact, model_artifact
 from ded_bench.methods.registry import METHODS
-from ded_bench.methods.solution import Settings
+from ded_bench.methods.solution import Artifact, Settings, model_artifact
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results

@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.artifact import Artifact, named
 from ded_bench.methods.registry import Method, get_method
-from ded_bench.methods.solution import Settings
+from ded_bench.methods.solution import Artifact, Settings, named
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario

@@ -83,16 +83,17 @@ def _accelerated(
     started = time.perf_counter()
     programs = _programs(case, regime, instance.steps, instance.dt_s)
     build_s = time.perf_counter() - started
-    outcome, schedule = programs.solve(instance, time_limit_s)
-    if outcome.status != Status.FAILED:
-        return answer(outcome, build_s, lambda: schedule)
-    rest = None if time_limit_s is None else max(time_limit_s - outcome.solve_s, 1e-3)
+    found = programs.solve(instance, time_limit_s)
+    if found.status != Status.FAILED:
+        return dataclasses.replace(found, build_s=build_s)
+    spent_s = found.solve_s or 0.0
+    rest = None if time_limit_s is None else max(time_limit_s - spent_s, 1e-3)
     verdict = _solve(case, regime, solver, rest, instance)
     return dataclasses.replace(
         verdict,
-        iterations=(verdict.iterations or 0) + (outcome.iterations or 0),
-        solve_s=(verdict.solve_s or 0.0) + outcome.solve_s,
-        solver_version=f"{outcome.version}, {verdict.solver_version}".removeprefix(", "),
+        iterations=(verdict.iterations or 0) + (found.iterations or 0),
+        solve_s=(verdict.solve_s or 0.0) + spent_s,
+        solver_version=f"{found.solver_version}, {verdict.solver_version}".removeprefix(", "),
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.methods.slp import Attempt, Parts, sequence
+from ded_bench.methods.solution import Solution
 from ded_bench.plants.lossless.network import Network, PowerFlowError
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
@@ -23,7 +24,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.piqp import solve_form
-from ded_bench.solvers.status import Outcome, Status
+from ded_bench.solvers.status import Status
 
 #: Mismatch of the nonlinear equations that ends the sequence, pu: IPOPT's tolerance for the same ones.
 TOLERANCE = 1e-8
@@ -111,7 +112,7 @@ class EulerPrograms:
         self._lower = np.tile(np.concatenate([-endless, -limit, case.p_min, np.zeros(2)]), steps)
         self._upper = np.tile(np.concatenate([endless, limit, case.p_max, np.full(2, np.inf)]), steps)
 
-    def solve(self, instance: Instance, time_limit_s: float | None = None) -> tuple[Outcome, Schedule | None]:
+    def solve(self, instance: Instance, time_limit_s: float | None = None) -> Solution:
         """Solve one instance; the first trajectory stays in the state at t = 0.
 
         Returns:
@@ -147,12 +148,16 @@ class EulerPrograms:
             p_slack = np.abs(end.followed.f[:, -1])
             cost = power @ instance.cost_gen(self._case) + instance.cost_slack(self._case) * p_slack
             objective = float(cost.sum())
-        version = end.answer.version if end.answer else ""
-        elapsed = time.perf_counter() - started
-        outcome = Outcome(
-            end.status, schedule is not None, end.iterations, 0.0, elapsed, objective, version, end.message
+        return Solution(
+            status=end.status,
+            schedule=schedule,
+            iterations=end.iterations,
+            setup_s=0.0,
+            solve_s=time.perf_counter() - started,
+            solver_objective=objective,
+            solver_version=end.answer.version if end.answer else "",
+            error=end.message if schedule is None else "",
         )
-        return outcome, schedule
 
     def _program(self, instance: Instance, along: Injections) -> FreeForm:
         """The linear program around a trajectory of angles."""

@@ -31,7 +31,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -59,14 +59,13 @@ class ForeignSolver:
 
     case: Case
     function: Callable[..., Any]
+    arguments: tuple[Any, ...] = ()  # after the instance
+    named: Mapping[str, Any] = field(default_factory=dict)
 
-    def __call__(self, instance: Instance) -> Solution:
+    def __call__(self, instance: Instance, **more: Any) -> Solution:
         """Solve one instance."""
-        return self._checked(instance)
-
-    def _checked(self, instance: Instance, **options: Any) -> Solution:
         started = time.perf_counter()
-        answer = self.function(instance, **options)
+        answer = self.function(instance, *self.arguments, **self.named, **more)
         return accept(answer, self.case, instance, time.perf_counter() - started)
 
 
@@ -76,7 +75,7 @@ class ForeignWarmSolver(ForeignSolver):
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve one instance, starting from the plan in force."""
-        return self._checked(instance, last=last)
+        return self(instance, last=last)
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ class Foreign:
         """
         if not self._prepares:
             extra = {"case": case} if "case" in _parameters(self.function) else {}
-            return ForeignSolver(case, functools.partial(_swapped, self.function, regime, extra))
+            return ForeignSolver(case, self.function, (regime,), extra)
         inner = self.function(case, regime, settings)
         if callable(getattr(inner, "solve", None)):
             return ForeignWarmSolver(case, inner.solve)
@@ -242,12 +241,6 @@ def _line(text: object) -> str:
 
 def _kind(value: object) -> str:
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
-
-
-def _swapped(
-    function: Callable[..., Any], regime: str, extra: Mapping[str, Any], instance: Instance
-) -> object:
-    return function(instance, regime, **extra)
 
 
 def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:

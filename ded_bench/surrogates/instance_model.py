@@ -43,15 +43,7 @@ def model_along(
 def _lifted_along(
     case: Case, model: Koopman, instance: Instance, p_gen: Array, points: Indices
 ) -> TimeVarying:
-    """A lifted model around its own rollout.
-
-    Args:
-        case: the grid.
-        model: K, B and G are those of all intervals.
-        instance: x_0 and the loads.
-        p_gen: powers at the knots, linear between them, shape (n_knots, n_gen), pu.
-        points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
-    """
+    """A lifted model around its own rollout: K, B and G are those of all intervals."""
     n_gen, lengths = len(case.generators), np.diff(points)
     psi = model.initial(Network(case), [instance])[0]
     steps = np.arange(points[-1] + 1)

@@ -8,7 +8,7 @@ import pytest
 
 from ded_bench.cli.commands import main
 from ded_bench.files.errors import InputError
-from ded_bench.methods.options import NoOptions, described, option, options_text, read_options
+from ded_bench.methods.options import described, option, options_text, read_options
 from ded_bench.methods.registry import METHODS, get_method
 from ded_bench.methods.solution import Settings
 
@@ -58,11 +58,6 @@ def test_mistakes_are_told(text: str, told: str) -> None:
     with pytest.raises(InputError) as caught:
         read_options(Options, text)
     assert told in str(caught.value)
-
-
-def test_a_method_without_options_says_so() -> None:
-    with pytest.raises(InputError, match="this method has none"):
-        read_options(NoOptions, "steps=3")
 
 
 def test_a_description_has_every_option() -> None:

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from ded_bench.files.errors import InputError
 from ded_bench.solvers import highs, piqp
 from ded_bench.solvers.compile import SOLVERS, compile_model, fix
-from ded_bench.solvers.linear_program import FreeForm, read_linear
+from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.status import Status
 
 LINEAR = ("ipopt", "piqp", "highs")
@@ -154,18 +154,6 @@ def test_ipopt_solves_nonlinear_models() -> None:
     model.x.setub(0.5)  # the valley's floor is y = x²
     outcome = compile_model(model, "ipopt").solve()
     assert outcome.objective == pytest.approx(0.25, abs=1e-6)
-
-
-def test_read_linear_gives_the_arrays_of_the_model() -> None:
-    model = diet()
-    program = read_linear(model)
-    numbers = program.numbers()
-    values = {"x": 1.5, "y": 0.25, "need": 4.0, "price[0]": 2.0, "price[1]": 3.0}
-    point = np.array([values[v.name] for v in program.columns])
-    assert (program.a @ point).tolist() == [1.5 + 0.5 - 4.0]
-    assert (program.row_lower.tolist(), program.row_upper.tolist()) == ([0.0], [np.inf])
-    assert program.objective(numbers, point) == pytest.approx(2 * 1.5 + 3 * 0.25 + 1)
-    assert sorted(v.name for v, free in zip(program.columns, numbers.free, strict=True) if free) == ["x", "y"]
 
 
 def test_unknown_and_missing_solvers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

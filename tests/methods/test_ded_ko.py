@@ -172,7 +172,7 @@ def test_only_piqp_solves_what_is_made_for_each_instance(ninebus: Case) -> None:
 
 
 def test_a_lifted_models_knots_answer_as_its_own_rollout(case: Case) -> None:
-    instance, surrogate = short(case, 1), find_surrogate(case, "linear", [])
+    instance, surrogate = short(case, 1), nominal_model(case)
     points = np.array([0, 40, 41, 120, 300])
     model = model_along(case, surrogate, instance, slow_dispatch(case, instance, points), points)
     u = np.random.default_rng(2).normal(scale=0.02, size=model.p_gen.shape)

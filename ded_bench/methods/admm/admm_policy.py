@@ -19,7 +19,7 @@ from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import Problems
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.policy_file import Scope
-from ded_bench.methods.solution import Artifact, Settings, Solver
+from ded_bench.methods.solution import Settings, Solver
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import PowerFlowError
 from ded_bench.problem.case import Array, Case

@@ -199,11 +199,26 @@ def test_instances_of_one_run_differ_in_id_and_share_a_case(threebus, ninebus, a
 @pytest.mark.parametrize(
     ("reader", "name", "text", "field"),
     [
-        (load_split, "split.json", '{"seed": 1, "train": []}', "test"),
-        (load_split, "split.json", '{"seed": 1.5, "train": [], "test": []}', "seed"),
-        (load_split, "split.json", '{"seed": 1, "train": ["../a"], "test": []}', "train.0"),
-        (load_manifest, "MANIFEST.json", '{"files": {}}', "version"),
-        (load_manifest, "MANIFEST.json", '{"version": "1", "files": {"a": 1}}', "files.a"),
+        (load_split, "split.json", '{"schema": "ded-bench/split/1", "seed": 1, "train": []}', "test"),
+        (
+            load_split,
+            "split.json",
+            '{"schema": "ded-bench/split/1", "seed": 1.5, "train": [], "test": []}',
+            "seed",
+        ),
+        (
+            load_split,
+            "split.json",
+            '{"schema": "ded-bench/split/1", "seed": 1, "train": ["../a"], "test": []}',
+            "train.0",
+        ),
+        (load_manifest, "MANIFEST.json", '{"schema": "ded-bench/manifest/1", "files": {}}', "version"),
+        (
+            load_manifest,
+            "MANIFEST.json",
+            '{"schema": "ded-bench/manifest/1", "version": "1", "files": {"a": 1}}',
+            "files.a",
+        ),
     ],
 )
 def test_split_and_manifest_are_read_strictly(tmp_path, reader, name, text, field):

@@ -112,7 +112,11 @@ def test_make_hands_on_what_the_user_says() -> None:
     """Its variables, and the name of the target."""
     said = ["CASE=39bus", "RESULTS=/tmp/x y", "REGIME=TO", "LIMIT=3", "TRAIN=--seconds 5", "WORKERS=3"]
     made = subprocess.run(
-        ["make", "-n", "report", *said], cwd=REPOSITORY, capture_output=True, text=True, check=True
+        ["make", "--no-print-directory", "-n", "report", *said],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     line = made.stdout.splitlines()[-1]
     words = shlex.split(line)

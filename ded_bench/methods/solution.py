@@ -15,7 +15,6 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Outcome, Status
-from ded_bench.surrogates.find import find_model_file, find_surrogate
 
 #: What the program of one worker may take, bytes.
 MAX_BYTES = 4 * 2**30
@@ -75,6 +74,8 @@ def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> 
         InputError: there is no such model, or its file is wrong.
     """
     name = settings.model or default
+    from ded_bench.surrogates.find import find_model_file, find_surrogate  # and SciPy: the door does without
+
     model = find_surrogate(case, name, settings.search)
     path = find_model_file(case, name, settings.search)
     return Artifact("model", model.kind, model.fingerprint, path)

@@ -14,6 +14,7 @@ from ded_bench.cli import main
 from ded_bench.cli.arguments import ORDER
 from ded_bench.cli.commands import parser
 from ded_bench.methods import plugin
+from ded_bench.methods.options import described
 from ded_bench.methods.registry import METHODS
 from tests.cli.command_line import run_cli
 
@@ -30,8 +31,7 @@ def test_every_command_has_help() -> None:
     overview = run_cli("--help").stdout
     assert max(map(len, overview.splitlines())) <= 80
     listed = [line.split()[0] for line in overview.splitlines() if line.startswith("    ") and line[4] != " "]
-    road = ["cases", "instances", "train-ko", "solve", "train-dpc", "bench", "report"]
-    assert listed[: len(road)] == road
+    assert set(listed) == set(ORDER)
     assert listed == sorted(listed, key=ORDER.index)  # none is missing there
 
 
@@ -54,16 +54,17 @@ def test_help_tells_every_option_its_default(capsys: pytest.CaptureFixture[str])
                 assert f"default: {told}" in text, (name, action.dest)
 
 
-def test_help_lists_methods_and_settings(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those of other packages too; one that cannot be imported says so, and the help goes on."""
+def test_methods_are_listed_with_their_options(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of other packages too; one that cannot be imported says so, and the list goes on."""
     targets = {"flat": "tests.strange_methods:prepare", "gone": "no.such.module:solve"}
     monkeypatch.setattr(plugin, "installed", lambda: targets)
-    for command in ("solve", "online", "bench", "train-dpc"):
-        text = shown_help(command, capsys)
-        for method in METHODS.values():
-            assert f"{method.name} {', '.join(method.settings)}" in text
-        assert "flat default" in text
-        assert "gone cannot be used: " in text
+    assert main(["methods"]) == 0
+    text = capsys.readouterr().out
+    for name in ("flat", "gone", *METHODS):
+        assert name in text
+    for method in METHODS.values():
+        assert all(option in text for option, _, _ in described(method.options))
+    assert "cannot be used" in text
 
 
 def test_people_hear_at_once_what_a_command_does(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,7 +85,7 @@ def test_a_reader_that_leaves_early_sees_no_traceback(arguments: tuple[str, ...]
     with os.fdopen(write, "w") as pipe:
         command = [sys.executable, "-m", "ded_bench", *arguments]
         done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 1
+    assert done.returncode in (0, 1)  # argparse itself passes over what it cannot write
     assert done.stderr == ""
 
 

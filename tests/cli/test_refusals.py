@@ -180,10 +180,9 @@ def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp
 @pytest.mark.parametrize(
     ("options", "problem_said"),
     [
-        (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method, settings and regime"),
-        (("--settings", "nope*"), "matches no settings"),
+        (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method and regime"),
         (("--method", "ded", "--regime", "TO"), "is not trained"),
-        (("--method", "ded-dpc", "--start", "p.safetensors"), "is for ded-dpc-shared alone"),
+        (("--method", "ded-dpc", "--start", "p.safetensors"), "ded-dpc does not start from other weights"),
     ],
 )
 def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:

@@ -1,0 +1,1 @@
+"""The plant `detailed`: machines with exciters, stabilisers and governors on the full AC network."""

@@ -1,0 +1,189 @@
+"""The AC network between its ports, and its power flow.
+
+A port is a bus with a machine or a load; all others carry no current and are eliminated (Kron), which is
+exact. Loads draw constant P and Q. Everything is in pu of the network's base power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.time_varying import Indices
+from ded_bench.problem.case import Array
+
+Complex = NDArray[np.complex128]
+
+#: Added to r and x of every line, as the field's simulator ANDES does, with which this plant is compared:
+#: without it, powers of the slack differ by up to 8e-6 pu.
+LINE_EPSILON = 1e-8
+#: Newton stops at this mismatch, pu, and gives up after so many steps.
+MISMATCH, NEWTON_STEPS = 1e-11, 30
+
+
+class OperatingPoint(NamedTuple):
+    """A solved power flow."""
+
+    voltage: Complex  # at the ports, (n_port,), pu; the balancing machine's bus has angle 0
+    power: Complex  # P + jQ out of every machine, (n_machine,), pu
+    p_drawn: Array  # active power drawn at the ports, (n_port,), pu
+
+
+@dataclass(frozen=True, eq=False)
+class PortNetwork:
+    """Admittances between ports, what is drawn there nominally, and where machines stand."""
+
+    buses: tuple[str, ...]
+    ports: Indices  # (n_port,): their buses, first those with a load
+    n_load_port: int
+    admittance: Complex  # (n_port, n_port), pu
+    spread: Complex  # voltages of all buses by those of ports, (n_bus, n_port)
+    p_drawn: Array  # nominal active power drawn at the ports, (n_port,), pu
+    q_drawn: Array  # reactive power, always, (n_port,), pu
+    machine_port: Indices  # (n_machine,): the port of each machine
+    share: Array  # (n_machine,): of what machines at its bus deliver together
+    p_nominal: Array  # (n_machine,), pu, of the rounded power flow in the data
+    guess: Complex  # voltages of that power flow, (n_port,), pu; magnitudes at machines are held
+    balancing: int  # the machine that balances the power flow, alone at its bus
+
+    @property
+    def port_names(self) -> tuple[str, ...]:
+        """The buses of the ports."""
+        return tuple(self.buses[i] for i in self.ports)
+
+    def power_flow(self, p_machine: Array, p_drawn: Array, guess: Complex | None = None) -> OperatingPoint:
+        """Solve for voltages, with magnitudes held where machines are; one machine's power follows.
+
+        Newton's method in polar coordinates.
+
+        Args:
+            p_machine: active power, (n_machine,), pu; that of the balancing one is not looked at.
+            p_drawn: active power that loads draw at the ports, (n_port,), pu.
+            guess: voltages to start from, (n_port,), pu; default: nominal.
+
+        Raises:
+            SimulationError: there is no solution.
+        """
+        n, held = len(self.ports), np.unique(self.machine_port)
+        wanted = np.zeros(n)
+        np.add.at(wanted, self.machine_port, p_machine)
+        wanted -= p_drawn
+        angle, size = np.angle(self.guess if guess is None else guess), np.abs(self.guess)
+        if guess is not None:
+            size = np.abs(guess)
+            size[held] = np.abs(self.guess[held])
+        balancing = self.machine_port[self.balancing]
+        turning = np.delete(np.arange(n), balancing)
+        free = np.setdiff1d(np.arange(n), held)
+        for _ in range(NEWTON_STEPS):
+            voltage = size * np.exp(1j * (angle - angle[balancing]))
+            injected = voltage * (self.admittance @ voltage).conj()
+            off = np.concatenate([(injected.real - wanted)[turning], (injected.imag + self.q_drawn)[free]])
+            worst = np.abs(off).max(initial=0.0)
+            if worst < MISMATCH:
+                return self._point(voltage, injected, p_machine, p_drawn)
+            if not worst < np.inf:
+                break
+            try:
+                step = np.linalg.solve(self._jacobian(voltage, injected, turning, free), off)
+            except np.linalg.LinAlgError:
+                break
+            angle[turning] -= step[: n - 1]
+            size[free] -= step[n - 1 :]
+        raise SimulationError("the power flow has no solution")
+
+    def nominal(self) -> OperatingPoint:
+        """The power flow of the data, solved again: its rounded one is no equilibrium."""
+        return self.power_flow(self.p_nominal, self.p_drawn)
+
+    def balance_slopes(self, point: OperatingPoint) -> tuple[Array, Array]:
+        """How the balancing machine's power changes with other powers, losses included.
+
+        Returns:
+            Derivatives by the machines' active powers, (n_machine,), zero for the balancing one (about -1
+            for all others), and by the active powers drawn at the ports, (n_port,).
+        """
+        n = len(self.ports)
+        balancing = self.machine_port[self.balancing]
+        turning = np.delete(np.arange(n), balancing)
+        free = np.setdiff1d(np.arange(n), self.machine_port)
+        injected = point.voltage * (self.admittance @ point.voltage).conj()
+        by_angle, by_size = self._slopes(point.voltage, injected)
+        own = np.concatenate([by_angle.real[balancing, turning], by_size.real[balancing, free]])
+        jacobian = self._jacobian(point.voltage, injected, turning, free)
+        by_injection = np.zeros(n)
+        by_injection[turning] = np.linalg.solve(jacobian.T, own)[: n - 1]
+        by_machine = by_injection[self.machine_port]
+        drawn = -by_injection
+        drawn[balancing] = 1.0
+        return by_machine, drawn
+
+    def _point(self, voltage: Complex, injected: Complex, p_machine: Array, p_drawn: Array) -> OperatingPoint:
+        delivered = injected[self.machine_port] + (p_drawn + 1j * self.q_drawn)[self.machine_port]
+        power = p_machine + 1j * self.share * delivered.imag
+        power[self.balancing] = delivered[self.balancing]
+        return OperatingPoint(voltage, power, p_drawn)
+
+    def _slopes(self, voltage: Complex, injected: Complex) -> tuple[Complex, Complex]:
+        """Derivatives of the complex injections by angles and magnitudes, each (n_port, n_port)."""
+        coupled = voltage[:, None] * (self.admittance * voltage).conj()
+        return 1j * (np.diag(injected) - coupled), (coupled + np.diag(injected)) / np.abs(voltage)
+
+    def _jacobian(self, voltage: Complex, injected: Complex, turning: Indices, free: Indices) -> Array:
+        by_angle, by_size = self._slopes(voltage, injected)
+        return np.block(
+            [
+                [by_angle.real[np.ix_(turning, turning)], by_size.real[np.ix_(turning, free)]],
+                [by_angle.imag[np.ix_(free, turning)], by_size.imag[np.ix_(free, free)]],
+            ]
+        )
+
+
+def port_network(network: Any, machines: Any) -> PortNetwork:
+    """Build the network of a case's records; ports are the buses with a machine, a load or a feed-in."""
+    index = {bus.id: i for i, bus in enumerate(network.buses)}
+    full = np.zeros((len(index), len(index)), dtype=complex)
+    for bus in network.buses:
+        full[index[bus.id], index[bus.id]] += bus.gs + 1j * bus.bs
+    for line in network.lines:
+        near, far = index[line.from_bus], index[line.to_bus]
+        series = 1.0 / (line.r + LINE_EPSILON + 1j * (line.x + LINE_EPSILON))
+        own, tap = series + 0.5j * line.b, line.tap * np.exp(1j * np.radians(line.shift_deg))
+        full[near, near] += own / abs(tap) ** 2
+        full[far, far] += own
+        full[near, far] -= series / np.conj(tap)
+        full[far, near] -= series / tap
+    stations = [machine.bus for machine in machines.machines]
+    # A bus without machines that feeds in is a negative load; with machines, pg and qg are theirs.
+    drawn = np.array([
+        bus.pd + 1j * bus.qd - (0.0 if bus.id in stations else bus.pg + 1j * bus.qg) for bus in network.buses
+    ])  # fmt: skip
+    loads, others = np.flatnonzero(drawn), np.flatnonzero(drawn == 0.0)
+    bare = [i for i in others if network.buses[i].id in stations]
+    ports = np.array([*loads, *bare])
+    inner = np.setdiff1d(np.arange(len(index)), ports)
+    spread = np.zeros((len(index), len(ports)), dtype=complex)
+    spread[ports] = np.eye(len(ports))
+    spread[inner] = -np.linalg.solve(full[np.ix_(inner, inner)], full[np.ix_(inner, ports)])
+    place = {network.buses[bus].id: port for port, bus in enumerate(ports)}
+    generated = {bus.id: bus.pg for bus in network.buses}
+    return PortNetwork(
+        buses=tuple(index),
+        ports=ports,
+        n_load_port=len(loads),
+        admittance=full[ports] @ spread,
+        spread=spread,
+        p_drawn=drawn[ports].real,
+        q_drawn=drawn[ports].imag,
+        machine_port=np.array([place[m.bus] for m in machines.machines]),
+        share=np.array([m.share for m in machines.machines]),
+        p_nominal=np.array([m.share * generated[m.bus] for m in machines.machines]),
+        guess=np.array(
+            [network.buses[i].v * np.exp(1j * np.radians(network.buses[i].angle_deg)) for i in ports]
+        ),
+        balancing=stations.index(network.slack_machine_bus),
+    )

@@ -1,0 +1,92 @@
+"""Network and machines of one case together: power flow, equilibrium, linearisation and its modes."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.plants.detailed.equilibrium import Equilibrium, equilibrium
+from ded_bench.plants.detailed.machine_arrays import MachineArrays, machine_arrays, moving
+from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
+from ded_bench.plants.time_varying import Indices
+from ded_bench.problem.case import Array
+
+if TYPE_CHECKING:
+    from ded_bench.plants.detailed.symbolic import SymbolicPlant
+
+
+class Slopes(NamedTuple):
+    """Derivatives by the states that move, with voltages eliminated."""
+
+    rates: Array  # (n_moving, n_moving), 1/s
+    p_e: Array  # electrical powers, (n_machine, n_moving), pu
+    p_m: Array  # turbines' powers, (n_machine, n_moving), pu
+
+
+@dataclass(frozen=True, eq=False)
+class PowerSystem:
+    """Equations of one case; a machine keeps its speed where the slack is infinite, none on an island."""
+
+    network: PortNetwork
+    data: MachineArrays
+
+    @staticmethod
+    def of(network: Any, machines: Any, island: bool) -> PowerSystem:
+        """Build it from the records of network.json and machines.json."""
+        ac = port_network(network, machines)
+        infinite = None if island else machines.machines[ac.balancing].name
+        return PowerSystem(ac, machine_arrays(machines, ac.machine_port, infinite))
+
+    @property
+    def island(self) -> bool:
+        """Whether every machine can change its speed."""
+        return bool((self.data.inverse_m > 0.0).all())
+
+    @functools.cached_property
+    def moving(self) -> Indices:
+        """See `machine_arrays.moving`."""
+        return moving(self.data)
+
+    @functools.cached_property
+    def symbolic(self) -> SymbolicPlant:
+        """The equations with their Jacobians."""
+        from ded_bench.plants.detailed.symbolic import symbolic_plant  # CasADi: simulation does without
+
+        return symbolic_plant(self.data, self.network)
+
+    def equilibrium(self, point: OperatingPoint) -> Equilibrium:
+        """See `equilibrium`."""
+        return equilibrium(self.data, point)
+
+    def slopes(self, x: Array, voltage: Complex, p_drawn: Array) -> Slopes:
+        """Linearise at states (N_STATES, n_machine) and voltages (n_port,), pu."""
+        n, n_v = len(self.data.port), 2 * len(voltage)
+        references = np.zeros(n)  # they enter linearly
+        given = x.ravel(), interleaved(voltage), references, p_drawn, references
+        full = self.symbolic.jacobian(*given).sparse().tocsr()
+        columns = full[:, : x.size].tocsc()[:, self.moving].toarray()
+        by_v = full[:, x.size :].toarray()
+        balance = slice(x.size, x.size + n_v)
+        v_by_x = np.linalg.solve(by_v[balance], -columns[balance])
+        reduced = columns + by_v @ v_by_x
+        outputs = reduced[x.size + n_v :]
+        return Slopes(reduced[self.moving], outputs[:n], outputs[n:])
+
+    def modes(self, point: OperatingPoint) -> NDArray[np.complex128]:
+        """Eigenvalues at an equilibrium, 1/s, ascending in size; that of an island's free angle is first."""
+        rest = self.equilibrium(point)
+        values = np.linalg.eigvals(self.slopes(rest.x, point.voltage, point.p_drawn).rates)
+        return np.asarray(values[np.argsort(np.abs(values))], dtype=np.complex128)
+
+    def stable(self, point: OperatingPoint) -> bool:
+        """Tell whether an equilibrium is one to which small deviations return."""
+        return bool((self.modes(point)[int(self.island) :].real < 0.0).all())
+
+
+def interleaved(voltage: Complex) -> Array:
+    """Real and imaginary parts in turn, (..., 2 n)."""
+    return np.ascontiguousarray(voltage).view(np.float64)

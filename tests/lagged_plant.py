@@ -21,13 +21,14 @@ from ded_bench.plants.plant import PLANTS, Piece
 from ded_bench.plants.time_varying import Delivered, Hold, Indices, TimeVarying, across_intervals
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, State
+from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.trajectory import Trajectory
 
 #: Time constant of the turbines, s.
 LAG_S = 0.3
 
 
-class LaggedCase(Case):
+class LaggedCase(LosslessCase):
     """A case that is simulated on the lagged plant."""
 
     @property

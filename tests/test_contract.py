@@ -24,6 +24,7 @@ from ded_bench.plants.score import judge, score
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance, LoadPoints
+from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import model_file
@@ -42,7 +43,7 @@ PROMISES_NOTHING = "ded-dpc-paper"
 @pytest.fixture(scope="session")
 def strange() -> Case:
     """A grid that nothing was made for."""
-    return parse_record(Case, json.dumps(grid(3, seed=3)), "strange")
+    return parse_record(LosslessCase, json.dumps(grid(3, seed=3)), "strange")
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from ded_bench.analysis.summary import statistics, summary
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
 from ded_bench.methods.options import DEFAULT
-from ded_bench.problem.case import Name, NonNegative, Number
+from ded_bench.problem.quantities import Name, NonNegative, Number
 
 
 class PaperRow(Record):

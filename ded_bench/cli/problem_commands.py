@@ -134,9 +134,9 @@ def _cases(a: argparse.Namespace) -> int:
 def _list() -> int:
     rows = [["case", "buses", "generators", "loads", "instances", "version"]]
     folders = {path.parent: Case.load(path) for path in SHIPPED_CASES.glob("*/case.json")}
-    for folder, case in sorted(folders.items(), key=lambda item: len(item[1].buses)):
+    for folder, case in sorted(folders.items(), key=lambda item: item[1].n_bus):
         split, manifest = load_split(folder), load_manifest(folder)
-        sizes = len(case.buses), len(case.generators), len(case.loads)
+        sizes = case.n_bus, len(case.generators), len(case.loads)
         instances = f"{len(split.train)}+{len(split.test)}"
         rows.append([case.id, *map(str, sizes), instances, manifest.version if manifest else ""])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -150,7 +150,7 @@ def _check(case: Case, count: int) -> int:
     from ded_bench.analysis.inspect_case import check_case
     from ded_bench.plants.lossless.network import PowerFlowError
 
-    sizes = f"{len(case.buses)} buses, {len(case.generators)} generators, {len(case.loads)} loads"
+    sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
     print(f"case {case.id}: {sizes}", flush=True)
     say(f"drawing and simulating {counted(count, 'instance')}")
     try:
@@ -184,8 +184,8 @@ def _print_check(case: Case, found: CaseCheck) -> None:
         print(f"             {percent:>3} %     {peak:.4g}")
     print("static dispatch violates")
     for regime, limits in case.regimes.items():
-        share = found.violating(limits.omega_hz)
-        print(f"             {regime}: {100 * share:.0f} % of the instances beyond {limits.omega_hz:g} Hz")
+        share = found.violating(limits.largest_hz)
+        print(f"             {regime}: {100 * share:.0f} % of the instances beyond {limits.largest_hz:g} Hz")
 
 
 def _scenarios(a: argparse.Namespace) -> int:

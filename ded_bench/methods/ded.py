@@ -23,6 +23,7 @@ from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_l
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model, fix
 from ded_bench.solvers.linear_program import assign
@@ -77,7 +78,7 @@ def _accelerated(
     case: Case, regime: str, solver: str, time_limit_s: float | None, instance: Instance
 ) -> Solution:
     """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
-    needed = BYTES_PER_ENTRY * (instance.steps + 1) * len(case.buses) ** 2
+    needed = BYTES_PER_ENTRY * (instance.steps + 1) * case.n_bus**2
     if refusal := too_large(needed, "the sequence of programs", "`ded-slp` takes less"):
         return refusal
     started = time.perf_counter()
@@ -99,7 +100,7 @@ def _accelerated(
 
 def program_bytes(case: Case, instance: Instance) -> int:
     """About the memory that the model and IPOPT take, bytes."""
-    return BYTES_PER_FLOW * len(case.lines) * (instance.steps + 1)
+    return BYTES_PER_FLOW * len(lossless(case).lines) * (instance.steps + 1)
 
 
 @functools.lru_cache(maxsize=1)
@@ -127,7 +128,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m = pyo.ConcreteModel()
     m.t = dae.ContinuousSet(bounds=(0, steps * dt))
     m.gen = pyo.Set(initialize=case.generators, ordered=True)
-    m.algebraic = pyo.Set(initialize=[case.buses[i].id for i in network.algebraic], ordered=True)
+    m.algebraic = pyo.Set(initialize=[network.case.buses[i].id for i in network.algebraic], ordered=True)
     m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
 
     # Data, fixed by bounds.
@@ -169,7 +170,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
     @m.Constraint(m.t)
     def eq_slack(m: Any, t: float) -> Any:
-        return m.p_slack_up[t] - m.p_slack_down[t] == injection(case.slack, t)
+        return m.p_slack_up[t] - m.p_slack_down[t] == injection(network.case.slack, t)
 
     @m.Constraint(m.gen, m.step)
     def ineq_ramp(m: Any, g: str, k: int) -> Any:
@@ -213,19 +214,19 @@ def injections(m: pyo.ConcreteModel, times: Any, case: Case, network: Network) -
         case: the grid.
         network: its network.
     """
-    leaving: dict[str, list[int]] = {bus.id: [] for bus in case.buses}
-    arriving: dict[str, list[int]] = {bus.id: [] for bus in case.buses}
-    for number, line in enumerate(case.lines):
+    leaving: dict[str, list[int]] = {bus.id: [] for bus in network.case.buses}
+    arriving: dict[str, list[int]] = {bus.id: [] for bus in network.case.buses}
+    for number, line in enumerate(network.case.lines):
         leaving[line.from_bus].append(number)
         arriving[line.to_bus].append(number)
-    m.line = pyo.RangeSet(0, len(case.lines) - 1)
+    m.line = pyo.RangeSet(0, len(network.case.lines) - 1)
 
     def angle(bus: str, t: float) -> Any:
         return 0.0 if bus == case.slack else m.theta[bus, t] if bus in m.gen else m.angle[bus, t]
 
     @m.Expression(m.line, times)
     def flow(m: Any, number: int, t: float) -> Any:
-        line = case.lines[number]
+        line = network.case.lines[number]
         return float(network.coupling[number]) * pyo.sin(angle(line.from_bus, t) - angle(line.to_bus, t))
 
     def injection(bus: str, t: float) -> Any:

@@ -70,7 +70,7 @@ def _program(case: Case, elements: int) -> RadauProgram:
 
 def program_bytes(case: Case, elements: int) -> int:
     """About the memory that IPOPT takes for so many elements, bytes, as if each were a dense block."""
-    n_gen, n_bus = len(case.generators), len(case.buses)
+    n_gen, n_bus = len(case.generators), case.n_bus
     columns = len(POINTS) * (n_gen + n_bus + 1) + n_gen  # as in `RadauProgram`
     return BYTES_PER_ENTRY * elements * columns**2
 

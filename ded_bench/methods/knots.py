@@ -63,7 +63,7 @@ def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Ind
 def tightened(case: Case, margin: float) -> Case:
     """A case whose frequency bounds are smaller by a part of them."""
     regimes = {
-        name: limits.model_copy(update={"omega_hz": (1 - margin) * limits.omega_hz})
+        name: limits.model_copy(update={kind: (1 - margin) * value for kind, value in limits})
         for name, limits in case.regimes.items()
     }
     return case.model_copy(update={"regimes": regimes})

@@ -41,8 +41,9 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
-from ded_bench.problem.case import LARGEST, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.quantities import LARGEST
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 

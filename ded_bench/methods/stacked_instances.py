@@ -37,7 +37,7 @@ class StackedInstances:
         Raises:
             PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
         """
-        machines = (case.slack, *case.generators)
+        machines = case.priced
         return StackedInstances(
             load=load_segments(case, instances),
             cost=np.array([[i.cost[bus] for bus in machines] for i in instances]),

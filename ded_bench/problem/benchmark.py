@@ -13,8 +13,9 @@ from pydantic import Field
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record, write_atomically, write_record
-from ded_bench.problem.case import SHIPPED_CASES, Case, Name
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, load_instances
+from ded_bench.problem.quantities import Name
 from ded_bench.problem.sampling import (
     DURATION_S,
     VALIDATION_SEED,

@@ -1,31 +1,35 @@
-"""Case: buses, lines, machines and limits of one grid, and the ranges its instances are drawn from."""
+"""Case: one grid, its limits, and the ranges its instances are drawn from; its file, and those beside it."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+import importlib
+import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import PrivateAttr, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Fingerprinted, Record, read_record
+from ded_bench.files.strict import Fingerprinted, parse_record, read_text
+from ded_bench.problem.grid_files import (
+    MACHINES_FILE,
+    NETWORK_FILE,
+    GridFiles,
+    load_grid_files,
+)
+from ded_bench.problem.limits import Agc, Bounds, IslandRegime, Regime, Transfer
+from ded_bench.problem.quantities import Array as Array
+from ded_bench.problem.quantities import Extended, NonNegative, Positive, Probability, Range
 
-Array = NDArray[np.float64]
-#: Numbers beyond these are typing errors or in other units; within them no product overflows.
-SMALLEST, LARGEST = 1e-9, 1e9
-Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, le=LARGEST)]
-NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
-Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-Range = tuple[Number, Number]
-#: Knots of a case that names no number of its own.
-KNOTS = 50
+#: Records of a case's file by its schema: `module:class`.
+SCHEMAS = {
+    "ded-bench/case/1": "ded_bench.problem.lossless_case:LosslessCase",
+    "ded-bench/case/2": "ded_bench.problem.lossless_case:LosslessCase",
+    "ded-bench/case/3": "ded_bench.problem.detailed_case:DetailedCase",
+}
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 #: Cases that come with the suite: beside a checkout, or inside an installed package.
@@ -33,55 +37,6 @@ SHIPPED_CASES = next(
     (p for p in (REPOSITORY / "problems", REPOSITORY / "ded_bench" / "_problems") if p.is_dir()),
     REPOSITORY / "problems",
 )
-
-
-class Extended(Record):
-    """A record that a later schema extends: what is not given is not written, as before."""
-
-    @model_serializer(mode="wrap")
-    def _given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in write(self).items() if value is not None}
-
-
-class Bus(Record):
-    """A node with fixed voltage magnitude `v` in pu (paper, Table I)."""
-
-    id: Name
-    kind: Literal["slack", "generator", "load", "junction"]
-    v: Magnitude
-    p_nominal: Number | None = None  # loads only: nominal injection in pu, negative
-
-
-class Line(Record):
-    """A series impedance r + jx in pu between two buses (paper, Table II)."""
-
-    from_bus: Name = Field(alias="from")
-    to_bus: Name = Field(alias="to")
-    r: NonNegative
-    x: Magnitude
-
-
-class Machine(Extended):
-    """Inertia m (s² pu/rad), damping d (s pu/rad), power limits in pu and ramp limit of one generator."""
-
-    m: Magnitude
-    d: NonNegative
-    p_nominal: Number
-    p_min: Number
-    p_max: Number
-    ramp_pu_per_s: Magnitude | None = None  # case/2; else the case's
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Machine:
-        if not self.p_min < self.p_max:
-            raise ValueError("p_min must be below p_max")
-        return self
-
-
-class Regime(Record):
-    """Limits of one operating regime: |omega| at every generator stays within `omega_hz`."""
-
-    omega_hz: Magnitude
 
 
 class Sampling(Extended):
@@ -117,90 +72,130 @@ class Sampling(Extended):
 
 
 class Case(Fingerprinted, Extended):
-    """One grid. Buses keep the file's order; generators and loads are named by their bus."""
+    """What the records of all schemas share.
 
-    schema_: Literal["ded-bench/case/1", "ded-bench/case/2"] = Field(alias="schema")
-    id: Name
-    source: str | dict[Name, str] | None = None  # case/2: where the data come from, and their licence
-    f0_hz: Magnitude
-    buses: tuple[Bus, ...]
-    lines: tuple[Line, ...]
-    machines: dict[Name, Machine]
-    ramp_pu_per_s: Magnitude
-    regimes: dict[Name, Regime]
-    sampling: Sampling
-    knots: Annotated[int, Field(ge=2, le=100_000)] | None = None  # case/2: `n_knots`
+    Generators are what a schedule gives set-points to; loads are named by their bus.
+    """
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Case:
-        names = [bus.id for bus in self.buses]
-        if len(set(names)) != len(names):
-            raise ValueError("buses: two buses have the same id")
-        if [bus.kind for bus in self.buses].count("slack") != 1:
-            raise ValueError("buses: exactly one slack bus is needed")
-        if not self.generators or not self.loads:
-            raise ValueError("buses: at least one generator and one load bus are needed")
-        if set(self.machines) != set(self.generators):
-            raise ValueError("machines: must name exactly the generator buses")
-        if not self.regimes:
-            raise ValueError("regimes: at least one regime is needed")
-        for bus in self.buses:
-            if (bus.kind == "load") != (bus.p_nominal is not None):
-                raise ValueError(f"buses: {bus.id}: p_nominal belongs to load buses, and to all of them")
-        for line in self.lines:
-            if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - set(names):
-                raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
-        self._check_connected(set(names))
-        self._check_schema()
-        return self
+    if TYPE_CHECKING:  # each record declares its fields in the order of its file, as its fingerprint needs it
+        schema_: str
+        id: str
+        f0_hz: float
+        machines: Mapping[str, Any]
+        ramp_pu_per_s: float
+        regimes: Mapping[str, Regime | IslandRegime]
+        sampling: Sampling
 
-    def _check_schema(self) -> None:
-        given = {*self.model_fields_set, *(f"sampling.{name}" for name in self.sampling.model_fields_set)}
-        given |= {f"machines.{bus}.{n}" for bus, m in self.machines.items() for n in m.model_fields_set}
-        newer = {"source", "knots", "sampling.rate_relative_per_s"}
-        newer |= {f"machines.{bus}.ramp_pu_per_s" for bus in self.machines}
-        if self.schema_ == "ded-bench/case/1" and given & newer:
-            raise ValueError(f"{min(given & newer)}: belongs to schema ded-bench/case/2")
-
-    def _check_connected(self, names: set[str]) -> None:
-        reached = {self.slack}
-        for _ in names:
-            for line in self.lines:
-                if reached & {line.from_bus, line.to_bus}:
-                    reached |= {line.from_bus, line.to_bus}
-        if names - reached:
-            raise ValueError(f"lines: bus {min(names - reached)} is not connected to the slack bus")
+    _grid: GridFiles | None = PrivateAttr(default=None)
 
     @staticmethod
     def load(name_or_path: str | Path) -> Case:
         """Read a case by the name of a shipped one, its folder, or its case.json.
 
         A folder that holds no case, such as results named after theirs, does not hide the shipped case.
+        `network.json` and `machines.json` beside it are read, too: case/3 needs them.
 
         Raises:
-            InputError: there is no such case, or its file is wrong.
+            InputError: there is no such case, or a file is missing or wrong.
         """
-        return read_record(Case, case_file(name_or_path))
+        path = case_file(name_or_path)
+        text = read_text(path)
+        case = parse_record(_record_of(text), text, path)
+        case._read_grid(path.parent)
+        return case
+
+    def _read_grid(self, folder: Path) -> None:
+        if all((folder / name).is_file() for name in (NETWORK_FILE, MACHINES_FILE)):
+            grid = load_grid_files(folder, self.id, self.f0_hz)
+            self._grid = grid
+            self._check_grid(grid, folder)
+
+    def _check_grid(self, grid: GridFiles, folder: Path) -> None:
+        """Raise InputError unless the files beside the case have its machines and loads."""
+        named = {self.machine_of(name) for name in self.priced}
+        if differing := named ^ set(grid.machines):
+            where = "case.json" if differing & named else MACHINES_FILE
+            problem = f"machine {min(differing)} stands here only"
+            raise InputError(folder / where, "machines", problem)
+        if unknown := set(self.loads) - {bus.id for bus in grid.network.buses}:
+            raise InputError(folder / NETWORK_FILE, "buses", f"there is no bus {min(unknown)} of a load")
+
+    def __eq__(self, other: object) -> bool:
+        """Equal content, also of the files beside the case."""
+        return isinstance(other, Case) and super().__eq__(other) and self._grid == other._grid
+
+    __hash__ = Fingerprinted.__hash__
+
+    @property
+    def detailed(self) -> GridFiles:
+        """The AC network and the machines of the files beside the case.
+
+        Raises:
+            InputError: there are none.
+        """
+        if self._grid is None:
+            problem = f"{NETWORK_FILE} and {MACHINES_FILE} are needed beside case.json"
+            raise InputError(f"case {self.id}", "plant", problem)
+        return self._grid
 
     @property
     def plant_name(self) -> str:
         """Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`)."""
-        return "lossless"
+        raise NotImplementedError
 
-    @functools.cached_property
-    def slack(self) -> str:
-        """Id of the slack bus."""
-        return next(bus.id for bus in self.buses if bus.kind == "slack")
+    @property
+    def slack(self) -> str | None:
+        """Name of what takes up every imbalance; None on an island."""
+        raise NotImplementedError
 
-    @functools.cached_property
+    @property
     def generators(self) -> tuple[str, ...]:
-        """Ids of the generator buses (the paper's 𝒢, without the slack)."""
-        return tuple(bus.id for bus in self.buses if bus.kind == "generator")
+        """What a schedule gives set-points to (the paper's 𝒢, without the slack)."""
+        raise NotImplementedError
 
-    @functools.cached_property
+    @property
     def loads(self) -> tuple[str, ...]:
-        """Ids of the load buses (the paper's ℒ)."""
-        return tuple(bus.id for bus in self.buses if bus.kind == "load")
+        """Buses of the loads (the paper's ℒ)."""
+        raise NotImplementedError
+
+    @property
+    def load_nominal(self) -> Array:
+        """Nominal load injections, shape (n_load,), pu (negative, but for feed-ins of lossless cases)."""
+        raise NotImplementedError
+
+    @property
+    def inertia(self) -> Array:
+        """Weights of the generators in the mean frequency, shape (n_gen,)."""
+        raise NotImplementedError
+
+    @property
+    def n_bus(self) -> int:
+        """Number of buses."""
+        raise NotImplementedError
+
+    @property
+    def n_knots(self) -> int:
+        """Number of knots of policies and knot methods (`knots` of the file)."""
+        raise NotImplementedError
+
+    def machine_of(self, name: str) -> str:
+        """Name in `machines.json` of a generator, or of the slack."""
+        return name
+
+    @property
+    def agc(self) -> Agc | None:
+        """Secondary control; None: there is none."""
+        return None
+
+    @property
+    def transfers(self) -> tuple[Transfer, ...]:
+        """Limits on what groups of machines deliver."""
+        return ()
+
+    @property
+    def priced(self) -> tuple[str, ...]:
+        """What an instance gives costs to: the slack, if there is one, and the generators."""
+        return self.generators if self.slack is None else (self.slack, *self.generators)
 
     @functools.cached_property
     def p_min(self) -> Array:
@@ -218,11 +213,6 @@ class Case(Fingerprinted, Extended):
         return np.array([self.machines[g].p_nominal for g in self.generators])
 
     @functools.cached_property
-    def load_nominal(self) -> Array:
-        """Nominal load injections, shape (n_load,), pu (negative)."""
-        return np.array([bus.p_nominal for bus in self.buses if bus.kind == "load"], dtype=float)
-
-    @functools.cached_property
     def ramp(self) -> Array:
         """Ramp limits of the generators, shape (n_gen,), pu/s."""
         own = [self.machines[g].ramp_pu_per_s for g in self.generators]
@@ -235,23 +225,31 @@ class Case(Fingerprinted, Extended):
             return np.outer(self.sampling.rate_relative_per_s, np.abs(self.load_nominal))
         return np.repeat(np.array([self.sampling.rate_pu_per_s], dtype=float).T, len(self.loads), axis=1)
 
-    @property
-    def n_knots(self) -> int:
-        """Number of knots of policies and knot methods, chosen from the fastest mode (`knots` in case/2)."""
-        return KNOTS if self.knots is None else self.knots
-
     def knot_times(self, horizon_s: float) -> Array:
         """Equidistant times from 0 to the horizon, shape (n_knots,), s."""
         return np.linspace(0.0, horizon_s, self.n_knots)
 
-    def omega_bound(self, regime: str) -> float:
-        """Bound on |omega| in rad/s.
+    def bounds(self, regime: str) -> Bounds:
+        """Bounds on frequencies.
 
         Raises:
             InputError: the case has no such regime.
         """
         self.check_regimes([regime])
-        return 2 * np.pi * self.regimes[regime].omega_hz
+        return self.regimes[regime].bounds(self.inertia)
+
+    def omega_bound(self, regime: str) -> float:
+        """Bound on |omega| of every generator in rad/s.
+
+        Raises:
+            InputError: the case has no such regime, or the regime bounds something else.
+        """
+        self.check_regimes([regime])
+        limits = self.regimes[regime]
+        if not isinstance(limits, Regime):
+            problem = "bounds the mean frequency and swings about it, not |omega|, which is needed here"
+            raise InputError(f"case {self.id}", f"regimes.{regime}", problem)
+        return 2 * np.pi * limits.omega_hz
 
     def check_regimes(self, regimes: Iterable[str]) -> None:
         """Raise InputError unless the case knows every one of the regimes."""
@@ -262,6 +260,18 @@ class Case(Fingerprinted, Extended):
                     "regime",
                     f"unknown regime {regime!r} (known: {', '.join(self.regimes)})",
                 )
+
+
+def _record_of(text: str) -> type[Case]:
+    """The record of a file's schema; what names none of them is refused as the oldest."""
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        data = None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    module, _, kind = SCHEMAS[schema if schema in SCHEMAS else min(SCHEMAS)].partition(":")
+    record: type[Case] = getattr(importlib.import_module(module), kind)
+    return record
 
 
 def case_file(name_or_path: str | Path) -> Path:

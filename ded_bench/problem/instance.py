@@ -14,7 +14,8 @@ from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
-from ded_bench.problem.case import Array, Case, Extended, Name, NonNegative, Number, Positive
+from ded_bench.problem.case import Case
+from ded_bench.problem.quantities import Array, Extended, Name, NonNegative, Number, Positive
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,30 +92,50 @@ def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
         raise ValueError(f"{name}: must be a whole multiple of dt_s")
 
 
-class Initial(Extended):
-    """State at t = 0, by generator bus: power in pu, frequency deviation in rad/s, angle in rad.
+class AgcState(Extended):
+    """Secondary control at t = 0: what it holds, the integral of the mean frequency, when it acts next."""
 
-    Without angles (always in instance/1) they are those of the power flow.
+    held_pu: Number = 0.0
+    integral_rad: Number = 0.0
+    next_s: NonNegative | None = None  # None: after a whole period
+
+
+class Initial(Extended):
+    """State at t = 0, by generator: set-point in pu, frequency deviation in rad/s, angle in rad.
+
+    Without angles (always in instance/1) they are those of the power flow. On an island angles are relative
+    to their inertia-weighted mean, and turbines' powers (pu) and secondary control may be given, too.
     """
 
     power: dict[Name, Number]
     omega: dict[Name, Number]
     theta: dict[Name, Number] | None = None
+    mechanical: dict[Name, Number] | None = None
+    agc: AgcState | None = None
+
+    @property
+    def measured(self) -> str | None:
+        """The first field given beyond powers and frequencies; None: it starts from an equilibrium."""
+        return next((n for n in ("theta", "mechanical", "agc") if getattr(self, n) is not None), None)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
     """Where the generators are at an instant, as a planner is told; it need not be an equilibrium."""
 
-    theta: Array  # (n_gen,), rad, relative to the slack
+    theta: Array  # (n_gen,), rad, relative to the slack; on an island to the inertia-weighted mean
     omega: Array  # (n_gen,), rad/s, deviation from nominal
     p_gen: Array  # (n_gen,), pu: set-points
+    mechanical: Array | None = None  # (n_gen,), pu: turbines' powers, where they are not the set-points
+    agc: AgcState | None = None
 
     def initial(self, case: Case) -> Initial:
         """The state at t = 0 of an instance that starts here (instance/2)."""
         arrays = {"power": self.p_gen, "omega": self.omega, "theta": self.theta}
-        by_bus = {n: dict(zip(case.generators, a.tolist(), strict=True)) for n, a in arrays.items()}
-        return Initial(**by_bus)
+        if self.mechanical is not None:
+            arrays["mechanical"] = self.mechanical
+        by_name = {n: dict(zip(case.generators, a.tolist(), strict=True)) for n, a in arrays.items()}
+        return Initial(**by_name, agc=self.agc)
 
 
 class Instance(Fingerprinted):
@@ -141,8 +162,9 @@ class Instance(Fingerprinted):
     def _consistent(self) -> Instance:
         check_whole_steps("horizon_s", self.horizon_s, self.dt_s)
         second = self.schema_ == "ded-bench/instance/2"
-        if "theta" in self.initial.model_fields_set and not second:
-            raise ValueError("initial.theta: needs schema ded-bench/instance/2")
+        newer = {"theta", "mechanical", "agc"} & self.initial.model_fields_set
+        if newer and not second:
+            raise ValueError(f"initial.{max(newer)}: needs schema ded-bench/instance/2")
         for bus, load in self.load.items():
             if isinstance(load, LoadPoints):
                 if not second:
@@ -171,23 +193,31 @@ class Instance(Fingerprinted):
         return instance, case
 
     def check_case(self, case: Case, source: str | Path = "") -> None:
-        """Raise InputError unless this instance names exactly the buses of `case`."""
+        """Raise InputError unless this instance names exactly the generators and loads of `case`."""
         source = source or f"instance {self.id}"
         if self.case != case.id:
             raise InputError(source, "case", f"is for case {self.case!r}, not {case.id!r}")
         wanted: dict[str, tuple[Mapping[str, object], tuple[str, ...]]] = {
-            "cost": (self.cost, (case.slack, *case.generators)),
+            "cost": (self.cost, case.priced),
             "load": (self.load, case.loads),
             "initial.power": (self.initial.power, case.generators),
             "initial.omega": (self.initial.omega, case.generators),
         }
-        if self.initial.theta is not None:
-            wanted["initial.theta"] = (self.initial.theta, case.generators)
+        for name in ("theta", "mechanical"):
+            if (values := getattr(self.initial, name)) is not None:
+                wanted[f"initial.{name}"] = (values, case.generators)
         for field, (given, buses) in wanted.items():
             if missing := [bus for bus in buses if bus not in given]:
                 raise InputError(source, f"{field}.{missing[0]}", "field required")
             if unknown := [bus for bus in given if bus not in buses]:
                 raise InputError(source, f"{field}.{unknown[0]}", f"no such bus here in case {case.id}")
+        if self.initial.mechanical is not None and case.slack is not None:
+            raise InputError(source, "initial.mechanical", f"case {case.id} is no island")
+        if (agc := self.initial.agc) is not None:
+            if case.agc is None:
+                raise InputError(source, "initial.agc", f"case {case.id} has no secondary control")
+            if (agc.next_s or 0.0) > case.agc.period_s:
+                raise InputError(source, "initial.agc.next_s", f"is beyond {case.agc.period_s:g} s, a period")
 
     @functools.cached_property
     def steps(self) -> int:
@@ -224,18 +254,22 @@ class Instance(Fingerprinted):
         return np.array([self.initial.omega[g] for g in case.generators])
 
     def theta_initial(self, case: Case) -> Array | None:
-        """Given angles at t = 0 relative to the slack, shape (n_gen,), rad; None: the power flow's."""
-        if self.initial.theta is None:
-            return None
-        return np.array([self.initial.theta[g] for g in case.generators])
+        """Given angles at t = 0 (see `State.theta`), shape (n_gen,), rad; None: the power flow's."""
+        given = self.initial.theta
+        return None if given is None else np.array([given[g] for g in case.generators])
+
+    def mechanical_initial(self, case: Case) -> Array | None:
+        """Given powers of the turbines at t = 0, shape (n_gen,), pu; None: the set-points."""
+        given = self.initial.mechanical
+        return None if given is None else np.array([given[g] for g in case.generators])
 
     def cost_gen(self, case: Case) -> Array:
         """Generator costs c_i, shape (n_gen,)."""
         return np.array([self.cost[g] for g in case.generators])
 
     def cost_slack(self, case: Case) -> float:
-        """Cost c_s of one pu at the slack bus, of either sign."""
-        return self.cost[case.slack]
+        """Cost c_s of one pu at the slack bus, of either sign; 0 on an island, which has none."""
+        return 0.0 if case.slack is None else self.cost[case.slack]
 
 
 def check_plausible(case: Case, instance: Instance, source: str | Path) -> None:
@@ -288,8 +322,9 @@ def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
     Columns: `id, case, seed, horizon_s, dt_s` (the seed's parts joined by spaces), then by bus
     `cost_<bus>`, `load_<bus>_initial` (pu), `_start` (s), `_duration` (s), `_rate` (pu/s), `P0_<bus>`
     (initial power, pu) and `omega0_<bus>` (initial frequency deviation, rad/s). A load that is given by
-    points has them as pairs (s, pu) in `load_<bus>_points` instead; where an instance gives angles,
-    `theta0_<bus>` are those (rad).
+    points has them as pairs (s, pu) in `load_<bus>_points` instead; where an instance gives a measured state,
+    `theta0_<bus>` are its angles (rad), `mechanical0_<bus>` its turbines' powers (pu), and `agc0_held_pu`,
+    `agc0_integral_rad` and `agc0_next_s` its secondary control.
     """
     import pandas as pd  # here only: loading instances does without it
 
@@ -303,6 +338,9 @@ def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
             row |= {f"load_{bus}_{name}": value for name, value in load}
         row |= {f"P0_{bus}": value for bus, value in instance.initial.power.items()}
         row |= {f"omega0_{bus}": value for bus, value in instance.initial.omega.items()}
-        row |= {f"theta0_{bus}": value for bus, value in (instance.initial.theta or {}).items()}
+        for name in ("theta", "mechanical"):
+            given = getattr(instance.initial, name) or {}
+            row |= {f"{name}0_{bus}": value for bus, value in given.items()}
+        row |= {f"agc0_{name}": value for name, value in instance.initial.agc or ()}
         rows.append(row)
     return pd.DataFrame(rows)

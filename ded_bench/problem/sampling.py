@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.problem.case import Array, Case, Range
+from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Initial, Instance, LoadRamp
+from ded_bench.problem.quantities import Array, Range
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioLoad, ScenarioRamp
 
 #: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 4).
@@ -97,7 +98,7 @@ def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -
         seed=(master, index),
         horizon_s=ranges.horizon_s,
         dt_s=ranges.dt_s,
-        cost=_by_bus((case.slack, *case.generators), cost),
+        cost=_by_bus(case.priced, cost),
         load={
             bus: LoadRamp(initial=values[0], start=values[1], duration=values[2], rate=values[3])
             for bus, values in zip(case.loads, ramps.tolist(), strict=True)
@@ -197,7 +198,7 @@ def _draw_scenario(
         seed=(SCENARIO_SEED + seed, index),
         duration_s=duration_s,
         dt_s=case.sampling.dt_s,
-        cost=_by_bus((case.slack, *case.generators), cost),
+        cost=_by_bus(case.priced, cost),
         initial=_initial(case, cost, first, generator.random(2 * n_gen)),
         load=load,
     )

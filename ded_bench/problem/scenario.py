@@ -12,8 +12,9 @@ from pydantic import Field, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
-from ded_bench.problem.case import Array, Case, Name, NonNegative, Number, Positive
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp, check_whole_steps
+from ded_bench.problem.quantities import Array, Name, NonNegative, Number, Positive
 
 
 class ScenarioRamp(Record):
@@ -91,8 +92,8 @@ class Scenario(Fingerprinted):
     @model_validator(mode="after")
     def _whole_steps(self) -> Scenario:
         check_whole_steps("duration_s", self.duration_s, self.dt_s)
-        if self.initial.theta is not None:
-            raise ValueError("initial.theta: a scenario starts from the power flow")
+        if given := self.initial.measured:
+            raise ValueError(f"initial.{given}: a scenario starts from the power flow")
         return self
 
     @staticmethod

@@ -35,16 +35,16 @@ class Trajectory:
     def to_frame(self) -> pd.DataFrame:
         """One row per grid point, columns named by bus in the case's order.
 
-        `t` (s); `P_<bus>` of the generators, delivered, then of the slack (pu); `L_<bus>` of the loads
-        (injections, pu); `omega_<bus>` of the generators (rad/s, deviation from nominal); then the plant's
-        own, such as `theta_<bus>` (rad, relative to the slack).
+        `t` (s); `P_<bus>` of the generators, delivered, then of the slack, if there is one (pu);
+        `L_<bus>` of the loads (injections, pu); `omega_<bus>` of the generators (rad/s, deviation from
+        nominal); then the plant's own, such as `theta_<bus>` (rad, relative to the slack).
         """
         import pandas as pd  # here only: the scorer does without it
 
         case = self.case
         columns = {"t": self.t}
         columns |= {f"P_{bus}": values for bus, values in zip(case.generators, self.p_gen.T, strict=True)}
-        columns[f"P_{case.slack}"] = self.p_slack
+        columns |= {} if case.slack is None else {f"P_{case.slack}": self.p_slack}
         columns |= {f"L_{bus}": values for bus, values in zip(case.loads, self.p_load.T, strict=True)}
         columns |= {f"omega_{bus}": values for bus, values in zip(case.generators, self.omega.T, strict=True)}
         return pd.DataFrame(columns | dict(self.columns))

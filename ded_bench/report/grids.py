@@ -49,13 +49,13 @@ def sizes(grids: Sequence[Sources]) -> pd.DataFrame:
         rows.append(
             {
                 "case": case.id,
-                "buses": len(case.buses),
+                "buses": case.n_bus,
                 "generators": len(case.generators),
                 "loads": len(case.loads),
                 "tests": grid.test_count,
                 "modes_hz": f"{hertz.min():.2g}–{hertz.max():.2g}" if len(hertz) else "–",
                 "damping": float((-modes.real / np.abs(modes)).min()) if len(modes) else np.nan,
-                "tight_hz": min(limit.omega_hz for limit in case.regimes.values()),
+                "tight_hz": min(limit.largest_hz for limit in case.regimes.values()),
                 "knots": case.n_knots,
                 "judged": int(grid.judged["instance"].nunique()),
                 "reference": grid.reference.title,

@@ -78,7 +78,7 @@ class Sources:
     @property
     def tightest(self) -> str:
         """The regime with the tightest bound."""
-        return min(self.case.regimes, key=lambda name: self.case.regimes[name].omega_hz)
+        return min(self.case.regimes, key=lambda name: self.case.regimes[name].largest_hz)
 
     @cached_property
     def summary(self) -> pd.DataFrame:

@@ -14,6 +14,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
@@ -42,7 +43,7 @@ class Trajectories:
 
 def _signals(run: Trajectory) -> tuple[Array, ...]:
     """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""
-    initial = np.array([run.columns[f"theta_{bus.id}"][0] for bus in run.case.buses])
+    initial = np.array([run.columns[f"theta_{bus.id}"][0] for bus in lossless(run.case).buses])
     theta = np.stack([run.columns[f"theta_{g}"] for g in run.case.generators], axis=1)
     return np.hstack([run.p_gen, run.p_load]), initial, theta, run.omega, run.p_slack
 

@@ -152,7 +152,7 @@ class Koopman:
             "k": (n, n),
             "b": (n, n_in),
             "g": (n, n_in),
-            "lift": (n, 2 * len(case.buses) + n_in + 1),
+            "lift": (n, 2 * case.n_bus + n_in + 1),
         }
         width = 2 * n_gen + 1
         for i, (weight, bias) in enumerate(self.mlp):

@@ -109,7 +109,7 @@ def _scaled_state(case: Case, data: Trajectories) -> tuple[Tensor, Array, Array]
 def _in_original_units(
     case: Case, model: PaperKoopman, offset: Array, scale: Array, training: dict[str, int | float]
 ) -> Koopman:
-    n_gen, n_bus = len(case.generators), len(case.buses)
+    n_gen, n_bus = len(case.generators), case.n_bus
     with torch.no_grad():
         k, b = (matrix.numpy() for matrix in model.matrices())
         first, last = model.first, model.last

@@ -12,6 +12,7 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import sample_instance
 
 
@@ -132,7 +133,7 @@ def test_a_wrong_case_is_refused(threebus, edit, field, problem):
     data = json.loads(threebus.model_dump_json(by_alias=True))
     edit(data)
     with pytest.raises(InputError) as caught:
-        parse_record(Case, json.dumps(data), Path("bad/case.json"))
+        parse_record(LosslessCase, json.dumps(data), Path("bad/case.json"))
     assert caught.value.source == str(Path("bad/case.json"))
     assert caught.value.field == field
     assert problem in caught.value.problem
@@ -150,7 +151,7 @@ def _extended(data: dict) -> dict:
 def test_fields_of_case_2(threebus):
     """What each of them means, and that a case keeps them through a file."""
     plain = json.loads(threebus.model_dump_json(by_alias=True))
-    case = parse_record(Case, json.dumps(_extended(plain)), "case.json")
+    case = parse_record(LosslessCase, json.dumps(_extended(plain)), "case.json")
     assert json.loads(case.model_dump_json(by_alias=True)) == _extended(plain)
     np.testing.assert_array_equal(case.ramp, [0.125])
     np.testing.assert_array_equal(case.load_rate, [[0.01 * 1.0], [0.5 * 1.0]])
@@ -166,7 +167,7 @@ def test_fields_of_case_2(threebus):
         data = _extended(plain)
         _set(path, value)(data)
         with pytest.raises(InputError) as caught:
-            parse_record(Case, json.dumps(data), "case.json")
+            parse_record(LosslessCase, json.dumps(data), "case.json")
         assert caught.value.field == field
 
 

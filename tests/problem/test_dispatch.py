@@ -11,6 +11,7 @@ from scipy.optimize import linprog
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.lossless_case import LosslessCase
 
 
 def linear_program(p_min, p_max, cost_gen, cost_slack, demand) -> tuple[float, np.ndarray]:
@@ -47,7 +48,7 @@ def star(request, threebus) -> Case:
         name: {"m": 1.0, "d": 1.0, "p_nominal": a, "p_min": a, "p_max": b}
         for name, a, b in zip(names, low.tolist(), high.tolist(), strict=True)
     }
-    return parse_record(Case, json.dumps(data), "star")
+    return parse_record(LosslessCase, json.dumps(data), "star")
 
 
 def test_merit_order_is_optimal_on_random_cases(star):

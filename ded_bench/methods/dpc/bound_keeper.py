@@ -54,7 +54,7 @@ class BoundKeeper:
         of_change = linear.g - linear.b
         self.model = OmegaModel(
             linear.k,
-            np.ascontiguousarray(linear.lift[:, len(case.buses) + Network(case).generators]),
+            np.ascontiguousarray(linear.lift[:, case.n_bus + Network(case).generators]),
             np.ascontiguousarray(of_change[:, :n_gen]),
             np.ascontiguousarray(of_change[:, n_gen:]),
         )

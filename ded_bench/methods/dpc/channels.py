@@ -59,7 +59,7 @@ class Response:
         for i in range(n_gen):
             unit_powers[:, i, :, i] = hat_functions(nodes, knots)
         psi = inputs[0] @ model.b.T
-        psi[:n_gen] += model.lift[:, len(case.buses) + Network(case).generators].T
+        psi[:n_gen] += model.lift[:, case.n_bus + Network(case).generators].T
         psi[n_gen : 2 * n_gen, :n_gen] += np.eye(n_gen)
         outputs = model.rollout(psi, inputs)[:, :, : n_gen + 1]
         before = np.concatenate([outputs[:1], outputs[1::2]])

@@ -70,7 +70,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
 
 def n_channels(case: Case) -> int:
     """Number of channels: loads, costs with the slack's, x_0 = (θ without the slack's, P_s, ω), P_0."""
-    return len(case.loads) + (1 + len(case.generators)) + len(case.buses) + 2 * len(case.generators)
+    return len(case.loads) + (1 + len(case.generators)) + case.n_bus + 2 * len(case.generators)
 
 
 def channels(network: Network, instances: Sequence[Instance], knots: Array) -> Array:

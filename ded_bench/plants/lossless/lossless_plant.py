@@ -21,6 +21,7 @@ from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_int
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, State
+from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.trajectory import Trajectory
 
 #: Longest step times the fastest mode: far inside the region of stability; errors of the exact method are
@@ -122,7 +123,9 @@ class LosslessPlant:
 
     def columns(self, states: Array) -> Mapping[str, Array]:
         """Angles of all buses, `theta_<bus>`, rad, relative to the slack."""
-        return {f"theta_{bus.id}": column for bus, column in zip(self.case.buses, states.T, strict=True)}
+        return {
+            f"theta_{bus.id}": column for bus, column in zip(lossless(self.case).buses, states.T, strict=True)
+        }
 
     def check_servable(self, instance: Instance, source: str) -> None:
         """See `Plant.check_servable`.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import lossless
 
 if TYPE_CHECKING:
     from ded_bench.plants.lossless.stepper import CompiledGrid, Indices
@@ -57,7 +58,8 @@ class Network:
     (paper, eq. for f_i). Angles are arrays over all buses in the case's order.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, given: Case) -> None:
+        case = lossless(given)
         index = {bus.id: i for i, bus in enumerate(case.buses)}
         voltage = np.array([bus.v for bus in case.buses])
         self.ends = ends = np.array([[index[line.from_bus], index[line.to_bus]] for line in case.lines])

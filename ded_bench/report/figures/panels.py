@@ -73,7 +73,7 @@ def power_panels(case: Case, shown: Sequence[Shown], count: int = FEW) -> list[P
 
 def frequency_panels(case: Case, regime: str, shown: Sequence[Shown], count: int = FEW) -> list[Panel]:
     """Frequency deviations with the regime's bounds of the generators that move most, mHz."""
-    limit = 1e3 * case.regimes[regime].omega_hz
+    limit = 1e3 * case.regimes[regime].largest_hz
     return [
         Panel(
             f"$\\omega_{{{case.generators[j]}}}$ (mHz)",

@@ -27,7 +27,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
                 what = f"{row['broken']}: {row['excess']:.2g} × tolerance"
                 what = what if row["broken"] else f"{row['gap_percent']:+.2g} %"
                 curves = [one.curve(1e3 * RAD_TO_HZ * one.omega)]
-                bound = 1e3 * limit.omega_hz
+                bound = 1e3 * limit.largest_hz
                 title = f"{one.label}\n{row['instance']}, {what}"
                 panels.append(Panel("frequency (mHz)", curves, (bound, -bound), title))
         if panels:

@@ -43,9 +43,9 @@ EXPLANATION = (
 def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """The first screen, and all methods folded away."""
     case, reference, paper = sources.case, sources.reference, sources.paper
-    regimes = ", ".join(f"{name} |ω| ≤ {limit.omega_hz:g} Hz" for name, limit in case.regimes.items())
+    regimes = ", ".join(f"{name} |ω| ≤ {limit.largest_hz:g} Hz" for name, limit in case.regimes.items())
     what = (
-        f"{len(case.buses)} buses, {len(case.generators)} generators besides the slack bus, "
+        f"{case.n_bus} buses, {len(case.generators)} generators besides the slack bus, "
         f"{len(case.loads)} loads; {rows_caption(sources)}; regimes: {regimes}. "
         f"Every objective and violation is re-simulated; gaps are to {reference.title}."
     )
@@ -90,10 +90,10 @@ def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:
 
 def _fastest(case: Case, lines: pd.DataFrame, reference: str) -> Iterator[str]:
     """The fastest method that keeps every limit in the tightest regime (lines: see `result_lines`)."""
-    tight = min(case.regimes, key=lambda name: case.regimes[name].omega_hz)
+    tight = min(case.regimes, key=lambda name: case.regimes[name].largest_hz)
     timed = lines[(lines["regime"] == tight) & (lines["rows"] > 0) & lines["solve_s"].notna()]
     good = timed[timed["correct_rate"] == 1].sort_values("solve_s", kind="stable")
-    limit = f"{tight} (|ω| ≤ {case.regimes[tight].omega_hz:g} Hz)"
+    limit = f"{tight} (|ω| ≤ {case.regimes[tight].largest_hz:g} Hz)"
     if len(timed) and not len(good):
         yield f"**Fast and feasible:** no timed method keeps every limit on every instance of {limit}."
     for best in good[:1].to_dict("records"):

@@ -116,6 +116,9 @@ class LaggedPlant:
     def columns(self, states: Any) -> Mapping[str, Array]:
         return self.network.columns(states)
 
+    def balanced(self, instance: Instance) -> Instance:
+        return instance
+
     def check_servable(self, instance: Instance, source: str) -> None:
         self.network.check_servable(instance, source)
 

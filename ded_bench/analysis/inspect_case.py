@@ -49,7 +49,7 @@ def check_case(case: Case, count: int) -> CaseCheck:
     modes = modes[modes.imag >= 0]
     modes = modes[np.argsort(np.abs(modes))]
     drawn = list(drawn_with_redraws(case, VALIDATION_SEED, count))
-    served = [instance for instance, _ in drawn if servable(case, instance)]
+    served = [found for instance, _ in drawn if (found := servable(case, instance))]
     frequency = np.abs(modes) / (2 * np.pi)
     return CaseCheck(
         p_slack=float(-case.p_nominal.sum() - case.load_nominal.sum()),

@@ -92,6 +92,13 @@ class Plant(Protocol):
     def check_servable(self, instance: Instance, source: str) -> None:
         """Raise InputError, which names source and field, unless static dispatch can serve it throughout."""
 
+    def balanced(self, instance: Instance) -> Instance:
+        """A drawn instance with powers at t = 0 that are balanced, where no slack does that.
+
+        Raises:
+            SimulationError: there are none within limits.
+        """
+
 
 #: Plants by name: `module:class`, called with the case.
 PLANTS: dict[str, str] = {"lossless": "ded_bench.plants.lossless.lossless_plant:LosslessPlant"}
@@ -116,10 +123,12 @@ def _made(case: Case, name: str) -> Plant:
     return plant
 
 
-def servable(case: Case, instance: Instance) -> bool:
-    """Tell whether static dispatch can serve an instance on the case's plant: the rule of drawing them."""
+def servable(case: Case, instance: Instance) -> Instance | None:
+    """What becomes of a drawn instance: balanced where it must be; None: static dispatch cannot serve it."""
+    plant = plant_of(case)
     try:
-        plant_of(case).check_servable(instance, "")
-    except InputError:
-        return False
-    return True
+        instance = plant.balanced(instance)
+        plant.check_servable(instance, "")
+    except (InputError, SimulationError):
+        return None
+    return instance

@@ -192,6 +192,25 @@ class Case(Fingerprinted, Extended):
         """Limits on what groups of machines deliver."""
         return ()
 
+    def transfer_excess(self, p_set: Array, p_load: Array) -> Array:
+        """What groups of machines deliver beyond their loads and their limit, shape (..., n_transfers), pu.
+
+        Args:
+            p_set: set-points, shape (..., n_gen), pu.
+            p_load: load injections, shape (..., n_load), pu.
+        """
+        by_machine, by_load, limit = self.transfer_rows
+        return np.asarray(p_set @ by_machine.T + p_load @ by_load.T - limit)
+
+    @functools.cached_property
+    def transfer_rows(self) -> tuple[Array, Array, Array]:
+        """Coefficients of set-points and load injections, (n_transfers, n_gen or n_load), and limits, pu."""
+        rows = [[g in t.machines for g in self.generators] for t in self.transfers]
+        of_loads = [[bus in t.loads for bus in self.loads] for t in self.transfers]
+        shapes = (-1, len(self.generators)), (-1, len(self.loads))
+        by = [np.array(r, dtype=float).reshape(s) for r, s in zip((rows, of_loads), shapes, strict=True)]
+        return by[0], by[1], np.array([t.max for t in self.transfers])
+
     @property
     def priced(self) -> tuple[str, ...]:
         """What an instance gives costs to: the slack, if there is one, and the generators."""

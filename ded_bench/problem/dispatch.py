@@ -16,7 +16,8 @@ def merit_order(case: Case, cost_gen: Array, cost_slack: Array | float, p_load: 
     Args:
         case: gives the generator bounds.
         cost_gen: generator costs, shape (..., n_gen).
-        cost_slack: slack cost, shape (...).
+        cost_slack: slack cost, shape (...); infinite where no slack takes any power: generators then
+            deliver the demand, or what they can.
         p_load: load injections, shape (..., n_load), pu.
 
     Returns:

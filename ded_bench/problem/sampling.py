@@ -40,8 +40,8 @@ FLUCTUATION, STEP_S, DECAY_S, SMOOTH_S = 0.0005, 0.5, 20.0, 2.0
 #: Digits of the fluctuation after the point, in pu: a tenth of a thousandth of its standard deviation.
 FLUCTUATION_DECIMALS = 8
 
-#: Tells whether an instance of a case can be served on its plant (`plants.plant.servable`).
-Servable = Callable[[Case, Instance], bool]
+#: A drawn instance as the case's plant can serve it, or None (`plants.plant.servable`).
+Servable = Callable[[Case, Instance], Instance | None]
 
 
 def sample_instances(
@@ -62,10 +62,11 @@ def drawn_with_redraws(
     """Draw instances `first` to `first + count - 1` of a master seed, each with how often it drew again.
 
     An instance's generator is seeded by (master, index). Drawn again are a load that changes its sign (in
-    case/2; some of the paper's 9-bus loads do), and an instance that is not servable.
+    case/2; some of the paper's 9-bus loads do), and an instance that is not servable. On an island powers
+    at t = 0 are balanced by `servable`.
 
     Args:
-        servable: tells which instances can be served; None: all of them.
+        servable: tells which instances can be served, and balances them; None: all of them, as drawn.
 
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
@@ -76,20 +77,21 @@ def drawn_with_redraws(
         for _ in range(ATTEMPTS):
             instance, repeated = _draw(case, master, index, generator)
             redraws += repeated
-            if servable is None or servable(case, instance):
+            if (served := servable(case, instance) if servable else instance) is not None:
+                yield served, redraws
                 break
             redraws += 1
         else:
             raise InputError(f"case {case.id}", "sampling", f"{ATTEMPTS} draws in a row cannot be served")
-        yield instance, redraws
 
 
 def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -> tuple[Instance, int]:
     """Draw an instance (paper, Table III) and count the loads that were drawn again."""
     ranges = case.sampling
     n_gen, n_load = len(case.generators), len(case.loads)
-    draws = generator.random(1 + 2 * n_gen + 6 * n_load + n_gen)
-    cost, rest = _rounded(_between(ranges.cost, draws[: 1 + n_gen])), draws[1 + n_gen :]
+    n_priced = len(case.priced)
+    draws = generator.random(n_priced + 2 * n_gen + 6 * n_load)
+    cost, rest = _rounded(_between(ranges.cost, draws[:n_priced])), draws[n_priced:]
     ramps, redraws = _draw_ramps(case, rest[: 6 * n_load].reshape(n_load, 6), generator)
     instance = Instance(
         schema_="ded-bench/instance/1",
@@ -113,12 +115,13 @@ def _initial(case: Case, cost: Array, load: Array, uniform: Array) -> Initial:
 
     Args:
         case: gives the ranges.
-        cost: of the slack, then of the generators, (1 + n_gen,).
+        cost: of the slack, if there is one, then of the generators, (n_priced,).
         load: at t = 0, (n_load,), pu.
         uniform: (2 n_gen,).
     """
     perturbation, frequency = uniform.reshape(2, -1)
-    p_opt = merit_order(case, cost[1:], cost[0], load)
+    n_gen = len(case.generators)
+    p_opt = merit_order(case, cost[-n_gen:], np.inf if case.slack is None else cost[0], load)
     power = p_opt - 0.5 * (p_opt - case.p_nominal) * _between(case.sampling.perturbation, perturbation)
     omega = _between(case.sampling.omega_rad_per_s, frequency)
     return Initial(
@@ -173,8 +176,14 @@ def sample_scenario(
     generator = np.random.default_rng(np.random.SeedSequence([SCENARIO_SEED + seed, index]))
     for _ in range(ATTEMPTS):
         scenario = _draw_scenario(case, seed, index, generator, duration_s)
-        if servable is None or all(servable(case, instance) for instance in _snapshots(case, scenario)):
-            return scenario
+        initial = scenario.initial
+        for number, snapshot in enumerate(_snapshots(case, scenario)):
+            served = servable(case, snapshot) if servable else snapshot
+            if served is None:
+                break
+            initial = initial if number else served.initial
+        else:
+            return scenario.model_copy(update={"initial": initial})
     raise InputError(f"case {case.id}", "sampling", f"{ATTEMPTS} scenarios in a row cannot be served")
 
 
@@ -188,7 +197,7 @@ def _draw_scenario(
     case: Case, seed: int, index: int, generator: np.random.Generator, duration_s: float
 ) -> Scenario:
     n_gen = len(case.generators)
-    cost = _rounded(_between(case.sampling.cost, generator.random(1 + n_gen)))
+    cost = _rounded(_between(case.sampling.cost, generator.random(len(case.priced))))
     load = {bus: _draw_load(case, i, generator, duration_s) for i, bus in enumerate(case.loads)}
     first = np.array([load[bus].initial for bus in case.loads])
     return Scenario(

@@ -83,6 +83,14 @@ class Row:
     plant: str = "lossless"
     commit: str = ""
     method_version: int = 0
+    mean_freq_rms_hz: float | None = None
+    mean_freq_max_hz: float | None = None
+    swing_rms_hz: float | None = None
+    swing_max_hz: float | None = None
+    excess_mean_hz: float | None = None
+    excess_relative_hz: float | None = None
+    excess_end_hz: float | None = None
+    agc_travel_pu: float | None = None
 
     @property
     def key(self) -> Key:
@@ -122,6 +130,14 @@ class ValidatedRow:
     feasible_strict: bool | None = None
     error: str = ""
     fingerprint: str = ""
+    mean_freq_rms_hz: float | None = None
+    mean_freq_max_hz: float | None = None
+    swing_rms_hz: float | None = None
+    swing_max_hz: float | None = None
+    excess_mean_hz: float | None = None
+    excess_relative_hz: float | None = None
+    excess_end_hz: float | None = None
+    agc_travel_pu: float | None = None
 
     @property
     def key(self) -> tuple[Key, str]:

@@ -93,7 +93,7 @@ def score_cells(verdict: object) -> dict[str, Any]:
     if not isinstance(verdict, Score):
         return {"error": f"{SCORING_FAILED}{reason_of(verdict)}"}
     numbers = dataclasses.asdict(verdict)
-    if not all(abs(value) <= LARGEST for value in numbers.values()):
+    if not all(value is None or abs(value) <= LARGEST for value in numbers.values()):
         return {"error": f"{SCORING_FAILED}cost or violations are above {LARGEST:g}"}
     return numbers | {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
 
@@ -198,17 +198,17 @@ def _differences(old: Row, new: Row) -> Iterator[str]:
     for name in _SCORE:
         was, now = getattr(old, name), getattr(new, name)
         if was is None or now is None:
-            same = was is now
+            same = was is now  # numbers that only islands have, or no score at all
         elif name == "objective":
             same = math.isclose(was, now, rel_tol=OBJECTIVE_RELATIVE)
         else:
-            same = abs(was - now) <= (VIOLATION_HZ if name == "freq_violation_hz" else VIOLATION_PU)
+            same = abs(was - now) <= (VIOLATION_HZ if name.endswith("_hz") else VIOLATION_PU)
         if not same:
             why = f" ({old.error or new.error})" if was is None or now is None else ""
             yield f"{name} {was!r} in the row, {now!r} scored again{why}"
-        if was is None or now is None:
-            return
-    if all(getattr(old, name) is not None for name in _SCORE):
+            if was is None or now is None:
+                return
+    if old.objective is not None and new.objective is not None:
         own = Score(**{name: getattr(old, name) for name in _SCORE})
         if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):
             yield "feasible or feasible_strict do not follow from the row's own violations"

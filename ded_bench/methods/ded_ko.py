@@ -102,7 +102,9 @@ def _array_solver(case: Case, surrogate: Surrogate, regime: str, settings: Setti
             return refusal
         limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
         # Softly, since one widening for all of thousands of intervals would be a dense column.
-        solution = solve_on_surrogate(case, surrogate, instance, regime, points, limit_s, soft=True)
+        solution = solve_on_surrogate(
+            case, surrogate, instance, case.bounds(regime), points, limit_s, soft=True
+        )
         return replace(solution, schedule=None) if solution.status == Status.INFEASIBLE else solution
 
     return solve

@@ -11,10 +11,9 @@ options matter there alone: knots may keep their places in time, and plans a mar
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
-from ded_bench.methods.knots import case_knots, receding_knots, tightened
+from ded_bench.methods.knots import case_knots, receding_knots
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
 from ded_bench.methods.surrogate_program import solve_on_surrogate
@@ -65,8 +64,8 @@ class KnotSolver:
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve with the case's knots and bound."""
-        points = case_knots(self.case, instance)
-        return solve_on_surrogate(self.case, self.surrogate, instance, self.regime, points, self.time_limit_s)
+        points, bounds = case_knots(self.case, instance), self.case.bounds(self.regime)
+        return solve_on_surrogate(self.case, self.surrogate, instance, bounds, points, self.time_limit_s)
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
@@ -76,11 +75,8 @@ class KnotSolver:
             last: its schedule, if it has one, gives receding knots; its time is the instance's.
         """
         plan = last.schedule if last is not None and self.options.receding else None
-        points, case = receding_knots(self.case, instance, plan), self._planning_case
+        points = receding_knots(self.case, instance, plan)
+        bounds = self.case.bounds(self.regime).tightened(part=self.options.margin)
         return solve_on_surrogate(
-            case, self.surrogate, instance, self.regime, points, self.time_limit_s, soft=True
+            self.case, self.surrogate, instance, bounds, points, self.time_limit_s, soft=True
         )
-
-    @functools.cached_property
-    def _planning_case(self) -> Case:
-        return tightened(self.case, self.options.margin)

@@ -22,13 +22,14 @@ import dataclasses
 import functools
 from dataclasses import dataclass
 
-from ded_bench.methods.knots import receding_knots, tightened
+from ded_bench.methods.knots import receding_knots
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.reserve import LIMIT, Reserve
 from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
 from ded_bench.methods.surrogate_program import Plan, solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
@@ -72,10 +73,11 @@ class RealTimeSolver:
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve by two steps; the first, from the static dispatch, is `setup_s`."""
-        first = self._step(self.case, instance, None)
+        bounds = self.case.bounds(self.regime)
+        first = self._step(bounds, instance, None)
         if first.schedule is None:
             return first
-        second = self._step(self.case, instance, first.schedule)
+        second = self._step(bounds, instance, first.schedule)
         return dataclasses.replace(second, setup_s=(first.build_s or 0.0) + (first.solve_s or 0.0))
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
@@ -85,21 +87,18 @@ class RealTimeSolver:
             instance: what to solve.
             last: its schedule, if it has one, is the plan to correct; its time is the instance's.
         """
-        return self._step(self._planning_case, instance, None if last is None else last.schedule)
-
-    @functools.cached_property
-    def _planning_case(self) -> Case:
-        return tightened(self.case, self.options.margin)
+        bounds = self.case.bounds(self.regime).tightened(part=self.options.margin)
+        return self._step(bounds, instance, None if last is None else last.schedule)
 
     @functools.cached_property
     def _reserve(self) -> Reserve | None:
         bound = self.case.omega_bound(self.regime)
         return Reserve.of(self.case, LIMIT * bound) if self.options.reserve else None
 
-    def _step(self, case: Case, instance: Instance, last: Schedule | None) -> Solution:
-        points, plan = receding_knots(case, instance, last), Plan(last, self._reserve)
+    def _step(self, bounds: Bounds, instance: Instance, last: Schedule | None) -> Solution:
+        points, plan = receding_knots(self.case, instance, last), Plan(last, self._reserve)
         solution = solve_on_surrogate(
-            case, self.surrogate, instance, self.regime, points, self.time_limit_s, plan=plan
+            self.case, self.surrogate, instance, bounds, points, self.time_limit_s, plan=plan
         )
         is_claimed = solution.status == Status.OPTIMAL  # of a penalty, roughly
         return dataclasses.replace(solution, status=Status.FEASIBLE) if is_claimed else solution

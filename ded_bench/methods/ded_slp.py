@@ -26,6 +26,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
 from ded_bench.solvers.status import Status
@@ -84,8 +85,8 @@ class SlpSolver:
         started = time.perf_counter()
         deadline = started + (np.inf if self.time_limit_s is None else self.time_limit_s)
         points = self._knots(instance)
-        bound = self.case.omega_bound(self.regime)
-        parts = _OnPlant(self.case, instance, bound, points, deadline, soft, near is not None)
+        bounds = self.case.bounds(self.regime)
+        parts = _OnPlant(self.case, instance, bounds, points, deadline, soft, near is not None)
         if is_reachable(self.case, instance, points):
             start = ed.dispatch(self.case, instance, 1.0) if near is None else near
             end = parts.run(start)
@@ -121,7 +122,7 @@ class Simulated:
     at: Array  # powers at the knots, (n_knots, n_gen), pu
     trajectory: Trajectory
     cost: float
-    excess: float  # of |ω| over the bound, rad/s
+    excess: float  # over the bounds, rad/s
 
 
 @dataclass
@@ -130,7 +131,7 @@ class _OnPlant:
 
     case: Case
     instance: Instance
-    bound: float  # rad/s
+    bounds: Bounds
     points: Indices
     deadline: float  # on the clock of `time.perf_counter`
     soft: bool  # an infeasible instance has a schedule, too: that of least excess
@@ -162,7 +163,7 @@ class _OnPlant:
         trajectory = simulate(self.case, self.instance, self._schedule(p_gen))
         cost = trajectory.cost(self.instance.cost_gen(self.case), self.instance.cost_slack(self.case))
         # After t_0: x_0 is given, wherever it lies.
-        excess = float(np.abs(trajectory.omega[1:]).max()) - self.bound
+        excess = float(self.bounds.beyond(trajectory.omega @ self.bounds.matrix.T)[1:].max())
         found = Simulated(p_gen, trajectory, cost, excess)
         if found.excess <= ACCEPTED and (self.best is None or cost < self.best.cost):
             self.best = found
@@ -170,9 +171,9 @@ class _OnPlant:
 
     def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
-        program = KnotProgram(self.case, self.instance, self.bound - MARGIN, model)
+        program = KnotProgram(self.case, self.instance, self.bounds.tightened(MARGIN), model)
         if self.is_near:
-            self.limits |= program.near(around.trajectory.omega)
+            self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
         return solve_with_rows_added(program, self.limits, Rows(OPEN, enough, self.soft), self.deadline)
 

@@ -8,10 +8,11 @@ every piece p of a few grid points, so that every row is local to one interval b
 
     min  Σ_j weight_j c · (P_j + u_j) + c_s Σ_p s_p
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
-    limits on P, on its ramps, and on ω at the knots and at chosen points between them
+    limits on P, on its ramps, and on outputs of ω at the knots and at chosen points between them
 
-Where the plant delivers other powers than its set-points, what is delivered is paid. Few of the limits
-between knots bind: they get rows as solutions ask for them (`slp.solve_with_rows_added`).
+The outputs are those that the regime bounds (`problem.limits.Bounds`): ω itself, or its mean and the swings
+about it. Where the plant delivers other powers than its set-points, what is delivered is paid. Few of the
+limits between knots bind: they get rows as solutions ask for them (`slp.solve_with_rows_added`).
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits
+from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits, transfer_room
 from ded_bench.methods.reserve import Reserve
 from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 from ded_bench.solvers.highs import solve_form as solve_by_highs
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm, moved_columns
 from ded_bench.solvers.piqp import solve_form
@@ -39,17 +41,17 @@ ROUND_OFF = 1e-13
 #: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
 SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
 LONG = 20
-#: What widening the limits of |ω| by 1 rad/s costs, in sums of all columns' costs: where they are widened as
+#: What widening limits of outputs by 1 rad/s costs, in sums of all columns' costs: where they are widened as
 #: little as possible, and where a program prices every excess from the start: an exact penalty above nearly
 #: all multipliers of the limits.
 LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
 #: Of programs with priced excess: relative duality gap, and residuals, that are small enough; regularisation.
 #: All chosen on validation draws.
 GAP, RESIDUAL, REGULARISATION = 1e-3, 1e-5, 1e-9
-#: Where |ω| exceeds this part of the bound it gets rows: at peaks, and at so many points of an interval.
+#: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval.
 NEAR, PARTS = 0.9, 8
 
-#: (generator, grid point) of a limit of |ω| between knots.
+#: (output, grid point) of a limit between knots.
 Limit = tuple[int, int]
 #: Row numbers, column numbers and values of dense blocks, stacked or single.
 Block = tuple[Indices, Indices, Array]
@@ -60,7 +62,7 @@ class Prediction:
     """A solution of a program, and what the linear model says about all grid points."""
 
     p_gen: Array  # (n_knots, n_gen), pu
-    omega: Array  # (n_points, n_gen), rad/s
+    outputs: Array  # (n_points, n_out), rad/s
     p_slack: Array  # (n_points,), pu
     objective: float  # with |P_s| at every point
 
@@ -68,24 +70,30 @@ class Prediction:
 class KnotProgram:
     """The program around one trajectory. P_0 and x_0 are given: the first knot has no columns.
 
-    Columns of an interval, one after another: s of its pieces, then u and x at its end. Where limits of |ω|
-    may be exceeded, how much follows, then what a reserve needs.
+    Columns of an interval, one after another: s of its pieces, then u and x at its end; an island has no s.
+    Where limits of outputs may be exceeded, how much follows, then what a reserve needs.
 
     Args:
         case: the grid.
         instance: costs and P_0.
-        bound: limit of |ω|, rad/s.
+        bounds: of outputs of ω.
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
     """
 
     def __init__(
-        self, case: Case, instance: Instance, bound: float, model: TimeVarying, reserve: Reserve | None = None
+        self,
+        case: Case,
+        instance: Instance,
+        bounds: Bounds,
+        model: TimeVarying,
+        reserve: Reserve | None = None,
     ) -> None:
-        self.model, self.bound, self._reserve = model, bound, reserve
+        self.model = model = model.monitored(bounds.matrix)
+        self.bounds, self._reserve = bounds, reserve
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
-        self.pieces = piece_starts(model.points)
+        self.pieces = piece_starts(model.points) if case.slack is not None else np.empty(0, dtype=int)
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
@@ -102,10 +110,10 @@ class KnotProgram:
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with |ω| limited at all knots and at the points chosen.
+        """Solve with outputs limited at all knots and at the points chosen.
 
         Args:
-            limits: (generator, grid point) of the limits between knots, shape (n_limits, 2).
+            limits: (output, grid point) of the limits between knots, shape (n_limits, 2).
             time_limit_s: see `piqp.solve_form`.
         """
         form, model = self._unlimited(), self.model
@@ -115,14 +123,15 @@ class KnotProgram:
             speed = self._x[:, model.speed]
             form.lower[speed], form.upper[speed] = least, most
         else:
-            rows = sp.vstack([self._at_knots, rows])
-            low, high = np.append(least, low), np.append(most, high)
+            at_knots, held = self._at_knots
+            rows = sp.vstack([at_knots, rows])
+            low, high = np.append(least.ravel()[held], low), np.append(most.ravel()[held], high)
         return self._answer(form.with_rows(rows, low, high), time_limit_s)
 
     def solve_relaxed(
         self, limits: Indices, time_limit_s: float, by_interval: bool = False
     ) -> tuple[FormAnswer, float]:
-        """Solve with the limits of |ω| widened as little as possible; what PIQP does not solve HiGHS does.
+        """Solve with limits of outputs widened as little as possible; what PIQP does not solve HiGHS does.
 
         The cost counts, but so little that the widening is the least one but for round-off.
 
@@ -145,7 +154,7 @@ class KnotProgram:
         return replace(answer, x=answer.x[place]), float(answer.x[widening].max())
 
     def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with a priced excess of |ω| in every interval, and with the reserve; less exactly.
+        """Solve with a priced excess of outputs in every interval, and with the reserve; less exactly.
 
         Args:
             limits, time_limit_s: see `solve`.
@@ -165,42 +174,42 @@ class KnotProgram:
             answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
         return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
 
-    def near(self, omega: Array) -> set[Limit]:
-        """Points between knots at which |ω| comes near the bound.
+    def near(self, outputs: Array) -> set[Limit]:
+        """Points between knots at which an output comes near its bound.
 
         Args:
-            omega: shape (n_points, n_gen), rad/s.
+            outputs: shape (n_points, n_out), rad/s.
         """
-        size, points = np.abs(omega.T), self.model.points
+        size, points, beyond = np.abs(outputs.T), self.model.points, self.bounds.beyond(outputs).T
         chosen = np.zeros(size.shape, dtype=bool)
         peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
         chosen[:, 1:-1] = peak
         # A peak that is cut off moves to the points beside it.
-        over = peak & (size[:, 1:-1] > self.bound)
+        over = peak & (beyond[:, 1:-1] > 0.0)
         chosen[:, :-2] |= over
         chosen[:, 2:] |= over
         chosen[:, divided(points, np.full(len(points) - 1, PARTS))] = True
         chosen[:, points] = False
-        g, k = np.nonzero(chosen & (size > NEAR * self.bound))
-        return set(zip(g.tolist(), k.tolist(), strict=True))
+        of, k = np.nonzero(chosen & (beyond > (NEAR - 1.0) * self.bounds.limit[:, None]))
+        return set(zip(of.tolist(), k.tolist(), strict=True))
 
-    def excess(self, omega: Array) -> float:
-        """Largest excess of |ω| over the bound after t_0: x_0 is given, wherever it lies; rad/s."""
-        return float(np.abs(omega[1:]).max()) - self.bound
+    def excess(self, outputs: Array) -> float:
+        """Largest excess over a bound after t_0: x_0 is given, wherever it lies; rad/s."""
+        return float(self.bounds.beyond(outputs)[1:].max())
 
     def predict(self, columns: Array) -> Prediction:
         """All grid points at a solution, shape (n_columns,)."""
         model = self.model
         p_gen = np.array(model.p_gen)
         p_gen[1:] = np.clip(p_gen[1:] + columns[self._u], self._case.p_min, self._case.p_max)
-        omega, p_slack = model.outputs(p_gen - model.p_gen)
+        outputs, p_slack = model.outputs(p_gen - model.p_gen)
         if model.delivered is None:
             generation = float((self._generation * p_gen).sum())
         else:
             paid = np.append(self._u, self._x)
             along = model.delivered.p_gen @ self._instance.cost_gen(self._case)
             generation = float(along.sum() + self._cost[paid] @ columns[paid])
-        return Prediction(p_gen, omega, p_slack, generation + self._price * float(np.abs(p_slack).sum()))
+        return Prediction(p_gen, outputs, p_slack, generation + self._price * float(np.abs(p_slack).sum()))
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         """PIQP's, by the next factorisation where one stalls."""
@@ -215,11 +224,12 @@ class KnotProgram:
         return replace(answer, iterations=iterations)
 
     def _unlimited(self) -> FreeForm:
-        """The program without limits of |ω|."""
+        """The program without limits of outputs."""
         case, model = self._case, self.model
         ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
         slack = np.add.reduceat(model.p_slack, self.pieces)
         p_min, p_max = power_limits(case, self._instance, model.lengths)
+        transfers, room = self._transfer_rows()
         lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
         lower[self._s] = 0.0
         lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
@@ -227,9 +237,9 @@ class KnotProgram:
             cost=self._cost,
             equal=self._dynamics,
             right=np.zeros(self._x.size),
-            between=sp.csc_matrix(sp.vstack([self._ramp_rows(), self._slack])),
-            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack), -np.inf)]),
-            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack]),
+            between=sp.csc_matrix(sp.vstack([self._ramp_rows(), self._slack, transfers])),
+            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack) + room.size, -np.inf)]),
+            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack, room]),
             lower=lower,
             upper=upper,
         )
@@ -237,21 +247,23 @@ class KnotProgram:
     def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""
         form = self._unlimited()
-        own = np.append(np.repeat(np.arange(self._n), self._n_gen), self._interval_of(limits[:, 1]))
+        at_knots, held = self._at_knots
+        at_knot = np.repeat(np.arange(self._n), len(self.bounds.limit))[held]
+        own = np.append(at_knot, self._interval_of(limits[:, 1]))
         after = self._x[:, -1] if by_interval else np.array([self._n_columns - 1])
         none = np.zeros(len(after))
         form, place, new = form.with_columns(
             after, none + price * max(self._cost.sum(), 1.0), none, none + np.inf
         )
         of_limit = new[own] if by_interval else np.full(len(own), new[0])
-        omega = sp.csc_matrix(sp.vstack([self._at_knots, self._frequency_rows(limits)]))
-        omega = moved_columns(omega, place, len(form.cost))
+        outputs = sp.csc_matrix(sp.vstack([at_knots, self._frequency_rows(limits)]))
+        outputs = moved_columns(outputs, place, len(form.cost))
         one = np.ones(len(own)), (np.arange(len(own)), of_limit)
-        widening = sp.csc_matrix(one, omega.shape)
+        widening = sp.csc_matrix(one, outputs.shape)
         ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])
-        low, high = (np.append(*pair) for pair in zip(*ends, strict=True))
+        low, high = (np.append(knots[held], chosen) for knots, chosen in zip(*ends, strict=True))
         below = np.full(len(own), -np.inf)
-        rows = sp.vstack([omega - widening, -omega - widening])
+        rows = sp.vstack([outputs - widening, -outputs - widening])
         return form.with_rows(rows, np.append(below, below), np.append(high, -low)), place, new
 
     def _with_reserve(
@@ -264,10 +276,14 @@ class KnotProgram:
         power, p_gen = place[self._u][near], self.model.p_gen[1:][near]
         return reserve.required(form, power, p_gen, excess[near], shortage[near])
 
-    def _room(self, points: Indices, generators: Indices | None = None) -> tuple[Array, Array]:
-        """How far δω may go down and up: at points of all generators, or at pairs of both; rad/s."""
-        omega = self.model.omega[points] if generators is None else self.model.omega[points, generators]
-        return (-self.bound - omega).ravel(), (self.bound - omega).ravel()
+    def _room(self, points: Indices, outputs: Indices | None = None) -> tuple[Array, Array]:
+        """How far outputs may go down and up: at points of all of them, or at pairs of both; rad/s."""
+        is_free = self.bounds.at_end & (points[:, None] < self.model.points[-1])
+        limit, now = np.where(is_free, np.inf, self.bounds.limit), self.model.omega[points]
+        if outputs is not None:
+            pairs = np.arange(len(points)), outputs
+            limit, now = limit[pairs], now[pairs]
+        return (-limit - now).ravel(), (limit - now).ravel()
 
     def _interval_of(self, points: Indices) -> Indices:
         return np.searchsorted(self.model.points, points) - 1
@@ -304,9 +320,20 @@ class KnotProgram:
         one = np.eye(self._n_gen) / self._durations[:, None, None]
         return self._matrix(row.size, [(row, self._u, one), (row[1:], self._u[:-1], -one[1:])])
 
+    def _transfer_rows(self) -> tuple[sp.csc_matrix, Array]:
+        """What the machines of each transfer deliver at all knots but the first, and how far it may go up."""
+        case, model = self._case, self.model
+        of = np.array([[g in one.machines for g in case.generators] for one in case.transfers], dtype=float)
+        room = transfer_room(case, self._instance, model.points)
+        row = np.arange(room.size).reshape(room.shape)
+        blocks = [(row, self._u, np.broadcast_to(of, (self._n, *of.shape)))] if room.size else []
+        return self._matrix(room.size, blocks), (room - model.p_gen[1:] @ of.T if room.size else room).ravel()
+
     def _slack_rows(self) -> sp.csc_matrix:
         """Σ δP_s - s over every piece, then -Σ δP_s - s."""
         n = len(self.pieces)
+        if not n:
+            return self._matrix(0, [])
         rows, place = self.model.slack_rows(self.pieces), np.arange(n)
         one = np.ones((n, 1, 1))
         blocks = self._local(rows, place) + self._local(rows, place + n, -1.0)
@@ -314,13 +341,20 @@ class KnotProgram:
         return self._matrix(2 * n, blocks)
 
     @functools.cached_property
-    def _at_knots(self) -> sp.csc_matrix:
-        """δω of all generators at all knots but the first; a knot belongs to the interval after it."""
-        row, speed = np.arange(self._u.size).reshape(self._n, -1), self.model.speed
+    def _at_knots(self) -> tuple[sp.csc_matrix, Indices]:
+        """Outputs at all knots but the first where they are bounded, and which of all of them these are.
+
+        A knot belongs to the interval after it.
+        """
+        n_out, speed = len(self.bounds.limit), self.model.speed
+        row = np.arange(self._n * n_out).reshape(self._n, -1)
         if isinstance(speed, slice):
-            one = np.broadcast_to(np.eye(self._n_gen), (self._n, self._n_gen, self._n_gen))
-            return self._matrix(row.size, [(row, self._x[:, speed], one)])
-        return self._matrix(row.size, [(row, self._x, np.concatenate([speed[1:], speed[-1:]]))])
+            one = np.broadcast_to(np.eye(n_out), (self._n, n_out, n_out))
+            every = self._matrix(row.size, [(row, self._x[:, speed], one)])
+        else:
+            every = self._matrix(row.size, [(row, self._x, np.concatenate([speed[1:], speed[-1:]]))])
+        held = np.flatnonzero(np.isfinite(self._room(self.model.points[1:])[1]))
+        return every[held], held
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
         rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])
@@ -337,6 +371,8 @@ class KnotProgram:
         ]
 
     def _matrix(self, n_rows: int, blocks: list[Block]) -> sp.csc_matrix:
+        if not blocks:
+            return sp.csc_matrix((n_rows, self._n_columns))
         rows = [np.broadcast_to(row[..., :, None], value.shape).ravel() for row, _, value in blocks]
         columns = [np.broadcast_to(column[..., None, :], value.shape).ravel() for _, column, value in blocks]
         values = np.concatenate([value.ravel() for _, _, value in blocks])

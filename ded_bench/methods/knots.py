@@ -60,15 +60,6 @@ def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Ind
     return knot_points(np.concatenate([[0.0], ahead, beyond, [instance.horizon_s]]), instance.dt_s)
 
 
-def tightened(case: Case, margin: float) -> Case:
-    """A case whose frequency bounds are smaller by a part of them."""
-    regimes = {
-        name: limits.model_copy(update={kind: (1 - margin) * value for kind, value in limits})
-        for name, limits in case.regimes.items()
-    }
-    return case.model_copy(update={"regimes": regimes})
-
-
 def knot_weights(lengths: Indices) -> Array:
     """How much power at a knot counts in the sum over all grid points, shape (n_knots,)."""
     half = (lengths - 1) / 2
@@ -100,3 +91,20 @@ def power_limits(case: Case, instance: Instance, lengths: Indices) -> tuple[Arra
     p_min[0] = np.maximum(case.p_min, (case.p_min - (1 - part) * p_initial) / part)
     p_max[0] = np.minimum(case.p_max, (case.p_max - (1 - part) * p_initial) / part)
     return p_min, p_max
+
+
+def transfer_room(case: Case, instance: Instance, points: Indices) -> Array:
+    """What machines of a transfer may deliver at all knots but the first, (n_intervals, n_transfers), pu.
+
+    Set-points are linear between knots and loads need not be: what a load lies above its chord, in either
+    interval beside a knot, is taken off.
+    """
+    p_load, grid = instance.p_load(case), np.arange(instance.steps + 1)
+    room = np.empty((len(points) - 1, len(case.transfers)))
+    for column, transfer in zip(room.T, case.transfers, strict=True):
+        drawn = [case.loads.index(bus) for bus in transfer.loads]
+        most = transfer.max - p_load[:, drawn].sum(axis=1)
+        short = np.maximum(np.interp(grid, points, most[points]) - most, 0.0)
+        largest = np.maximum.reduceat(short, points[:-1])
+        column[:] = most[points[1:]] - np.maximum(largest, np.append(largest[1:], 0.0))
+    return room

@@ -127,7 +127,7 @@ def _steps(now: Array, wanted: Array, tries: int) -> Iterable[Array]:
 
 @dataclass(frozen=True)
 class Rows:
-    """How limits of |ω| become rows of a program on knots."""
+    """How limits of outputs become rows of a program on knots."""
 
     open: float  # excess that needs no further row, or makes nothing infeasible, rad/s
     enough: float  # excess with which to stop, rad/s; no less than `open`
@@ -138,7 +138,7 @@ class Rows:
 def solve_with_rows_added(
     program: KnotProgram, limits: set[Limit], rows: Rows, deadline: float
 ) -> Attempt[Prediction]:
-    """Solve, look at all grid points, limit |ω| where it comes near the bound, and again.
+    """Solve, look at all grid points, limit outputs where they come near their bounds, and again.
 
     Args:
         program: what to solve.
@@ -164,7 +164,7 @@ def solve_with_rows_added(
         if answer.status != Status.OPTIMAL:
             break
         prediction = program.predict(answer.x)
-        excess, added = program.excess(prediction.omega), program.near(prediction.omega) - limits
+        excess, added = program.excess(prediction.outputs), program.near(prediction.outputs) - limits
         limits |= added if excess > rows.open else set()
         infeasible = infeasible or widening > rows.open
         if not added or (not rows.by_interval if infeasible else excess <= rows.enough):

@@ -19,6 +19,7 @@ from ded_bench.methods.solution import Solution
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate
@@ -32,7 +33,7 @@ SOFT_TOLERANCE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan to correct, by a program whose excess of |ω| has a price."""
+    """A plan to correct, by a program whose excess over bounds has a price."""
 
     last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
     reserve: Reserve | None = None
@@ -42,7 +43,7 @@ def solve_on_surrogate(
     case: Case,
     surrogate: Surrogate,
     instance: Instance,
-    regime: str,
+    bounds: Bounds,
     points: Indices,
     time_limit_s: float | None = None,
     soft: bool = False,
@@ -58,7 +59,7 @@ def solve_on_surrogate(
         case: the grid.
         surrogate: what stands for the plant.
         instance: what to solve.
-        regime: gives the bound of |ω|.
+        bounds: of outputs of ω.
         points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
         time_limit_s: s.
         soft: `Infeasible` comes with the schedule of least frequency excess, summed over knot intervals.
@@ -66,11 +67,11 @@ def solve_on_surrogate(
     """
     started = built = time.perf_counter()
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
-    bound = case.omega_bound(regime)
     if plan is None:
         rows = Rows(OMEGA_TOLERANCE, OMEGA_TOLERANCE, by_interval=soft)
     else:
-        rows = Rows(SOFT_TOLERANCE * bound, SOFT_TOLERANCE * bound, soft=True)
+        left = SOFT_TOLERANCE * float(bounds.limit.min())
+        rows = Rows(left, left, soft=True)
 
     def follow(p_gen: Array) -> TimeVarying:
         return model_along(case, surrogate, instance, p_gen, points, exact=plan is None)
@@ -78,10 +79,10 @@ def solve_on_surrogate(
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
         reserve = None if plan is None else plan.reserve
-        program = KnotProgram(case, instance, bound, model, reserve)
+        program = KnotProgram(case, instance, bounds, model, reserve)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
-        limits = program.near(model.omega) if is_near else set()
+        limits = program.near(program.model.omega) if is_near else set()
         return solve_with_rows_added(program, limits, rows, deadline)
 
     if not is_reachable(case, instance, points):

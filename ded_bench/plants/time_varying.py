@@ -14,7 +14,7 @@ all intervals, around its own rollout under any powers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +86,18 @@ class TimeVarying:
     p_slack: Array  # (n_points,): of the trajectory, pu
     p_gen: Array  # (n_knots, n_gen): set-points of the trajectory, pu
     delivered: Delivered | None = None  # None: the set-points are delivered
+
+    def monitored(self, matrix: Array) -> TimeVarying:
+        """The same model with outputs y = matrix @ ω in the place of ω, matrix of shape (n_out, n_gen)."""
+        n_gen, n = matrix.shape[1], len(self.slack)
+        if np.array_equal(matrix, np.eye(n_gen)):
+            return self
+        if isinstance(self.speed, slice):
+            speed = np.zeros((n, n_gen, self.slack.shape[1]))
+            speed[:, :, self.speed] = np.eye(n_gen)
+        else:
+            speed = self.speed
+        return replace(self, speed=matrix @ speed, omega=self.omega @ matrix.T)
 
     @property
     def lengths(self) -> Indices:

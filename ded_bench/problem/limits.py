@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -25,11 +25,26 @@ class Bounds:
     at_end: Array  # (n_out,), bool
     kinds: tuple[str, ...]  # (n_out,): `omega`, `mean`, `relative` or `end`
 
+    def tightened(self, by: float = 0.0, part: float = 0.0) -> Bounds:
+        """Bounds that are smaller by a part of them, and by so many rad/s."""
+        return replace(self, limit=(1.0 - part) * self.limit - by)
+
+    def beyond(self, outputs: Array) -> Array:
+        """How far outputs are beyond their bounds, negative within; -inf at times that a bound leaves free.
+
+        Args:
+            outputs: y up to the last time, shape (n, n_out), rad/s.
+
+        Returns:
+            Of the same shape, rad/s.
+        """
+        beyond = np.abs(outputs) - self.limit
+        beyond[:-1, self.at_end] = -np.inf
+        return beyond
+
     def excess_hz(self, omega: Array) -> dict[str, float]:
         """Largest excess over the bounds of each kind, Hz, along frequency deviations (n, n_gen), rad/s."""
-        outputs = np.abs(omega @ self.matrix.T)
-        largest = np.where(self.at_end, outputs[-1], outputs.max(axis=0))
-        excess = np.maximum(largest - self.limit, 0.0) / (2 * np.pi)
+        excess = np.maximum(self.beyond(omega @ self.matrix.T).max(axis=0), 0.0) / (2 * np.pi)
         found = dict.fromkeys(self.kinds, 0.0)
         for kind, value in zip(self.kinds, excess.tolist(), strict=True):
             found[kind] = max(found[kind], value)

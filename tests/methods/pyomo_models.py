@@ -11,9 +11,10 @@ from ded_bench.methods.knots import power_limits as knot_limits
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 
 
-def build_ded_slp(case: Case, instance: Instance, bound: float, model: TimeVarying) -> pyo.ConcreteModel:
+def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVarying) -> pyo.ConcreteModel:
     """One program of `ded-slp` with a state, a limit and |P_s| at every grid point: what arrays reduce."""
     n_gen, n_state, steps = len(case.generators), model.slack.shape[1], len(model.omega) - 1
     interval = np.searchsorted(model.points, np.arange(steps + 1), side="right") - 1
@@ -60,10 +61,13 @@ def build_ded_slp(case: Case, instance: Instance, bound: float, model: TimeVaryi
         change = pyo.quicksum(model.slack[interval[k], s] * m.deviation[s, k] for s in m.state)
         return m.p_slack_up[k] - m.p_slack_down[k] == model.p_slack[k] + change
 
-    @m.Constraint(m.gen, m.step)
-    def ineq_frequency(m: Any, g: int, k: int) -> Any:
-        change = m.deviation[model.speed.start + g, k]
-        return pyo.inequality(-bound, model.omega[k, g] + change, bound)
+    @m.Constraint(range(len(bounds.limit)), m.step)
+    def ineq_frequency(m: Any, o: int, k: int) -> Any:
+        if bounds.at_end[o] and k < steps:
+            return pyo.Constraint.Skip
+        omega = [model.omega[k, g] + m.deviation[model.speed.start + g, k] for g in m.gen]
+        output = pyo.quicksum(weight * one for weight, one in zip(bounds.matrix[o], omega, strict=True))
+        return pyo.inequality(-bounds.limit[o], output, bounds.limit[o])
 
     @m.Constraint(m.gen, m.knot)
     def ineq_ramp(m: Any, g: int, j: int) -> Any:

@@ -19,6 +19,7 @@ from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
@@ -33,40 +34,40 @@ POINTS = np.array([0, 60, 121, 130, 205, 300, 400])
 short = functools.partial(on_surrogates.short, horizon_s=HORIZON)
 
 
-def program(case: Case, instance: Instance, bound: float, points=POINTS) -> KnotProgram:
+def program(case: Case, instance: Instance, bounds: Bounds, points=POINTS) -> KnotProgram:
     """The program around the static dispatch."""
     times = instance.grid[points]
     schedule = Schedule(t=times, p=ed.dispatch(case, instance, 1.0).at(times))
     model = plant_of(case).linearise_along(simulate(case, instance, schedule), points)
-    return KnotProgram(case, instance, bound, model)
+    return KnotProgram(case, instance, bounds, model)
 
 
 @pytest.mark.parametrize("index", range(3))
 def test_program_is_the_model_with_every_point(case, index):
     """HiGHS on the Pyomo model with a state, a limit and |P_s| at every grid point finds the same optimum."""
-    instance, bound = short(case, index), case.omega_bound("TO")
-    made = program(case, instance, bound)
+    instance, bounds = short(case, index), case.bounds("TO")
+    made = program(case, instance, bounds)
     limits = [
         (g, k) for g in range(len(case.generators)) for k in range(1, instance.steps) if k not in POINTS
     ]
     answer = made.solve(np.array(limits), np.inf)
     assert answer.status == Status.OPTIMAL
     prediction = made.predict(answer.x)
-    whole = build_ded_slp(case, instance, bound, made.model)
+    whole = build_ded_slp(case, instance, bounds, made.model)
     outcome = compile_model(whole, "highs").solve()
     assert outcome.status == Status.OPTIMAL
     # Within a piece P_s of both signs costs the program too little: its answer may be a little dearer,
     # the more so the shorter the horizon is.
     assert outcome.objective <= prediction.objective * (1 + 1e-8)
     assert prediction.objective == pytest.approx(outcome.objective, rel=2e-4)
-    assert np.abs(prediction.omega[1:]).max() <= bound + 1e-7
+    assert bounds.beyond(prediction.outputs)[1:].max() <= 1e-7
 
 
 @pytest.mark.parametrize("message", ["PIQP_MAX_ITER_REACHED", "PIQP_PRIMAL_INFEASIBLE"])
 @pytest.mark.parametrize("interval", [1, 20])
 def test_another_factorisation_follows_where_one_stalled(case, monkeypatch, message, interval):
     """With a knot at every point, or at some. What is shown to be infeasible is not tried again."""
-    made = program(case, short(case, 0), case.omega_bound("NO"), np.arange(0, 401, interval))
+    made = program(case, short(case, 0), case.bounds("NO"), np.arange(0, 401, interval))
     none, solve, attempts = np.empty((0, 2), dtype=int), knot_program.solve_form, []
     direct = made.solve(none, np.inf)
 

@@ -17,6 +17,7 @@ from ded_bench.plants.plant import plant_of
 from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.limits import IslandRegime
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import compile_model
@@ -83,14 +84,20 @@ def test_the_linearisation_has_the_derivatives_of_simulations(slow: Case) -> Non
     assert told == pytest.approx(paid, rel=1e-8)
 
 
-def test_the_program_is_the_model_with_every_point(slow: Case) -> None:
+@pytest.mark.parametrize("bounded", ["every speed", "mean, swings and end"])
+def test_the_program_is_the_model_with_every_point(slow: Case, bounded: str) -> None:
     """HiGHS on the Pyomo model, in which what is delivered is paid, finds the same optimum."""
-    instance, bound = short(slow, 0), slow.omega_bound("TO")
+    instance, bounds = short(slow, 0), slow.bounds("TO")
+    if bounded != "every speed":
+        hz = slow.regimes["TO"].omega_hz
+        regime = IslandRegime(mean_hz=hz, relative_hz=hz, end_hz=hz / 5)
+        bounds = regime.bounds(slow.inertia)
     p_gen = slow_dispatch(slow, instance, POINTS)
     along = simulate(slow, instance, Schedule(instance.grid[POINTS], p_gen))
-    program = KnotProgram(slow, instance, bound, plant_of(slow).linearise_along(along, POINTS))
+    model = plant_of(slow).linearise_along(along, POINTS)
+    program = KnotProgram(slow, instance, bounds, model)
     attempt = solve_with_rows_added(program, set(), Rows(1e-7, 1e-7), np.inf)
-    outcome = compile_model(build_ded_slp(slow, instance, bound, program.model), "highs").solve()
+    outcome = compile_model(build_ded_slp(slow, instance, bounds, model), "highs").solve()
     assert attempt.status == outcome.status == Status.OPTIMAL
     # Within a piece P_s of both signs costs the program too little.
     assert outcome.objective <= attempt.solution.objective * (1 + 1e-8)
@@ -122,7 +129,7 @@ def test_real_time_iterations_keep_the_bound(slow: Case) -> None:
 def test_speeds_may_be_given_as_matrices(case: Case) -> None:
     """Limits at the knots are then rows: the same optimum as with bounds of columns."""
     instance = sample_instance(case, 77, 1).model_copy(update={"horizon_s": 8.0})
-    points, plant, bound = case_knots(case, instance), plant_of(case), case.omega_bound("TO")
+    points, plant, bounds = case_knots(case, instance), plant_of(case), case.bounds("TO")
     p_gen = slow_dispatch(case, instance, points)
     model = plant.linearise_along(simulate(case, instance, Schedule(instance.grid[points], p_gen)), points)
     n, n_gen = len(model.lengths), len(case.generators)
@@ -131,7 +138,7 @@ def test_speeds_may_be_given_as_matrices(case: Case) -> None:
     by_rows = dataclasses.replace(model, speed=matrices)
     for rows in (Rows(1e-6, 1e-6), Rows(1e-4, 1e-4, soft=True)):
         found = [
-            solve_with_rows_added(KnotProgram(case, instance, bound, each), set(), rows, np.inf)
+            solve_with_rows_added(KnotProgram(case, instance, bounds, each), set(), rows, np.inf)
             for each in (model, by_rows)
         ]
         assert [attempt.status for attempt in found] == 2 * [Status.OPTIMAL]

@@ -35,7 +35,7 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
 
 #: Raised when answers change.
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)

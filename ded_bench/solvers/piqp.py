@@ -24,7 +24,6 @@ def solve_form(
     time_limit_s: float = np.inf,
     staged: bool = False,
     regularisation: float = REGULARISATION,
-    gap: float = GAP,
     residual: float | None = None,
 ) -> FormAnswer:
     """Solve a linear program.
@@ -39,8 +38,7 @@ def solve_form(
             stages have tens of columns.
         regularisation: least one of the factorised matrix. A smaller one gives more accurate steps; a sparse
             factorisation does not stand it.
-        gap: relative duality gap that is small enough.
-        residual: of rows, likewise, absolute and relative; PIQP's own values if not given.
+        residual: of rows, absolute and relative, that is small enough; PIQP's own values if not given.
 
     Returns:
         `Optimal`, `TimeLimit` or `Failed`: what is infeasible and what is hard PIQP does not tell apart well.
@@ -51,7 +49,7 @@ def solve_form(
         solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
     solver.settings.max_iter = MAX_ITERATIONS
     solver.settings.preconditioner_scale_cost = True
-    solver.settings.eps_duality_gap_rel = gap
+    solver.settings.eps_duality_gap_rel = GAP
     if residual is not None:
         solver.settings.eps_abs = solver.settings.eps_rel = residual
     solver.settings.reg_lower_limit = regularisation

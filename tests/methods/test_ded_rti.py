@@ -10,7 +10,6 @@ from scipy.optimize import linprog
 
 from ded_bench.methods import ded_ko_knots
 from ded_bench.methods.ded_rti import Options, RealTimeSolver
-from ded_bench.methods.knot_program import GAP
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.reserve import AHEAD_S, LIMIT, Reserve
 from ded_bench.methods.solution import Settings, Solution
@@ -27,6 +26,9 @@ from ded_bench.surrogates.linear import nominal_model
 from tests.methods.on_surrogates import replay, short
 from tests.methods.test_ded_ko_knots import least_excess
 
+#: Between rows |ω| may pass the bound by SOFT_TOLERANCE of it, which saves at most this part of the cost.
+SAVED = 1e-3
+
 
 def at_rest(case: Case, instance: Instance) -> Instance:
     """The same, with frequencies inside of any margin."""
@@ -42,8 +44,7 @@ def test_soft_limits_do_not_change_the_optimum(case: Case, koopman, regime: str)
         hard = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
         soft = RealTimeSolver(case, koopman, regime, Options(0.25))(instance)
         assert (hard.status, soft.status) == (Status.OPTIMAL, Status.FEASIBLE)
-        # Programs stop at a relative duality gap of GAP.
-        assert soft.solver_objective == pytest.approx(hard.solver_objective, rel=GAP)
+        assert soft.solver_objective == pytest.approx(hard.solver_objective, rel=SAVED)
 
 
 def test_plans_in_operation_keep_the_margin(case: Case, koopman) -> None:
@@ -51,7 +52,7 @@ def test_plans_in_operation_keep_the_margin(case: Case, koopman) -> None:
     solver = RealTimeSolver(case, koopman, "TO", Options(margin))
     single, plan = solver(instance), solver.solve(instance)
     assert plan.status == Status.FEASIBLE
-    assert plan.solver_objective >= single.solver_objective * (1 - GAP)
+    assert plan.solver_objective >= single.solver_objective * (1 - SAVED)
     omega = np.abs(replay(case, koopman, instance, plan.schedule).omega[1:]).max()
     assert omega <= (1 - margin) * case.omega_bound("TO") * (1 + 1.1 * SOFT_TOLERANCE)
 

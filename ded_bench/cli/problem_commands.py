@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
 from ded_bench.problem.benchmark import (
     Manifest,
+    copy_case,
     load_manifest,
     load_split,
     problem_folder,
@@ -24,7 +24,7 @@ from ded_bench.problem.benchmark import (
     write_scenarios,
 )
 from ded_bench.problem.case import SHIPPED_CASES, Case, case_file
-from ded_bench.problem.instance import check_whole_steps
+from ded_bench.problem.quantities import check_whole_steps
 from ded_bench.problem.sampling import DURATION_S, SCENARIOS
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _instances(a: argparse.Namespace) -> int:
     manifest = draw(folder) if a.force else _unless_changed(folder, draw)
     print(f"{counted(count, 'instance')} of {case.id} (seed {seed}) in {folder}, version {manifest.version}")
     if manifest.redraws:
-        print(f"{manifest.redraws} loads or instances were drawn again: their sign changed, or no power flow")
+        print(f"{manifest.redraws} loads or instances were drawn again: wrong sign, or not servable")
     return 0
 
 
@@ -112,7 +112,7 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
         place = Path(name)
         if (folder / "case.json").is_file():
-            shutil.copy(folder / "case.json", place)  # its bytes are part of the version
+            copy_case(folder / "case.json", place)  # its bytes are part of the version
         drawn = draw(place)
         if drawn.version != present.version:
             problem = (

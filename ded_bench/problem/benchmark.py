@@ -14,6 +14,8 @@ from pydantic import Field
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record, write_atomically, write_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.detailed_case import DetailedCase
+from ded_bench.problem.grid_files import GRID_FILES
 from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.quantities import Name
 from ded_bench.problem.sampling import (
@@ -109,7 +111,8 @@ def write_benchmark(
     Args:
         n_test: how many instances are for testing; None: a fifth.
         servable: as of `drawn_with_redraws`.
-        source: the case's file, whose bytes a new folder gets, since the version depends on them.
+        source: the case's file, whose bytes, and those of the files beside it that describe the grid, a new
+            folder gets, since the version depends on them.
 
     Raises:
         InputError: the folder holds another case, there are fewer instances than test instances, or the
@@ -119,12 +122,12 @@ def write_benchmark(
         raise InputError("instances", "test", f"{n_test} of {count} instances cannot be for testing")
     place = folder / "case.json"
     if place.exists():
-        if Case.load(folder) != case:
+        if Case.load(folder).fingerprint != case.fingerprint:
             raise InputError(place, "", f"is another case than {case.id}, or another version of it")
     elif source is None:
         write_record(case, place)
     else:
-        write_atomically(place, source.read_bytes())
+        copy_case(source, folder)
     written: dict[str, int] = {}
     for instance, redraws in drawn_with_redraws(case, seed, count, servable=servable):
         written[instance.id] = redraws
@@ -132,7 +135,15 @@ def write_benchmark(
     write_record(draw_split(list(written), seed, n_test), folder / "split.json")
     names = [f"instances/{name}.json" for name in written]
     _remove_others(folder / "instances", names)
-    return _write_manifest(folder, ["case.json", "split.json", *names], sum(written.values()))
+    own = ["case.json", *GRID_FILES] if isinstance(case, DetailedCase) else ["case.json"]
+    return _write_manifest(folder, [*own, "split.json", *names], sum(written.values()))
+
+
+def copy_case(source: Path, folder: Path) -> None:
+    """Copy a case's file, and those of its grid beside it, into another folder."""
+    for path, name in [(source, "case.json"), *((source.parent / name, name) for name in GRID_FILES)]:
+        if path.is_file():
+            write_atomically(folder / name, path.read_bytes())
 
 
 def write_scenarios(

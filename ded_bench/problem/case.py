@@ -15,6 +15,7 @@ from pydantic import PrivateAttr, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, parse_record, read_text
 from ded_bench.problem.grid_files import (
+    GRID_FILES,
     MACHINES_FILE,
     NETWORK_FILE,
     GridFiles,
@@ -105,7 +106,7 @@ class Case(Fingerprinted, Extended):
         return case
 
     def _read_grid(self, folder: Path) -> None:
-        if all((folder / name).is_file() for name in (NETWORK_FILE, MACHINES_FILE)):
+        if all((folder / name).is_file() for name in GRID_FILES):
             grid = load_grid_files(folder, self.id, self.f0_hz)
             self._grid = grid
             self._check_grid(grid, folder)

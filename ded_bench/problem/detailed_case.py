@@ -14,7 +14,7 @@ from ded_bench.files.strict import Record
 from ded_bench.problem.case import Case, Sampling
 from ded_bench.problem.grid_files import load_grid_files
 from ded_bench.problem.limits import Agc, IslandRegime, Regime, ScheduledMachine, Transfer
-from ded_bench.problem.quantities import LARGEST, Array, Magnitude, Name
+from ded_bench.problem.quantities import LARGEST, Array, Magnitude, Name, check_whole_steps
 
 #: Knots of a case that names no number of its own: one a second in a minute.
 KNOTS = 61
@@ -73,6 +73,8 @@ class DetailedCase(Case):
             named[f"transfers.{transfer.name}"] = set(transfer.machines)
             if unknown := set(transfer.loads) - set(self.loads):
                 raise ValueError(f"transfers.{transfer.name}: there is no load {min(unknown)}")
+        if self.agc is not None:
+            check_whole_steps("plant.agc.period_s", self.agc.period_s, self.sampling.dt_s)
         for field, machines in named.items():
             if unknown := machines - set(self.machines):
                 raise ValueError(f"{field}: there is no machine {min(unknown)}")

@@ -19,7 +19,7 @@ from ded_bench.files.strict import Fingerprinted, Record, parse_record, read_tex
 from ded_bench.problem.quantities import SMALLEST, Array, Magnitude, Name, NonNegative, Number, Positive
 
 BASE_MVA = 100.0
-NETWORK_FILE, MACHINES_FILE = "network.json", "machines.json"
+GRID_FILES = NETWORK_FILE, MACHINES_FILE = "network.json", "machines.json"
 #: How far the shares of the machines at a bus may be from 1 in sum.
 SHARES = 1e-6
 

@@ -15,12 +15,19 @@ from pydantic import Field, WrapValidator, field_validator, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
-from ded_bench.problem.quantities import Array, Extended, Name, NonNegative, Number, Positive
+from ded_bench.problem.quantities import (
+    Array,
+    Extended,
+    Name,
+    NonNegative,
+    Number,
+    Positive,
+    check_whole_steps,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_STEPS = 1_000_000
 #: No grid in operation is further from its nominal frequency, Hz; whoever writes more means another quantity.
 LARGEST_DEVIATION_HZ = 1.0
 
@@ -81,15 +88,6 @@ def _load_of_its_kind(value: Any, _: Any) -> LoadRamp | LoadPoints:
 
 
 Load = Annotated[LoadRamp | LoadPoints, WrapValidator(_load_of_its_kind)]
-
-
-def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
-    """Raise ValueError unless a time of this name is a number of steps, and not too many."""
-    steps = length_s / dt_s
-    if steps > MAX_STEPS:  # first, since the quotient may be infinite
-        raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
-    if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
-        raise ValueError(f"{name}: must be a whole multiple of dt_s")
 
 
 class AgcState(Extended):
@@ -228,6 +226,12 @@ class Instance(Fingerprinted):
     def grid(self) -> Array:
         """Times t_k = k dt, shape (steps + 1,), s."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.dt_s
+
+    @functools.cached_property
+    def kinks(self) -> Array:
+        """Times at which a load may change its slope, beside 0 and the horizon, ascending, s."""
+        inner = {t for load in self.load.values() for t in load.kinks if t < self.horizon_s}
+        return np.array(sorted({0.0, self.horizon_s} | inner))
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""

@@ -20,6 +20,7 @@ Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Range = tuple[Number, Number]
+MAX_STEPS = 1_000_000
 
 
 class Extended(Record):
@@ -28,3 +29,12 @@ class Extended(Record):
     @model_serializer(mode="wrap")
     def _given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         return {name: value for name, value in write(self).items() if value is not None}
+
+
+def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
+    """Raise ValueError unless a time of this name is a number of steps, and not too many."""
+    steps = length_s / dt_s
+    if steps > MAX_STEPS:  # first, since the quotient may be infinite
+        raise ValueError(f"dt_s: more than {MAX_STEPS} time steps")
+    if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
+        raise ValueError(f"{name}: must be a whole multiple of dt_s")

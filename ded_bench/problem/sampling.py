@@ -91,7 +91,7 @@ def _draw(case: Case, master: int, index: int, generator: np.random.Generator) -
     n_gen, n_load = len(case.generators), len(case.loads)
     n_priced = len(case.priced)
     draws = generator.random(n_priced + 2 * n_gen + 6 * n_load)
-    cost, rest = _rounded(_between(ranges.cost, draws[:n_priced])), draws[n_priced:]
+    cost, rest = rounded(_between(ranges.cost, draws[:n_priced])), draws[n_priced:]
     ramps, redraws = _draw_ramps(case, rest[: 6 * n_load].reshape(n_load, 6), generator)
     instance = Instance(
         schema_="ded-bench/instance/1",
@@ -125,7 +125,7 @@ def _initial(case: Case, cost: Array, load: Array, uniform: Array) -> Initial:
     power = p_opt - 0.5 * (p_opt - case.p_nominal) * _between(case.sampling.perturbation, perturbation)
     omega = _between(case.sampling.omega_rad_per_s, frequency)
     return Initial(
-        power=_by_bus(case.generators, _rounded(power)), omega=_by_bus(case.generators, _rounded(omega))
+        power=_by_bus(case.generators, rounded(power)), omega=_by_bus(case.generators, rounded(omega))
     )
 
 
@@ -146,11 +146,11 @@ def _draw_ramps(case: Case, uniform: Array, generator: np.random.Generator) -> t
 def _ramps(case: Case, uniform: Array, loads: NDArray[np.int_]) -> Array:
     ranges = case.sampling
     spread = (-ranges.load_relative, ranges.load_relative)
-    initial = _rounded(case.load_nominal[loads] * (1 + _between(spread, uniform[:, 0])))
-    start = _rounded(_between(ranges.start_s, uniform[:, 1]))
-    duration = _rounded(_between(ranges.duration_s, uniform[:, 2]))
+    initial = rounded(case.load_nominal[loads] * (1 + _between(spread, uniform[:, 0])))
+    start = rounded(_between(ranges.start_s, uniform[:, 1]))
+    duration = rounded(_between(ranges.duration_s, uniform[:, 2]))
     sign = np.where(uniform[:, 4] < 0.5, -1.0, 1.0)
-    rate = _rounded(_between(case.load_rate[:, loads], uniform[:, 3]) * sign)
+    rate = rounded(_between(case.load_rate[:, loads], uniform[:, 3]) * sign)
     rate = np.where(uniform[:, 5] < ranges.rate_zero_probability, 0.0, rate)
     return np.stack([initial, start, duration, rate], axis=1)
 
@@ -197,7 +197,7 @@ def _draw_scenario(
     case: Case, seed: int, index: int, generator: np.random.Generator, duration_s: float
 ) -> Scenario:
     n_gen = len(case.generators)
-    cost = _rounded(_between(case.sampling.cost, generator.random(len(case.priced))))
+    cost = rounded(_between(case.sampling.cost, generator.random(len(case.priced))))
     load = {bus: _draw_load(case, i, generator, duration_s) for i, bus in enumerate(case.loads)}
     first = np.array([load[bus].initial for bus in case.loads])
     return Scenario(
@@ -217,7 +217,7 @@ def _draw_load(case: Case, number: int, generator: np.random.Generator, duration
     """One ramp in every horizon of the case; it turns round where it would leave the range."""
     ranges, nominal = case.sampling, float(case.load_nominal[number])
     spread = min(ranges.load_relative, LOAD_RANGE)
-    level = initial = float(_rounded(nominal * (1 + _between((-spread, spread), generator.random(1))))[0])
+    level = initial = float(rounded(nominal * (1 + _between((-spread, spread), generator.random(1))))[0])
     last, ended, ramps = duration_s + ranges.horizon_s, 0.0, []
     for window in np.arange(0.0, last, ranges.horizon_s):
         start, duration, size, sign, *announced = generator.random(7)
@@ -237,15 +237,15 @@ def _draw_load(case: Case, number: int, generator: np.random.Generator, duration
 
 def _ramp(start: float, duration: float, rate: float, announced: list[float]) -> ScenarioRamp:
     """A ramp from its values and three uniforms: whether it is announced, and how wrong."""
-    start, duration, rate = _rounded(np.array([start, duration, rate])).tolist()
+    start, duration, rate = rounded(np.array([start, duration, rate])).tolist()
     known = announced[0] >= UNANNOUNCED
     error_start, error_rate = START_ERROR_S * _normal(announced[1]), RATE_ERROR * _normal(announced[2])
     return ScenarioRamp(
         start=start,
         duration=duration,
         rate=rate,
-        announced_start=float(_rounded(np.maximum(start + error_start, 0.0))) if known else None,
-        announced_rate=float(_rounded(np.array(rate * (1 + error_rate)))) if known else None,
+        announced_start=float(rounded(np.maximum(start + error_start, 0.0))) if known else None,
+        announced_rate=float(rounded(np.array(rate * (1 + error_rate)))) if known else None,
     )
 
 
@@ -280,5 +280,6 @@ def _between(ends: Range | Array, uniform: Array | float) -> Array:
     return np.asarray(ends[0] + (ends[1] - ends[0]) * uniform)
 
 
-def _rounded(values: Array) -> Array:
+def rounded(values: Array) -> Array:
+    """Values as files have them."""
     return np.round(values, DECIMALS) + 0.0  # + 0.0: no negative zero in the files

@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp, check_whole_steps
-from ded_bench.problem.quantities import Array, Name, NonNegative, Number, Positive
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
+from ded_bench.problem.quantities import Array, Name, NonNegative, Number, Positive, check_whole_steps
 
 
 class ScenarioRamp(Record):

@@ -6,17 +6,18 @@ stay. What the balancing machine of the power flow would have to add is what the
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linprog
 
-from ded_bench.plants.detailed.power_flow import Complex, PortNetwork
+from ded_bench.files.errors import InputError
+from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import rounded
 
 #: Balanced is what is short of less than this, pu; powers that move by less in a program stay.
 BALANCED, STAYS = 1e-9, 1e-6
@@ -29,7 +30,7 @@ class Balance:
     """Powers of all machines and loads, beside what the network makes of them."""
 
     power: Array  # (n_gen,), pu
-    voltage: Complex  # at the ports, (n_port,), pu
+    point: OperatingPoint
     short: float  # what loads and losses take beyond the powers, pu
     slopes: Array  # of `short` by the powers, (n_gen,): about -1
 
@@ -40,41 +41,34 @@ class StaticDispatch:
 
     case: Case
     network: PortNetwork
+    machines: Indices  # of the generators, (n_gen,)
+    load_ports: Indices  # (n_load,)
 
-    @functools.cached_property
-    def _places(self) -> Indices:
-        """Where generators stand among the machines."""
-        names = list(self.case.detailed.machines)
-        return np.array([names.index(self.case.machine_of(g)) for g in self.case.generators])
-
-    def weigh(self, power: Array, drawn: Array, guess: Complex | None = None) -> Balance:
+    def weigh(self, power: Array, p_load: Array, guess: Complex | None = None) -> Balance:
         """Solve the power flow and say what the powers are short of.
 
         Args:
             power: of the generators, (n_gen,), pu.
-            drawn: active power at the ports, (n_port,), pu.
+            p_load: load injections, (n_load,), pu; other loads are nominal.
             guess: voltages to start from; None: nominal.
 
         Raises:
             SimulationError: the power flow has no solution.
         """
-        machines = np.zeros(len(self._places))
-        machines[self._places] = power
+        machines, drawn = np.zeros(len(self.machines)), self.network.p_drawn.copy()
+        machines[self.machines], drawn[self.load_ports] = power, -p_load
         point = self.network.power_flow(machines, drawn, guess)
         slopes, balancing = self.network.balance_slopes(point)[0], self.network.balancing
         slopes[balancing] = -1.0
         short = float(point.power.real[balancing] - machines[balancing])
-        return Balance(power, point.voltage, short, slopes[self._places])
+        return Balance(power, point, short, slopes[self.machines])
 
-    def cheapest(
-        self, cost: Array, p_load: Array, drawn: Array, start: Balance, reach: Array | None = None
-    ) -> Balance:
+    def cheapest(self, cost: Array, p_load: Array, start: Balance, reach: Array | None = None) -> Balance:
         """Cheapest powers within limits and transfers that balance loads and losses.
 
         Args:
             cost: (n_gen,).
             p_load: load injections, (n_load,), pu.
-            drawn: the active power at the ports that they mean, (n_port,), pu.
             start: powers and voltages near these.
             reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere.
 
@@ -85,13 +79,13 @@ class StaticDispatch:
         lower, upper = case.p_min, case.p_max
         if reach is not None:
             lower, upper = np.maximum(lower, start.power - reach), np.minimum(upper, start.power + reach)
-        found = self.weigh(np.clip(start.power, lower, upper), drawn, start.voltage)
+        found = self.weigh(np.clip(start.power, lower, upper), p_load, start.point.voltage)
         for _ in range(PROGRAMS):
             power = self._program(cost, p_load, found, lower, upper)
             if power is None:
                 break
             moved = float(np.abs(power - found.power).max())
-            found = self.weigh(power, drawn, found.voltage)
+            found = self.weigh(power, p_load, found.point.voltage)
             if abs(found.short) < BALANCED and moved < STAYS:
                 return found
         raise SimulationError("no powers within limits and transfers balance loads and losses")
@@ -119,12 +113,12 @@ class StaticDispatch:
             A_ub=by_machine,
             b_ub=limit - by_load @ p_load,
             A_eq=arrives[None],
-            b_eq=[need + arrives @ lower],
+            b_eq=[float(need + arrives @ lower)],
             bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)),
         )
         return None if found.x is None else np.clip(found.x, lower, upper)
 
-    def balanced(self, power: Array, p_load: Array, drawn: Array) -> Balance:
+    def balanced(self, power: Array, p_load: Array) -> Balance:
         """Powers near some given ones that balance loads and losses within limits and transfers.
 
         A group beyond its transfer is brought to it; all other machines take what is missing or too much,
@@ -137,7 +131,7 @@ class StaticDispatch:
         power = np.clip(power, case.p_min, case.p_max)
         free = np.ones(len(power), dtype=bool)
         for _ in range(1 + len(by_machine)):
-            found = self._shared(power, free, drawn)
+            found = self._shared(power, free, p_load)
             excess = case.transfer_excess(found.power, p_load)
             beyond = np.flatnonzero(excess > BALANCED)
             if not beyond.size:
@@ -149,11 +143,11 @@ class StaticDispatch:
             power, free = found.power - room * excess[beyond[0]] / room.sum(), free & ~group
         raise SimulationError("the powers cannot be balanced within limits and transfers")
 
-    def _shared(self, power: Array, free: Array, drawn: Array) -> Balance:
+    def _shared(self, power: Array, free: Array, p_load: Array) -> Balance:
         """Move the free machines, each by the same part of what it can, until loads and losses are met."""
         case, voltage = self.case, None
         for _ in range(NEWTON_STEPS):
-            found = self.weigh(power, drawn, voltage)
+            found = self.weigh(power, p_load, voltage)
             if abs(found.short) < 1e-3 * BALANCED:
                 return found
             room = (case.p_max if found.short > 0 else case.p_min) - power
@@ -161,36 +155,49 @@ class StaticDispatch:
             part = found.short / max(-found.slopes @ room * np.sign(found.short), 1e-300)
             if not abs(part) <= 1.0:
                 break
-            power, voltage = power + abs(part) * room, found.voltage
+            power, voltage = power + abs(part) * room, found.point.voltage
         raise SimulationError("the powers cannot be balanced within limits and transfers")
 
+    def course(self, instance: Instance, times: Array) -> Array:
+        """Dispatch at one time after another, within the ramp limits from the one before; (n, n_gen), pu.
 
-def course(
-    dispatch: StaticDispatch,
-    cost: Array,
-    p_load: Array,
-    drawn: Array,
-    start: Balance,
-    apart_s: Sequence[float],
-) -> Array:
-    """Dispatch one instant after another, each within the ramp limits from the one before.
+        Args:
+            instance: gives costs, loads and the powers at t = 0, which are near balance.
+            times: ascending from 0, (n,), s; the powers at 0 are given.
 
-    Args:
-        dispatch: of the island.
-        cost: (n_gen,).
-        p_load: load injections at n instants, (n, n_load), pu.
-        drawn: at the ports, (n, n_port), pu.
-        start: the powers before the first instant.
-        apart_s: time from each instant's predecessor, (n,), s.
+        Raises:
+            SimulationError: no powers within reach balance the loads.
+        """
+        cost, p_load = instance.cost_gen(self.case), instance.p_load(self.case, times)
+        found = self.weigh(instance.p_initial(self.case), p_load[0])
+        powers = [found.power]
+        for load, apart in zip(p_load[1:], np.diff(times).tolist(), strict=True):
+            found = self.cheapest(cost, load, found, self.case.ramp * apart)
+            powers.append(found.power)
+        return np.array(powers)
 
-    Returns:
-        Powers, (n, n_gen), pu.
+    def drawn(self, instance: Instance) -> Instance:
+        """An instance whose powers at t = 0 are balanced, rounded as the sampler does.
 
-    Raises:
-        SimulationError: no powers within reach balance the loads.
-    """
-    powers = []
-    for load, at_ports, apart in zip(p_load, drawn, apart_s, strict=True):
-        start = dispatch.cheapest(cost, load, at_ports, start, dispatch.case.ramp * apart)
-        powers.append(start.power)
-    return np.array(powers)
+        Raises:
+            SimulationError: there are none within limits.
+        """
+        p_load = instance.p_load(self.case, np.zeros(1))[0]
+        power = self.balanced(instance.p_initial(self.case), p_load).power
+        by_name = dict(zip(self.case.generators, rounded(power).tolist(), strict=True))
+        return instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": by_name})})
+
+    def check_kinks(self, instance: Instance, source: str) -> None:
+        """Raise InputError unless powers balance the loads at 0, at every kink and at the horizon."""
+        cost, times = instance.cost_gen(self.case), instance.kinks
+        p_load = instance.p_load(self.case, times)
+        try:
+            found = self.weigh(instance.p_initial(self.case), p_load[0])
+        except SimulationError as error:
+            problem = f"initial loads and powers cannot be served: {error}"
+            raise InputError(source, "load, initial.power", problem) from None
+        for t, load in zip(times.tolist(), p_load, strict=True):
+            try:
+                found = self.cheapest(cost, load, found)
+            except SimulationError as error:
+                raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None

@@ -143,8 +143,7 @@ class LosslessPlant:
             given = "power" if instance.initial.theta is None else "theta"
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
-        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
-        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
+        case, times = self.case, instance.kinks
         p_load = instance.p_load(case, times)
         p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
         with contextlib.suppress(PowerFlowError):  # all at once is faster, one by one tells where it fails

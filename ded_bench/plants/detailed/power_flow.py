@@ -6,6 +6,7 @@ exact. Loads draw constant P and Q. Everything is in pu of the network's base po
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -143,8 +144,14 @@ class PortNetwork:
         )
 
 
-def port_network(network: Any, machines: Any) -> PortNetwork:
-    """Build the network of a case's records; ports are the buses with a machine, a load or a feed-in."""
+def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> PortNetwork:
+    """Build the network of a case's records.
+
+    Args:
+        network: its buses and lines.
+        machines: whose buses are ports.
+        loads: buses that may draw power though they draw none nominally; all that do are ports, too.
+    """
     index = {bus.id: i for i, bus in enumerate(network.buses)}
     full = np.zeros((len(index), len(index)), dtype=complex)
     for bus in network.buses:
@@ -162,9 +169,9 @@ def port_network(network: Any, machines: Any) -> PortNetwork:
     drawn = np.array([
         bus.pd + 1j * bus.qd - (0.0 if bus.id in stations else bus.pg + 1j * bus.qg) for bus in network.buses
     ])  # fmt: skip
-    loads, others = np.flatnonzero(drawn), np.flatnonzero(drawn == 0.0)
-    bare = [i for i in others if network.buses[i].id in stations]
-    ports = np.array([*loads, *bare])
+    drawing = [i for i, bus in enumerate(network.buses) if drawn[i] != 0.0 or bus.id in loads]
+    bare = sorted({index[bus] for bus in stations} - set(drawing))
+    ports = np.array([*drawing, *bare])
     inner = np.setdiff1d(np.arange(len(index)), ports)
     spread = np.zeros((len(index), len(ports)), dtype=complex)
     spread[ports] = np.eye(len(ports))
@@ -174,7 +181,7 @@ def port_network(network: Any, machines: Any) -> PortNetwork:
     return PortNetwork(
         buses=tuple(index),
         ports=ports,
-        n_load_port=len(loads),
+        n_load_port=len(drawing),
         admittance=full[ports] @ spread,
         spread=spread,
         p_drawn=drawn[ports].real,

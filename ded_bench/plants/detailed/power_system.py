@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,13 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.plants.detailed.equilibrium import Equilibrium, equilibrium
-from ded_bench.plants.detailed.machine_arrays import MachineArrays, machine_arrays, moving
+from ded_bench.plants.detailed.machine_arrays import DELTA, MachineArrays, machine_arrays, moving
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array
 
 if TYPE_CHECKING:
+    from ded_bench.plants.detailed.equations import CompiledNetwork
     from ded_bench.plants.detailed.symbolic import SymbolicPlant
+
+#: Change of voltages in a fixed-point step at which it ends, pu: a tenth of it, or less, is left.
+CHANGE = 1e-10
+#: Step of differences between states, which are of the order of one.
+DIFFERENCE = 1e-6
 
 
 class Slopes(NamedTuple):
@@ -35,9 +42,9 @@ class PowerSystem:
     data: MachineArrays
 
     @staticmethod
-    def of(network: Any, machines: Any, island: bool) -> PowerSystem:
-        """Build it from the records of network.json and machines.json."""
-        ac = port_network(network, machines)
+    def of(network: Any, machines: Any, island: bool, loads: Collection[str] = ()) -> PowerSystem:
+        """Build it from the records of network.json and machines.json; `loads` as in `port_network`."""
+        ac = port_network(network, machines, loads)
         infinite = None if island else machines.machines[ac.balancing].name
         return PowerSystem(ac, machine_arrays(machines, ac.machine_port, infinite))
 
@@ -57,6 +64,38 @@ class PowerSystem:
         from ded_bench.plants.detailed.symbolic import symbolic_plant  # CasADi: simulation does without
 
         return symbolic_plant(self.data, self.network)
+
+    @functools.cached_property
+    def compiled_network(self) -> CompiledNetwork:
+        """What compiled functions see of the network."""
+        from ded_bench.plants.detailed.equations import CompiledNetwork  # and with it Numba
+
+        y = self.network.admittance.copy()
+        np.add.at(y, (self.data.port, self.data.port), 1.0 / (1j * self.data.x))
+        real = np.empty((2 * len(y), 2 * len(y)))
+        real[0::2, 0::2] = real[1::2, 1::2] = y.real
+        real[0::2, 1::2], real[1::2, 0::2] = -y.imag, y.imag
+        return CompiledNetwork(real.T.copy(), self.network.q_drawn[: self.network.n_load_port].copy(), CHANGE)
+
+    @functools.cached_property
+    def fastest(self) -> float:
+        """Size of the fastest mode at the nominal point, 1/s, from differences of the compiled equations."""
+        from ded_bench.plants.detailed.equations import rates_at
+
+        point = self.network.nominal()
+        rest = self.equilibrium(point)
+        turned = point.voltage * np.exp(-1j * (self.data.inertia @ rest.x[DELTA]))
+        n = len(self.moving)
+        x = np.tile(rest.x, (2, n, 1, 1))
+        steps = x.reshape(2, n, -1)[:, np.arange(n), self.moving]
+        steps += np.array([[DIFFERENCE], [-DIFFERENCE]])
+        x.reshape(2, n, -1)[:, np.arange(n), self.moving] = steps
+        drawn = point.p_drawn[: self.network.n_load_port]
+        references = np.stack([point.power.real, rest.v_ref])
+        given = self.data, self.compiled_network, drawn, references
+        rates = rates_at(*given, x.reshape(-1, *rest.x.shape), interleaved(turned)).reshape(x.shape)
+        slopes = (rates[0] - rates[1]).reshape(n, -1)[:, self.moving] / (2.0 * DIFFERENCE)
+        return float(np.abs(np.linalg.eigvals(slopes)).max())
 
     def equilibrium(self, point: OperatingPoint) -> Equilibrium:
         """See `equilibrium`."""

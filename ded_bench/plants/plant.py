@@ -101,7 +101,10 @@ class Plant(Protocol):
 
 
 #: Plants by name: `module:class`, called with the case.
-PLANTS: dict[str, str] = {"lossless": "ded_bench.plants.lossless.lossless_plant:LosslessPlant"}
+PLANTS: dict[str, str] = {
+    "lossless": "ded_bench.plants.lossless.lossless_plant:LosslessPlant",
+    "detailed": "ded_bench.plants.detailed.detailed_plant:DetailedPlant",
+}
 
 
 def plant_of(case: Case, name: str | None = None) -> Plant:

@@ -6,7 +6,8 @@ knots (first-order hold):
 
     x⁺ = f x + g u + h Δu,    δω = C x,    δP_s = c x,    δP = C_p x + D_p u
 
-with δP what is delivered, on plants where that differs from the set-points. The loads are those of the
+with δP what is delivered, on plants where that differs from the set-points. A plant with control in discrete
+time has x⁺ = R x at the start of some intervals, before all that. The loads are those of the
 trajectory, so that they enter through it alone. A lifted model (`Koopman`) has the same form, the same for
 all intervals, around its own rollout under any powers.
 """
@@ -70,6 +71,13 @@ class Delivered(NamedTuple):
     p_gen: Array  # of the trajectory, (n_points, n_gen), pu
 
 
+class Reset(NamedTuple):
+    """x⁺ = R x at the start of some intervals; no output changes by it at once."""
+
+    intervals: Indices
+    f: Array  # R, (n_state, n_state)
+
+
 @dataclass(frozen=True, eq=False)
 class TimeVarying:
     """(ω, P_s) at all grid points as affine functions of set-points at the knots.
@@ -79,13 +87,14 @@ class TimeVarying:
 
     points: Indices  # (n_knots,): grid point of each knot
     step: Hold  # over one grid step, of each interval
-    across: Hold  # over the whole of each interval
+    across: Hold  # over the whole of each interval, a reset at its start included
     speed: slice | Array  # C: the entries δω of the state, or (n_intervals, n_gen, n_state)
     slack: Array  # (n_intervals, n_state): δP_s / δx
     omega: Array  # (n_points, n_gen): of the trajectory, rad/s
     p_slack: Array  # (n_points,): of the trajectory, pu
     p_gen: Array  # (n_knots, n_gen): set-points of the trajectory, pu
     delivered: Delivered | None = None  # None: the set-points are delivered
+    reset: Reset | None = None
 
     def monitored(self, matrix: Array) -> TimeVarying:
         """The same model with outputs y = matrix @ ω in the place of ω, matrix of shape (n_out, n_gen)."""
@@ -135,6 +144,9 @@ class TimeVarying:
         deviation = np.zeros((len(self.omega), x.shape[1]))
         deviation[self.points] = x
         interval = np.arange(len(length))
+        if self.reset is not None:
+            state = state.copy()
+            state[self.reset.intervals] = state[self.reset.intervals] @ self.reset.f.T
         for r in range(1, int(length.max())):
             if not (length[interval] > r).all():
                 some = length[interval] > r
@@ -247,6 +259,8 @@ class TimeVarying:
                 on_start += through
                 on_slope += (r - 1) * through + costate @ h
                 costate = costate @ f
+        if self.reset is not None:
+            costate[self.reset.intervals] = costate[self.reset.intervals] @ self.reset.f
         end = on_slope / self.lengths[:, None, None]
         return LocalRows(np.arange(n), costate, on_start - end, end)
 

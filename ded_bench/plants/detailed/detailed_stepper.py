@@ -23,12 +23,16 @@ from ded_bench.plants.detailed.equations import (
     sources,
 )
 from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
-from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import Array
 
 #: Slopes of loads are renewed where voltages take more fixed-point steps than this, but not within so many
 #: integrator steps: an inversion costs as much as some hundred of those.
 SLOW, RENEWED_AFTER = 3, 50
+
+
+#: A point that no grid has.
+NEVER = 2**62
 
 
 class PlantInputs(NamedTuple):
@@ -49,7 +53,7 @@ class SecondaryControl(NamedTuple):
     period: int  # points
 
 
-class Course(NamedTuple):
+class DetailedStates(NamedTuple):
     """States at n points of time; the first of `x`, `v` and `held` are given, the others computed."""
 
     x: Array  # (n, N_STATES, n_machine); the mean rotor angle is the integral of the mean frequency
@@ -65,7 +69,7 @@ def integrate_plant(
     inputs: PlantInputs,
     agc: SecondaryControl,
     steps: int,
-    course: Course,
+    states: DetailedStates,
 ) -> int:
     """Integrate from the first point of time to the last; a share due at the last point is not applied.
 
@@ -75,15 +79,15 @@ def integrate_plant(
         inputs: at the points.
         agc: secondary control.
         steps: integrator steps from one point to the next.
-        course: receives what happens.
+        states: receives what happens.
 
     Returns:
         The number of points computed: less than n where the network's equations have no solution.
     """
-    n, n_machine, n_load = len(course.x), course.x.shape[2], inputs.drawn.shape[1]
+    n, n_machine, n_load = len(states.x), states.x.shape[2], inputs.drawn.shape[1]
     h = inputs.dt / steps
     node, weight = (0.0, 0.5, 0.5, 1.0), (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
-    x, v, held = course.x[0].copy(), course.v[0].copy(), course.held[0]
+    x, v, held = states.x[0].copy(), states.v[0].copy(), states.held[0]
     stage, rates, total = x.copy(), np.zeros_like(x), np.zeros_like(x)
     p_ref, drawn, p_e = np.empty(n_machine), inputs.drawn[0].copy(), np.empty(n_machine)
     source = np.empty(len(v))
@@ -96,7 +100,7 @@ def integrate_plant(
     for k in range(n):
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
-        course.held[k] = held
+        states.held[k] = held
         after = min(k + 1, n - 1)
         for j in range(steps):
             age += 1
@@ -128,7 +132,7 @@ def integrate_plant(
                 recent[0, s] = v[: 2 * n_load]
                 machine_rates(data, stage, v, p_ref, inputs.v_ref, rates, p_e)
                 if s == 0 and j == 0:
-                    course.x[k], course.v[k], course.p_e[k] = x, v, p_e
+                    states.x[k], states.v[k], states.p_e[k] = x, v, p_e
                     if k == n - 1:
                         return n
                 for q in range(N_STATES):

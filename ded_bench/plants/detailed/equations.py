@@ -35,8 +35,8 @@ from ded_bench.plants.detailed.machine_arrays import (
     WASHOUT,
     MachineArrays,
 )
-from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import Array
 
 #: The fixed point gives up after so many steps.
 FIXED_POINT_STEPS = 40

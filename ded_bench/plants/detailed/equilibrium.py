@@ -21,7 +21,7 @@ from ded_bench.plants.detailed.machine_arrays import (
     MachineArrays,
 )
 from ded_bench.plants.detailed.power_flow import OperatingPoint
-from ded_bench.problem.case import Array
+from ded_bench.problem.quantities import Array
 
 
 class Equilibrium(NamedTuple):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
-from ded_bench.problem.case import Array
+from ded_bench.problem.quantities import Array
 
 Complex = NDArray[np.complex128]
 

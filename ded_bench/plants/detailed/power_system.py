@@ -14,7 +14,7 @@ from ded_bench.plants.detailed.equilibrium import Equilibrium, equilibrium
 from ded_bench.plants.detailed.machine_arrays import DELTA, MachineArrays, machine_arrays, moving
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
 from ded_bench.plants.time_varying import Indices
-from ded_bench.problem.case import Array
+from ded_bench.problem.quantities import Array
 
 if TYPE_CHECKING:
     from ded_bench.plants.detailed.equations import CompiledNetwork

@@ -1,0 +1,193 @@
+"""The plant `detailed`: machines with exciters, stabilisers and governors on the AC network.
+
+Either the machine at `slack_machine_bus` keeps its speed (infinite slack), or every machine is finite and
+scheduled (island), with secondary control (AGC) where the case has it. Set-points are the references of the
+governors; what turbines deliver follows. Loads draw constant power at any voltage. The equations are in
+`symbolic`.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.plants.detailed.case_system import CaseSystem, DetailedRun, DetailedState
+from ded_bench.plants.detailed.detailed_linearisation import linearised
+from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
+from ded_bench.plants.detailed.start import initial_point, start
+from ded_bench.plants.plant import Piece, SimulationError
+from ded_bench.plants.time_varying import Indices, TimeVarying
+from ded_bench.problem.case import Case
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import AgcState, Instance, State
+from ded_bench.problem.quantities import Array
+from ded_bench.problem.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from ded_bench.plants.detailed.detailed_stepper import SecondaryControl
+
+#: Longest step times the fastest mode: Kutta's method is stable up to 2.78.
+STEP_BY_MODE = 2.0
+#: Voltages are solved for less sharply where a linearisation follows, pu.
+PLANNING_CHANGE = 1e-8
+#: How far a time of secondary control may be from a grid point, in steps.
+BETWEEN = 1e-6
+
+
+@dataclass(frozen=True)
+class DetailedPlant:
+    """The detailed plant of one case."""
+
+    case: Case
+    name: str = "detailed"
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the case's network and machines are there."""
+        _ = self.case.detailed
+
+    def __reduce__(self) -> tuple[type[DetailedPlant], tuple[Case]]:
+        """Without what is made once."""
+        return DetailedPlant, (self.case,)
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the case and of the files beside it."""
+        parts = self.case.fingerprint + self.case.detailed.fingerprint
+        return hashlib.sha256(parts.encode()).hexdigest()[:12]
+
+    @functools.cached_property
+    def equations(self) -> CaseSystem:
+        """Its equations, by the case's generators and loads."""
+        return CaseSystem(self.case)
+
+    def initial(self, instance: Instance) -> DetailedState:
+        """See `Plant.initial` and `start`.
+
+        Raises:
+            InputError: powers and loads at t = 0 are not balanced.
+        """
+        return start(self.equations, instance)
+
+    def control(self, state: DetailedState, dt_s: float) -> SecondaryControl:
+        """Secondary control by the points of a grid.
+
+        Raises:
+            InputError: it acts between them.
+        """
+        from ded_bench.plants.detailed.detailed_stepper import NEVER, SecondaryControl
+
+        agc, shares = self.case.agc, self.equations.shares
+        if agc is None:
+            return SecondaryControl(shares, 0.0, NEVER, 1)
+        places = np.array([state.next_s, agc.period_s]) / dt_s
+        first, period = np.round(places).astype(int).tolist()
+        if np.abs(places - (first, period)).max() > BETWEEN or not period:
+            raise InputError(f"case {self.case.id}", "plant.agc", f"acts between points of dt_s = {dt_s:g} s")
+        return SecondaryControl(shares, agc.k, first, period)
+
+    def advance(
+        self, state: DetailedState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
+    ) -> Piece:
+        """See `Plant.advance`; `states` are a DetailedRun. On an island the slack's power is zero."""
+        from ded_bench.plants.detailed.detailed_stepper import DetailedStates, PlantInputs, integrate_plant
+
+        equations, n, control = self.equations, len(p_set), self.control(state, dt_s)
+        system, machines = equations.system, equations.scheduled
+        p_ref = np.tile(state.offset, (n, 1))
+        p_ref[:, machines] += p_set
+        drawn = np.ascontiguousarray(equations.p_drawn(p_load)[:, : system.network.n_load_port])
+        network = system.compiled_network
+        network = network if exact else network._replace(change=PLANNING_CHANGE)
+        x, v = (np.empty((n, *first.shape)) for first in (state.x, state.v))
+        states = DetailedStates(x, v, np.empty(n), np.empty((n, len(system.data))))
+        states.x[0], states.v[0], states.held[0] = state.x, state.v, state.held
+        inputs = PlantInputs(p_ref, drawn, state.v_ref, dt_s)
+        steps = max(int(np.ceil(system.fastest * dt_s / STEP_BY_MODE)), 1)
+        try:
+            done = integrate_plant(system.data, network, inputs, control, steps, states)
+        except np.linalg.LinAlgError:
+            done = 0
+        if done < n or not np.isfinite(states.x[-1]).all():
+            problem = "the network has no voltages any more" if done < n else "it loses its stability"
+            raise SimulationError(f"the system cannot follow this schedule: {problem}")
+        ahead = control.first - (n - 1)
+        if ahead < 0:
+            ahead %= control.period
+        end = state._replace(
+            x=states.x[-1], v=states.v[-1], held=float(states.held[-1]), next_s=ahead * dt_s, p_set=p_set[-1]
+        )
+        omega = states.x[:, SPEED, machines] * system.data.omega_0[machines]
+        p_gen = equations.turbines(states.x)[:, machines]
+        p_slack = np.zeros(n) if system.island else states.p_e[:, system.network.balancing]
+        run = DetailedRun(states, np.arange(control.first, n - 1, control.period), steps)
+        return Piece(omega, p_gen, p_slack, run, end)
+
+    def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
+        """See `Plant.linearise_along` and `linearised`.
+
+        Raises:
+            InputError: secondary control acts between knots.
+        """
+        return linearised(self.equations, trajectory, points)
+
+    def observed(self, state: DetailedState) -> State:
+        """Rotor angles relative to the slack's or their mean, frequencies, set-points; more on islands."""
+        data, machines = self.equations.system.data, self.equations.scheduled
+        theta = (state.x[DELTA] - data.inertia @ state.x[DELTA])[machines]
+        omega = (state.x[SPEED] * data.omega_0)[machines]
+        if self.case.slack is not None:
+            return State(theta, omega, state.p_set)
+        agc = None
+        if self.case.agc is not None:
+            mean = float(data.inertia @ state.x[DELTA])
+            agc = AgcState(held_pu=state.held, integral_rad=mean, next_s=state.next_s)
+        return State(theta, omega, state.p_set, self.equations.turbines(state.x)[machines], agc)
+
+    def columns(self, states: DetailedRun) -> Mapping[str, Array]:
+        """Voltages of all buses, rotor angles, secondary control.
+
+        `v_<bus>` (pu); `delta_<machine>` (rad, relative to the slack's or the inertia-weighted mean); with
+        secondary control `agc`, what it asks of all machines together (pu).
+        """
+        found, system = states.states, self.equations.system
+        network = system.network
+        size = np.abs(found.v.view(np.complex128) @ network.spread.T)
+        delta = found.x[:, DELTA] - (found.x[:, DELTA] @ system.data.inertia)[:, None]
+        names = self.case.detailed.machines
+        columns = {f"v_{bus}": column for bus, column in zip(network.buses, size.T, strict=True)}
+        columns |= {f"delta_{name}": column for name, column in zip(names, delta.T, strict=True)}
+        return columns | ({"agc": found.held} if self.case.agc is not None else {})
+
+    def check_servable(self, instance: Instance, source: str) -> None:
+        """See `Plant.check_servable`.
+
+        Powers and loads at t = 0 must have a stable equilibrium; the static dispatch at 0, at each kink of a
+        load and at the horizon a power flow.
+        """
+        equations = self.equations
+        try:
+            point = initial_point(equations, instance)
+            if not equations.system.stable(point):
+                raise SimulationError("their equilibrium is not stable")
+        except InputError as error:
+            raise InputError(source, error.field, error.problem) from None
+        except SimulationError as error:
+            problem = f"initial loads and power cannot be served: {error}"
+            raise InputError(source, "load, initial.power", problem) from None
+        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
+        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
+        p_load = instance.p_load(case, times)
+        price = np.inf if case.slack is None else instance.cost_slack(case)
+        for t, powers, loads in zip(
+            times, merit_order(case, instance.cost_gen(case), price, p_load), p_load, strict=True
+        ):
+            try:
+                equations.system.network.power_flow(equations.p_machine(powers), equations.p_drawn(loads))
+            except SimulationError as error:
+                raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None

@@ -1,0 +1,132 @@
+"""The state at t = 0 of an instance: at rest in an equilibrium, or as measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.plants.detailed.case_system import CaseSystem, DetailedState
+from ded_bench.plants.detailed.machine_arrays import (
+    DELTA,
+    E1D,
+    E1Q,
+    E2D,
+    E2Q,
+    EXCITER,
+    FEEDBACK,
+    FIELD,
+    GATE,
+    LEAD_A,
+    LEAD_B,
+    N_STATES,
+    SPEED,
+    TURBINE,
+    WASHOUT,
+)
+from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
+from ded_bench.plants.detailed.power_system import PowerSystem, interleaved
+from ded_bench.plants.plant import SimulationError
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.quantities import Array
+
+#: What powers and loads of an instance may leave to the machine that balances the power flow, pu.
+REMAINDER = 1e-4
+#: States that a measurement does not give, and that are stationary in it.
+STATIONARY = (E1Q, E1D, E2D, E2Q, EXCITER, FIELD, FEEDBACK)
+
+
+def initial_point(equations: CaseSystem, instance: Instance) -> OperatingPoint:
+    """The power flow of the initial powers and loads; one machine takes what these are short of.
+
+    Raises:
+        InputError: that is more than REMAINDER, on an island and at rest.
+        SimulationError: there is no solution.
+    """
+    wanted = equations.p_machine(instance.p_initial(equations.case))
+    drawn = equations.p_drawn(instance.p_load(equations.case, np.zeros(1)))[0]
+    point, balancing = equations.system.network.power_flow(wanted, drawn), equations.system.network.balancing
+    short = float(point.power.real[balancing] - wanted[balancing])
+    if equations.system.island and instance.initial.measured is None and abs(short) > REMAINDER:
+        problem = f"initial loads and losses exceed power by {short:.3g} pu, more than {REMAINDER:g} in size"
+        raise InputError(f"instance {instance.id}", "initial.power", problem)
+    return point
+
+
+def start(equations: CaseSystem, instance: Instance) -> DetailedState:
+    """The state at t = 0.
+
+    Voltages at machines are nominal in the power flow of the initial powers and loads, which gives the
+    exciters' references. At rest, what the powers lack goes to the machine that balances the power flow,
+    whose governor's reference is off its set-point by it. A measured state has that of its set-points and
+    secondary control; fluxes, exciters and stabilisers are stationary.
+
+    Raises:
+        InputError: see `initial_point`.
+        SimulationError: there is no equilibrium.
+    """
+    case, system, machines = equations.case, equations.system, equations.scheduled
+    data = system.data
+    p_set = instance.p_initial(case)
+    point = initial_point(equations, instance)
+    x, v_ref = system.equilibrium(point)
+    offset = point.power.real.copy()
+    offset[machines] -= p_set
+    mean = float(data.inertia @ x[DELTA])
+    x[DELTA] -= mean
+    v = interleaved(point.voltage * np.exp(-1j * mean))
+    x[SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
+    held, next_s = 0.0, 0.0 if case.agc is None else case.agc.period_s
+    if instance.initial.measured is None:
+        return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
+    offset[machines] = 0.0
+    if (theta := instance.theta_initial(case)) is not None:
+        x[DELTA, machines] = theta
+        x[DELTA] -= data.inertia @ x[DELTA]
+        v = _stationary(system, x, v, point.p_drawn, v_ref)
+    if (agc := instance.initial.agc) is not None:
+        held, next_s = agc.held_pu, next_s if agc.next_s is None else agc.next_s
+        x[DELTA] += agc.integral_rad
+    reference = offset.copy()
+    reference[machines] += p_set
+    reference += held * equations.shares
+    mechanical = reference.copy()
+    if (given := instance.mechanical_initial(case)) is not None:
+        mechanical[machines] = given
+    x[GATE] = reference - data.droop * x[SPEED]
+    through = 1.0 - data.reheat
+    lagging = np.divide(mechanical - data.reheat * x[GATE], through, out=x[GATE].copy(), where=through != 0.0)
+    x[TURBINE] = lagging
+    x[WASHOUT] = data.ks * x[SPEED]
+    x[LEAD_A] = x[LEAD_B] = 0.0
+    return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
+
+
+def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Array) -> Array:
+    """Set fluxes and exciters so that they are stationary at given rotor angles; return the voltages.
+
+    Newton's method on their rates and the network's balance.
+
+    Raises:
+        SimulationError: there is no such state.
+    """
+    n, n_v = x.shape[1], len(v)
+    moving = system.moving
+    free = moving[np.isin(moving // n, STATIONARY)]
+    rows = np.concatenate([free, N_STATES * n + np.arange(n_v)])
+    speed, x[SPEED] = x[SPEED].copy(), 0.0  # stabilisers have nothing to say in a stationary state
+    still = np.zeros(n)
+    for _ in range(NEWTON_STEPS):
+        given = x.ravel(), v, still, drawn, v_ref
+        rates, balance, *_ = (np.array(part).ravel() for part in system.symbolic.equations(*given))
+        off = np.concatenate([rates[free], balance])
+        worst = np.abs(off).max()
+        if worst < MISMATCH * 1e3:
+            x[SPEED] = speed
+            return v
+        if not worst < np.inf:
+            break
+        jacobian = system.symbolic.jacobian(*given).sparse().tocsr()[rows][:, rows]
+        step = np.linalg.solve(jacobian.toarray(), off)
+        x.flat[free] -= step[: len(free)]
+        v = v - step[len(free) :]
+    raise SimulationError("there are no stationary fluxes and voltages at the given angles")

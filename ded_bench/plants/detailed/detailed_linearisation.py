@@ -5,7 +5,8 @@ point to grid point it is advanced as the integrator does it: by the polynomial 
 stable where the simulation is, and needs two products of matrices where an exponential needs some ten.
 
 States are those of `machine_arrays`, all of one kind together, machines in the order of the generators;
-speeds are in rad/s. Last, where there is secondary control, is what it holds (pu), which changes at its times (`Reset`).
+speeds are in rad/s. Last, where there is secondary control, is what it holds (pu): it changes at its times
+(`Reset`).
 """
 
 from __future__ import annotations

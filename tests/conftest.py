@@ -70,7 +70,7 @@ def _quiet_instance(case: Case, **changes: Any) -> Instance:
         "seed": 0,
         "horizon_s": case.sampling.horizon_s,
         "dt_s": case.sampling.dt_s,
-        "cost": {bus: 0.5 for bus in (case.slack, *case.generators)},
+        "cost": dict.fromkeys(case.priced, 0.5),
         "load": {
             bus: {"initial": value, "start": 0.0, "duration": 0.0, "rate": 0.0}
             for bus, value in zip(case.loads, case.load_nominal.tolist(), strict=True)

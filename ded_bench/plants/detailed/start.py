@@ -117,7 +117,7 @@ def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Ar
     still = np.zeros(n)
     for _ in range(NEWTON_STEPS):
         given = x.ravel(), v, still, drawn, v_ref
-        rates, balance, *_ = (np.array(part).ravel() for part in system.symbolic.equations(*given))
+        rates, balance, *_ = (part.full().ravel() for part in system.symbolic.equations(*given))
         off = np.concatenate([rates[free], balance])
         worst = np.abs(off).max()
         if worst < MISMATCH * 1e3:

@@ -17,9 +17,8 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.cli.outputs import sweep
-from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results, Row
-from tests.cli.command_line import SOLVE, run_cli
+from tests.cli.command_line import SOLVE
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
 
@@ -28,35 +27,26 @@ FIRST_LINE_S = 4.0
 
 
 def test_solve_prints_one_object_per_row_and_score_agrees(
-    problem: Path, instance_file: Path, tmp_path: Path
+    problem: Path, instance_file: Path, tmp_path: Path, capsys
 ) -> None:
     out = tmp_path / "out"
-    arguments = ["solve", "--method", "ded", "--regime", "NO,TO", "--instance", instance_file, "--out", out]
-    first = run_cli(*arguments, cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
-    rows = [json.loads(line) for line in first.stdout.splitlines()]
+    arguments = ["solve", "--method", "ded", "--regime", "NO,TO", "--instance", str(instance_file)]
+    assert main([*arguments, "--out", str(out)]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {row["regime"] for row in rows} == {"NO", "TO"}
     for row in rows:
         assert row["status"] == "Optimal"
         with np.load(row["schedule"], allow_pickle=False) as archive:
             table, header = archive[row["schedule_member"]], ",".join(archive["columns"])
         np.savetxt(tmp_path / "s.csv", table, "%.17g", ",", header=header, comments="")
-        scored = run_cli(
-            "score",
-            "--instance",
-            instance_file,
-            "--schedule",
-            tmp_path / "s.csv",
-            "--regime",
-            row["regime"],
-            "--json",
-        )
-        verdict = json.loads(scored.stdout)
+        score = ["score", "--instance", str(instance_file), "--schedule", str(tmp_path / "s.csv"), "--json"]
+        assert main([*score, "--regime", row["regime"]]) == 0
+        verdict = json.loads(capsys.readouterr().out)
         for name in ("objective", "freq_violation_hz", "ramp_violation", "bound_violation"):
             assert verdict[name] == pytest.approx(row[name], rel=1e-9, abs=1e-12)
         assert verdict["feasible"] is row["feasible"]
-    again = run_cli(*arguments, cwd=tmp_path)
-    assert [json.loads(line) for line in again.stdout.splitlines()] == rows
+    assert main([*arguments, "--out", str(out)]) == 0
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == rows
     assert len(Results(out).rows) == 2
 
 
@@ -105,17 +95,15 @@ def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path
     assert [row.objective for row in Results(out).rows.values()] == [row.objective for row in rows]
 
 
-def test_errors_do_not_depend_on_the_working_directory(instance_file: Path, tmp_path: Path) -> None:
+def test_paths_are_those_of_the_working_directory(tmp_path: Path, monkeypatch, capsys) -> None:
+    """An instance without a case beside it is of a shipped one."""
     shipped = CASE_FILES["9bus"].parent / "instances" / "9bus-0007.json"
-    copy = tmp_path / "alone.json"
-    copy.write_bytes(shipped.read_bytes())  # no case beside it: the shipped one is meant
-    schedule = tmp_path / "s.csv"
-    schedule.write_text("t,P_2,P_3\n0,2.03748309,0.56635889\n60,2.03748309,0.56635889\n")
-    done = run_cli(
-        "score", "--instance", "alone.json", "--schedule", "s.csv", "--regime", "TO", "--json", cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["initial_violation"] == 0.0
+    (tmp_path / "alone.json").write_bytes(shipped.read_bytes())
+    (tmp_path / "s.csv").write_text("t,P_2,P_3\n0,2.03748309,0.56635889\n60,2.03748309,0.56635889\n")
+    monkeypatch.chdir(tmp_path)
+    score = ["score", "--instance", "alone.json", "--schedule", "s.csv", "--regime", "TO", "--json"]
+    assert main(score) == 0
+    assert json.loads(capsys.readouterr().out)["initial_violation"] == 0.0
 
 
 def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys) -> None:
@@ -161,11 +149,9 @@ def test_half_written_files_do_not_stay(tmp_path: Path) -> None:
     "arguments",
     [
         ("cases", "9bus", "--count", "1"),
-        ("score", "--results", "results"),
         ("bench", "--method", "ded", "--instances", "1", "--results", "results"),
         ("report", "--results", "results"),
         ("train-ko", "--results", "results"),
-        ("solve", "--help"),
     ],
     ids=lambda arguments: arguments[0],
 )
@@ -200,10 +186,10 @@ def test_only_policies_that_need_a_koopman_model_ask_for_one(
     problem: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     """`ded-admm` is trained on the grid itself."""
-    monkeypatch.setattr("ded_bench.methods.admm.admm_training.STEPS", 1)
-    regime = next(iter(Case.load(str(problem)).regimes))
-    where = ("--case", str(problem), "--regime", regime, "--epochs", "1", "--results", str(tmp_path))
-    assert main(["train-dpc", "--method", "ded-dpc", *where]) == 2
+    for name, small in (("STEPS", 1), ("ROWS", 400), ("iterations_of", lambda grid: 3)):
+        monkeypatch.setattr(f"ded_bench.methods.admm.admm_training.{name}", small)
+    where = ("--case", str(problem), "--regime", "TO", "--limit", "1", "--epochs", "1", "--results")
+    assert main(["train-dpc", "--method", "ded-dpc", *where, str(tmp_path)]) == 2
     assert "not there yet" in capsys.readouterr().err
-    assert main(["train-dpc", "--method", "ded-admm", *where]) == 0
-    assert (tmp_path / "policies" / f"ded-admm-{regime}.safetensors").is_file()
+    assert main(["train-dpc", "--method", "ded-admm", *where, str(tmp_path)]) == 0
+    assert (tmp_path / "policies" / "ded-admm-TO.safetensors").is_file()

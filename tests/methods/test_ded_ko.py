@@ -45,25 +45,24 @@ def test_solvers_agree_and_their_solution_replays_on_the_model(
 
 @pytest.mark.parametrize("slug", INSTALLED)
 def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Koopman, slug: str) -> None:
-    """In whatever order instances and regimes come, one built model serves them all."""
-    first, last = short(case, 0), short(case, 1)
-    for regime in ("TO", "NO"):
-        solve = ded_ko.prepare_with(case, koopman, regime, Settings(f"solver={slug}"))
-        solve(first)
-        again = solve(last)
-        model = build_ded_ko(case, koopman, last.steps)
-        set_instance(model, case, koopman, last, regime)
-        fresh = compile_model(model, slug, SOLVERS[slug]).solve()
-        # PIQP leaves a relative gap of 1e-7.
-        assert again.solver_objective == pytest.approx(fresh.objective, rel=2e-7 if slug == "piqp" else 1e-9)
-        assert again.build_s < 0.5  # built before
-        assert again.setup_s < 0.5
+    """One built model serves all instances."""
+    first, last = (short(case, index, horizon_s=1.0) for index in range(2))
+    solve = ded_ko.prepare_with(case, koopman, "TO", Settings(f"solver={slug}"))
+    solve(first)
+    again = solve(last)
+    model = build_ded_ko(case, koopman, last.steps)
+    set_instance(model, case, koopman, last, "TO")
+    fresh = compile_model(model, slug, SOLVERS[slug]).solve()
+    # PIQP leaves a relative gap of 1e-7.
+    assert again.solver_objective == pytest.approx(fresh.objective, rel=2e-7 if slug == "piqp" else 1e-9)
+    assert again.build_s < 0.5  # built before
+    assert again.setup_s < 0.5
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_models_of_other_forms_serve_as_well(method, case: Case, koopman: Koopman) -> None:
     """The paper's form (G = 0) is solved on its own rollout; one more observable changes nothing."""
-    instance = short(case, 2)
+    instance = short(case, 2, horizon_s=1.0)
     paper = dataclasses.replace(koopman, g=np.zeros_like(koopman.g))
     n = len(koopman.k)
     wider = dataclasses.replace(
@@ -83,7 +82,7 @@ def test_models_of_other_forms_serve_as_well(method, case: Case, koopman: Koopma
 
 @pytest.mark.parametrize("method", METHODS)
 def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: Koopman) -> None:
-    instance = short(case, 0)
+    instance = short(case, 0, horizon_s=1.0)
     outside = dict(zip(case.generators, (case.p_max + 0.05).tolist(), strict=True))
     far = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": outside})})
     spinning = dict.fromkeys(case.generators, 2.0)

@@ -9,7 +9,7 @@ import pytest
 from ded_bench.cli.commands import main
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import described, option, options_text, read_options
-from ded_bench.methods.registry import METHODS, get_method
+from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 
 
@@ -71,10 +71,7 @@ def test_settings_of_a_method_are_canonical() -> None:
     assert method.canonical(Settings("receding=on"), timed=True).options == "default"
 
 
-def test_the_command_lists_methods_and_their_options(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["methods"]) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in told if not line.startswith(" ")] == list(METHODS)
+def test_the_command_describes_one_method(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["methods", "ed"]) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].split() == ["ed", "ED"]

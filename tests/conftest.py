@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +15,7 @@ from ded_bench.files.strict import Record, parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.pool import Workers
 
 #: Generic properties are tested on every case here: the paper's; a chain slack - load - generator whose power
 #: flow, load angle and modes have closed forms; and a meshed grid with all that a case may have: junctions, a
@@ -97,3 +99,24 @@ def _constant(instance: Instance, power: Any) -> Schedule:
 def constant() -> Callable[..., Schedule]:
     """`constant(instance, power)`: the schedule that holds `power`, shape (n_gen,), pu."""
     return _constant
+
+
+def answers_here(
+    workers: Workers, calls: Any, labels: Any, limits_s: Any = None
+) -> Iterator[tuple[Any, object]]:
+    """Stands for `Workers.imap`."""
+    for label, call in zip(labels, calls, strict=True):
+        function, arguments = pickle.loads(pickle.dumps(call))  # as on their way to another process
+        try:
+            yield label, function(*arguments)
+        except Exception as error:
+            yield label, error
+
+
+@pytest.fixture
+def inline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What goes to worker processes is done in this one, whose libraries are loaded already.
+
+    For tests of what is done with the answers; processes have tests of their own.
+    """
+    monkeypatch.setattr(Workers, "imap", answers_here)

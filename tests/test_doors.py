@@ -20,6 +20,7 @@ from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.results.rows import Results
 from ded_bench.results.timing import read_timing
 
+pytestmark = pytest.mark.usefixtures("inline")
 PYPROJECT = """\
 [project]
 name = "dispatch-flat"

@@ -47,6 +47,7 @@ def test_kept_schedules_score_as_their_rows_say(name: str) -> None:
             assert getattr(again, field) == pytest.approx(getattr(row, field), rel=0, abs=1e-9), row.key
 
 
+@pytest.mark.usefixtures("inline")
 def test_rows_are_found_again() -> None:
     """One of each fast method, settings, model and regime on the paper's grid, solved with today's code."""
     case, results = Case.load("9bus"), Results(folder("9bus"))

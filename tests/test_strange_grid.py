@@ -69,6 +69,7 @@ def run(*arguments: object) -> None:
     assert main([str(argument) for argument in arguments]) == 0
 
 
+@pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize("machines", [3, 6])
 def test_the_whole_road(
     machines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

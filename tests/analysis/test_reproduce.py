@@ -15,6 +15,8 @@ from ded_bench.results.rows import Results
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import make_tasks
 
+pytestmark = pytest.mark.usefixtures("inline")
+
 
 def test_differences_are_told_and_limits_named(threebus: Case, quiet_instance, tmp_path: Path) -> None:
     instances = {name: quiet_instance(threebus, id=name, horizon_s=0.2) for name in "abcd"}

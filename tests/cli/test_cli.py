@@ -26,6 +26,7 @@ from tests.run.test_pool import runs, wait_until
 FIRST_LINE_S = 4.0
 
 
+@pytest.mark.usefixtures("inline")
 def test_solve_prints_one_object_per_row_and_score_agrees(
     problem: Path, instance_file: Path, tmp_path: Path, capsys
 ) -> None:
@@ -82,6 +83,7 @@ def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None
     assert not list(out.glob(".results.csv.*"))
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     assert main(["solve", "--method", "ed", "--regime", "NO", "--case", str(problem), "--out", str(out)]) == 0
@@ -106,6 +108,7 @@ def test_paths_are_those_of_the_working_directory(tmp_path: Path, monkeypatch, c
     assert json.loads(capsys.readouterr().out)["initial_violation"] == 0.0
 
 
+@pytest.mark.usefixtures("inline")
 def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys) -> None:
     """Exit code 0 if every kept schedule says what its row says, else 1 and a line for each that does not."""
     out = tmp_path / "out"

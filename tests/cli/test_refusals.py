@@ -14,6 +14,8 @@ from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
 
+pytestmark = pytest.mark.usefixtures("inline")
+
 
 @pytest.mark.parametrize(
     ("change", "named"),

@@ -66,6 +66,7 @@ def test_rows_are_scored_like_the_scorer_does(strange, make, threebus: Case, tmp
         assert row.date.endswith("Z")
 
 
+@pytest.mark.usefixtures("inline")
 def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_path: Path) -> None:
     run(threebus, make("calm-1"), Results(tmp_path / "out"))
     before = (tmp_path / "out" / "results.csv").read_bytes()
@@ -75,6 +76,7 @@ def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_pat
     assert calls(strange) == {"calm-1": 2, "calm-2": 2}  # once per regime
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp_path: Path) -> None:
     """A limited answer is another row than an unlimited one; model, policy, commit and version are named."""
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
@@ -103,6 +105,7 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     assert fallbacks(tasks(dataclasses.replace(settings, model=str(path))), folder) == []
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_row_of_an_older_version_is_made_anew(strange, make, threebus: Case, tmp_path: Path) -> None:
     """Other code without a new version makes no row invalid."""
     results = Results(tmp_path / "out")
@@ -116,6 +119,7 @@ def test_a_row_of_an_older_version_is_made_anew(strange, make, threebus: Case, t
     assert {row.method_version for row in again} == {row.method_version for row in rows}
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_run_leaves_one_line_per_row_even_if_interrupted(
     strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +164,7 @@ def test_a_worker_that_dies_once_costs_nothing(strange, make, threebus: Case, tm
     assert len({row.key for row in rows}) == 4
 
 
+@pytest.mark.usefixtures("inline")
 def test_nonsense_is_a_row_that_says_what_is_wrong(strange, make, threebus: Case, tmp_path: Path) -> None:
     names = ("wrong", "nothing", "shape", "nan", "infeasible", "huge", "numpy", "calm")
     results = Results(tmp_path / "out")
@@ -194,6 +199,7 @@ def test_a_hang_is_a_time_limit_and_blames_nobody_else(
     assert calls(strange) == {"hang": 1, "slow-1": 1, "slow-2": 1, "slow-3": 1}
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_failure_takes_an_earlier_schedule_away(
     strange, make, threebus: Case, constant, tmp_path: Path
 ) -> None:

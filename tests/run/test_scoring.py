@@ -17,6 +17,8 @@ from ded_bench.results.rows import VALIDATED, Results, Row
 from ded_bench.run.pool import Workers
 from ded_bench.run.scoring import rescore, save_scores, scored_row, unscored, validate
 
+pytestmark = pytest.mark.usefixtures("inline")
+
 
 @pytest.fixture
 def instances(threebus: Case, quiet_instance) -> dict[str, Instance]:

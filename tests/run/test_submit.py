@@ -16,6 +16,8 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Results
 from ded_bench.run.submit import submit
 
+pytestmark = pytest.mark.usefixtures("inline")
+
 
 @pytest.fixture
 def chosen(threebus: Case, quiet_instance) -> Selection:

@@ -18,7 +18,8 @@ from ded_bench.results.online_results import OnlineKey, OnlineResults, read_traj
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions
 from ded_bench.run.online.operation import make_operations, operate
-from tests.conftest import CASE_FILES
+from ded_bench.run.pool import Workers
+from tests.conftest import CASE_FILES, answers_here
 
 FAULTY = "tests.run.online.faulty_methods"
 #: What the clock and the day decide on.
@@ -44,7 +45,9 @@ def operations(case, files, latency="0.3", method="ed", limit_s=60.0):
 def first_run(threebus, scenarios, tmp_path_factory):
     """Rows of both scenarios, and the folder that holds them."""
     folder = tmp_path_factory.mktemp("first")
-    return operate(threebus, operations(threebus, scenarios), OnlineResults(folder)), folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Workers, "imap", answers_here)
+        return operate(threebus, operations(threebus, scenarios), OnlineResults(folder)), folder
 
 
 def test_rows_hold_all_that_is_judged(threebus, first_run):
@@ -79,6 +82,7 @@ def test_a_given_latency_gives_the_same_to_the_last_bit(threebus, scenarios, fir
         assert len({place.read_bytes() for place in places}) == 1
 
 
+@pytest.mark.usefixtures("inline")
 def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_path):
     """But a row that a killed process has torn, and all with another limit."""
     shutil.copytree(first_run[1], tmp_path, dirs_exist_ok=True)
@@ -96,6 +100,7 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
     assert not any(results.table.made_from(o.key, o.fingerprint) for o in changed)
 
 
+@pytest.mark.usefixtures("inline")
 def test_faults_are_in_the_row(threebus, scenarios, tmp_path):
     """A method that raises every third time."""
     chosen = operations(threebus, scenarios[:1], method=f"{FAULTY}:raises")
@@ -154,6 +159,7 @@ def test_rows_and_files_of_models_and_plants_stand_side_by_side(tmp_path):
     assert len({OnlineResults(tmp_path).files.trajectory(k) for k in keys}) == len(keys)
 
 
+@pytest.mark.usefixtures("inline")
 def test_another_plant_has_rows_and_hindsight_of_its_own(threebus, scenarios, tmp_path, lagged):
     loaded, chosen = load_scenarios(scenarios[:1], threebus), [("ed", Settings("every=1"))]
     rows = [
@@ -170,6 +176,7 @@ def test_another_plant_has_rows_and_hindsight_of_its_own(threebus, scenarios, tm
     assert len(OnlineResults(tmp_path).hindsight.rows) == 2
 
 
+@pytest.mark.usefixtures("inline")
 def test_the_command(scenarios, tmp_path, capsys):
     """Rows are printed as they are made, once."""
     line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--set", "every=1"]
@@ -186,6 +193,7 @@ def test_the_command(scenarios, tmp_path, capsys):
     )
 
 
+@pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize(
     ("change", "said"),
     [

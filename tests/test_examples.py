@@ -1,9 +1,8 @@
-"""The examples run, and do what they say; studies compile."""
+"""The examples run, and do what they say."""
 
 from __future__ import annotations
 
 import os
-import py_compile
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ import ded_bench
 from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.problem.sampling import sample_instance
 
-EXAMPLES, STUDIES = REPOSITORY / "examples", REPOSITORY / "studies"
+EXAMPLES = REPOSITORY / "examples"
 
 
 def test_the_tour(tmp_path: Path) -> None:
@@ -38,16 +37,3 @@ def test_dispatch_with_foresight(ninebus: Case, monkeypatch: pytest.MonkeyPatch)
     schedule = lookahead_dispatch.solve(instance, "NO", ninebus)
     verdict = ded_bench.score(instance, schedule, "NO")
     assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8
-
-
-@pytest.mark.parametrize("script", sorted(STUDIES.glob("*.py")), ids=lambda path: path.name)
-def test_studies_compile(script: Path, tmp_path: Path) -> None:
-    """They are run by hand, not here."""
-    py_compile.compile(str(script), cfile=str(tmp_path / "compiled"), doraise=True)
-
-
-def test_the_index_names_every_study() -> None:
-    """By its page and its script, but for what `make` runs."""
-    index = (STUDIES / "README.md").read_text(encoding="utf-8")
-    names = {path.name for path in (*STUDIES.glob("*.md"), *STUDIES.glob("*.py"))}
-    assert {name for name in names if f"]({name})" not in index} == {"README.md", "run.py"}

@@ -79,19 +79,6 @@ def test_every_command_is_understood(case: str) -> None:
                 METHODS[name].canonical(Settings(asked.set))
 
 
-def test_the_paper_s_case() -> None:
-    """Every method but those for physical grids, on all instances."""
-    road = commands("report")
-    others = [command[0] for command in road if command[0] != "solve"]
-    assert others == ["train-ko", "train-dpc", "train-dpc", "bench", "report"]
-    trained = [PARSER().parse_args(command) for command in road if command[0] == "train-dpc"]
-    assert [(a.method, a.seconds) for a in trained] == [(("ded-dpc-paper",), None), (("ded-dpc",), 420.0)]
-    methods = solved(road)
-    assert set(methods.values()) == {None}
-    solvers, policies = {"ed", "ded", "ded-slp", "ded-ko", "ded-ko-knots"}, {"ded-dpc-paper", "ded-dpc"}
-    assert {name for name, _, _ in methods} == solvers | policies
-
-
 def test_physical_grids_need_no_koopman_model_and_take_slow_methods_in_small_numbers() -> None:
     """The policies of the reference run answer; nothing is trained but the paper's kind of model."""
     road = commands("report", "39bus")

@@ -20,12 +20,7 @@ pytestmark = pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda d: d | {"colour": "red"}, "colour"),
-        (lambda d: {k: v for k, v in d.items() if k != "dt_s"}, "dt_s"),
         (lambda d: d | {"horizon_s": float("nan")}, "horizon_s"),
-        (lambda d: d | {"horizon_s": 1.005}, "horizon_s"),
-        (lambda d: d | {"cost": d["cost"] | {"s": -1.0}}, "cost.s"),
-        (lambda d: d | {"load": {"town": d["load"]["town"] | {"duration": -1.0}}}, "load.town.duration"),
         (lambda d: d | {"load": {"town": d["load"]["town"] | {"initial": -100.0}}}, "load"),
         (lambda d: d | {"load": {"town": d["load"]["town"] | {"rate": -1e3, "start": 0.0}}}, "load"),
         (lambda d: d | {"case": "atlantis"}, "atlantis"),
@@ -115,9 +110,7 @@ def test_a_versioned_case_is_not_changed_by_chance(tmp_path: Path, capsys) -> No
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("t,P_plant\n0.5,0.6\n6,0.6\n", "must start at 0"),
         ("t,P_plant\n0,0.6\n5,0.6\n", "must end at the horizon"),
-        ("t,P_plant\n0,0.6\n0,0.6\n6,0.6\n", "increase strictly"),
         ("t,P_plant\n0,nan\n6,0.6\n", "line 2, P_plant"),
         ("t,P_7\n0,0.6\n6,0.6\n", "P_plant"),
         ("", "empty"),

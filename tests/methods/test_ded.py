@@ -7,9 +7,7 @@ import pyomo.environ as pyo
 import pytest
 
 from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
-from ded_bench.methods.euler_program import injections_along
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
@@ -134,22 +132,6 @@ def test_accelerated_finds_the_same_optimum(case: Case) -> None:
         assert verdict.ramp_violation < 1e-10
         plain = score(case, instance, usual.schedule, regime)
         assert verdict.objective == pytest.approx(plain.objective, rel=1e-6)
-
-
-def test_a_linear_program_has_the_derivatives_of_the_network(case: Case) -> None:
-    """Central differences of f with the loads' angles solved anew; shifting all angles is not free."""
-    network, step = Network(case), 1e-5
-    load = np.tile(case.load_nominal, (3, 1))
-    start = network.power_flow(case.p_nominal, case.load_nominal)[network.generators]
-    theta = start + np.linspace(-0.05, 0.05, 3)[:, None]
-    along = injections_along(network, theta, load)
-    np.testing.assert_allclose(along.f.sum(axis=1), -load.sum(axis=1), atol=1e-12)  # lossless
-    np.testing.assert_allclose(along.f[1, :-1], case.p_nominal, atol=1e-11)
-    for j in range(len(case.generators)):
-        shift = step * np.eye(len(case.generators))[j]
-        change = injections_along(network, theta + shift, load).f
-        change = change - injections_along(network, theta - shift, load).f
-        np.testing.assert_allclose(along.slope[:, :, j], change / (2 * step), atol=1e-7)
 
 
 def test_what_a_sequence_cannot_solve_ipopt_decides(threebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,9 @@ import pytest
 
 from ded_bench.methods.ded_radau import default_element, element_count, element_ends, prepare
 from ded_bench.methods.radau_program import (
-    BETWEEN,
     POINTS,
     WEIGHTS,
     RadauProgram,
-    differentiation,
-    lagrange,
 )
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.lossless.network import Network
@@ -47,16 +44,6 @@ def test_points_and_weights_are_radaus() -> None:
     for degree in range(5):
         assert np.dot(WEIGHTS, np.power(POINTS, degree)) == pytest.approx(1 / (degree + 1), abs=1e-15)
     assert np.dot(WEIGHTS, np.power(POINTS, 5)) != pytest.approx(1 / 6, abs=1e-4)
-
-
-def test_values_and_slopes_at_any_place_are_those_of_the_cubic() -> None:
-    """The weights reproduce cubics."""
-    nodes = np.array([0.0, *POINTS])
-    for degree in range(4):
-        for c in (*BETWEEN, 0.1, 1.0):
-            assert np.dot(lagrange(c), nodes**degree) == pytest.approx(c**degree, abs=1e-14)
-        slopes = degree * np.power(POINTS, max(degree - 1, 0))
-        np.testing.assert_allclose(differentiation() @ nodes**degree, slopes, atol=1e-13)
 
 
 def test_elements_end_where_loads_kink(ninebus: Case) -> None:

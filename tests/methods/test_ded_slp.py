@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from ded_bench.methods import ded_slp, ed, knot_program
-from ded_bench.methods.ded_slp import MARGIN, prepare
+from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
-from ded_bench.methods.knots import PIECE, knot_weights, piece_starts
 from ded_bench.methods.slp import Parts
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import SimulationError, plant_of
@@ -192,17 +191,6 @@ def test_what_is_feasible_but_not_confirmed_is_no_optimum(case, monkeypatch):
     assert solution.status == Status.FEASIBLE
     assert solution.solver_objective is None
     assert score(case, instance, solution.schedule, "NO").feasible_strict
-
-
-def test_knots_and_pieces_share_the_horizon():
-    """Weights of a constant sum to the number of points; pieces start at every knot and nowhere twice."""
-    lengths = np.diff(POINTS)
-    assert knot_weights(lengths).sum() == POINTS[-1] + 1
-    assert knot_weights(lengths) @ POINTS == pytest.approx(POINTS[-1] * (POINTS[-1] + 1) / 2)
-    starts = piece_starts(POINTS)
-    assert set(POINTS[:-1]) <= set(starts)
-    assert 0 < np.diff(starts).min() <= np.diff(starts).max() <= PIECE
-    assert MARGIN > 0
 
 
 def test_in_operation_what_cannot_be_met_is_exceeded_least(case, alter):

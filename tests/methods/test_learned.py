@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.methods.policy_file import policy_file
-from ded_bench.methods.registry import METHODS, trainable
+from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
@@ -85,25 +83,6 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
     np.testing.assert_array_equal(there.schedule.p, here.schedule.p)
     alone, _ = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere))
     assert "train-dpc --method learned --regime TO" in alone.error
-
-
-def test_the_command_names_what_it_trains(out: Path, problem: Path, capsys) -> None:
-    assert trainable() == ["ded-dpc-paper", "ded-dpc", "ded-admm", "learned"]
-    with pytest.raises(SystemExit):
-        main(["train-dpc", "--help"])
-    told = capsys.readouterr().out
-    assert all(name in told for name in trainable())
-    assert main(["train-dpc", "--method", "ded", "--regime", "TO"]) == 2
-    told = capsys.readouterr().err
-    assert all(name in told for name in trainable())
-
-
-def test_help_does_without_torch() -> None:
-    code = "import sys; from ded_bench.cli import main\ntry: main(['train-dpc', '--help'])\n"
-    code += "except SystemExit: sys.exit('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert "ded-dpc-paper" in done.stdout
 
 
 def test_a_place_that_cannot_be_written_is_told_before_the_training(problem: Path, out: Path, capsys) -> None:

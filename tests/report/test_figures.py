@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from ded_bench.analysis.lines import GROUP, title
-from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.figures.panels import (
     FEW,
@@ -23,7 +22,7 @@ from ded_bench.report.figures.panels import (
     time_figure,
 )
 from ded_bench.report.figures.profile import profile_figure
-from ded_bench.report.figures.style import colour, marker, save_figure
+from ded_bench.report.figures.style import save_figure
 from ded_bench.report.figures.tradeoff import tradeoff_figure
 
 PAPERS = pd.DataFrame(
@@ -67,11 +66,6 @@ def test_trajectories_in_panels(name: str, tmp_path: Path) -> None:
     for drawn in (figure, frequencies):
         assert drawn.get_size_inches()[1] <= 10
         save_figure(drawn, tmp_path / "figure.png")
-
-
-def test_methods_differ_in_colour_and_marker() -> None:
-    assert len({colour(name) for name in METHODS}) == len({marker(name) for name in METHODS}) == len(METHODS)
-    assert colour("stranger") == colour("other")
 
 
 def test_tradeoff_draws_a_point_per_line_hollow_if_infeasible(tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.columns import TABLE_V, TABLE_VI, Column, tabulate, without_paper
-from tests.analysis.test_summary import NO_TIMES, frame_of, row, with_gaps
+from tests.analysis.test_summary import NO_TIMES, frame_of, row, table, with_gaps
+
+__all__ = ["table"]
 
 FILE = SHIPPED_CASES / "9bus" / "paper.json"
 PAPER = parse_record(Paper, FILE.read_text(encoding="utf-8"), FILE)
@@ -37,22 +39,6 @@ def made(
     """A table by regime, method and settings."""
     lines = result_lines(with_gaps(frame), timing, paper, "ded")
     return tabulate(columns, lines).set_index(["regime", "method", "settings"])
-
-
-@pytest.fixture
-def table() -> pd.DataFrame:
-    """ded-ko has gaps 1, -1 and 4 %, one failure, and one row without DED; largest violation 2e-4 Hz."""
-    return frame_of(
-        row("a", "ded", 100.0),
-        row("b", "ded", 200.0),
-        row("c", "ded", 1000.0),
-        row("d", "ded"),
-        row("a", "ded-ko", 101.0, freq_violation_hz=2e-4),
-        row("b", "ded-ko", 198.0, freq_violation_hz=1e-5),
-        row("c", "ded-ko", 1040.0),
-        row("d", "ded-ko", 10.0),
-        row("e", "ded-ko", status="TimeLimit"),
-    )
 
 
 def test_table_v_puts_the_papers_numbers_beside_ours(table: pd.DataFrame) -> None:

@@ -33,8 +33,9 @@ from ded_bench.run.bench import (
     runs_of,
     timed,
 )
-from ded_bench.run.pool import WorkerDiedError
+from ded_bench.run.pool import WorkerDiedError, Workers
 from ded_bench.solvers.status import Status
+from tests.conftest import answers_here
 
 ROW = TimingRow("run", 1, "TO", "ded", "default", "a", "Optimal", build_s=0.5, solve_s=3.5, host="here")
 TO = Job("fake", "TO", Settings())
@@ -49,21 +50,14 @@ class Choices:
     reserve: float = option(0.0, "kept back in the closed loop", in_operation=True)
 
 
-class Inline:
-    """Stands for `Workers`: runs calls in this process, so that a method of this test is found."""
+class Inline(Workers):
+    """Calls are made in this process, so that a method of this test is found."""
+
+    imap = answers_here
 
     def __init__(self, count: int) -> None:
         assert count == 1  # anything more would not be alone
-
-    def close(self) -> None:
-        pass
-
-    def imap(self, calls, labels) -> Iterator[tuple[object, object]]:
-        for (function, arguments), label in zip(calls, labels, strict=True):
-            try:
-                yield label, function(*arguments)
-            except Exception as error:
-                yield label, error
+        super().__init__(count)
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 # What a target runs on which grid stands in studies/runs/<case>.toml; studies/run.py runs it.
 .DEFAULT_GOAL := help
 .PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report online suite quick radau \
-  models certify test clean
+  models certify test types tests clean
 
 PYTHON    ?= python3
 CASE      ?= 9bus
@@ -63,8 +63,15 @@ quick: $(STAMP)  ## the same road with 4 instances (1 for full DED) and little t
 test: $(STAMP)  ## lint, type check and tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(MAKE) --no-print-directory -j 2 types tests
+
+# mypy has one process, and its half minute is not waited for.
+types: $(STAMP)
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+
+# Each process has tests that stand together, and so share their fixtures.
+tests: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 clean:  ## remove the virtual environment, caches and results/quick (other results stay)
 	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache results/quick

@@ -44,7 +44,9 @@ def test_kept_schedules_score_as_their_rows_say(name: str) -> None:
         again = score(case, instance, results.schedule(row, case, instance), row.regime)
         assert again.objective == pytest.approx(row.objective, rel=1e-9, abs=0), row.key
         for field in set(Score.__dataclass_fields__) - {"objective"}:
-            assert getattr(again, field) == pytest.approx(getattr(row, field), rel=0, abs=1e-9), row.key
+            told = getattr(row, field)  # None: a number of islands only
+            known = told if told is None else pytest.approx(told, rel=0, abs=1e-9)
+            assert getattr(again, field) == known, row.key
 
 
 @pytest.mark.usefixtures("inline")

@@ -47,11 +47,6 @@ class Options:
     """How the program is solved."""
 
     accelerated: bool = option(False, "linear programs first; IPOPT where they do not get through")
-    solver: str = option(
-        "ipopt",
-        "of the whole program: from the casadi wheel, or an executable on the PATH",
-        choices=("ipopt", "ipopt-executable"),
-    )
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -59,10 +54,10 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     case.check_regimes([regime])
     options = read_options(Options, settings.options)
     solve = _accelerated if options.accelerated else _solve
-    return functools.partial(solve, case, regime, options.solver, settings.time_limit_s)
+    return functools.partial(solve, case, regime, settings.time_limit_s)
 
 
-def _solve(case: Case, regime: str, solver: str, time_limit_s: float | None, instance: Instance) -> Solution:
+def _solve(case: Case, regime: str, time_limit_s: float | None, instance: Instance) -> Solution:
     """IPOPT on the whole program."""
     if refusal := too_large(program_bytes(case, instance), "the Pyomo model", "`ded-slp` takes less"):
         return refusal
@@ -70,13 +65,11 @@ def _solve(case: Case, regime: str, solver: str, time_limit_s: float | None, ins
     model = _built(case, instance.steps, instance.dt_s)
     set_instance(model, case, instance, regime)
     build_s = time.perf_counter() - started
-    outcome = _compiled(case, instance.steps, instance.dt_s, solver).solve(time_limit_s)
+    outcome = _compiled(case, instance.steps, instance.dt_s).solve(time_limit_s)
     return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
 
 
-def _accelerated(
-    case: Case, regime: str, solver: str, time_limit_s: float | None, instance: Instance
-) -> Solution:
+def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: Instance) -> Solution:
     """Linear programs; where they do not get through, IPOPT decides in what is left of the time."""
     needed = BYTES_PER_ENTRY * (instance.steps + 1) * case.n_bus**2
     if refusal := too_large(needed, "the sequence of programs", "`ded-slp` takes less"):
@@ -89,7 +82,7 @@ def _accelerated(
         return dataclasses.replace(found, build_s=build_s)
     spent_s = found.solve_s or 0.0
     rest = None if time_limit_s is None else max(time_limit_s - spent_s, 1e-3)
-    verdict = _solve(case, regime, solver, rest, instance)
+    verdict = _solve(case, regime, rest, instance)
     return dataclasses.replace(
         verdict,
         iterations=(verdict.iterations or 0) + (found.iterations or 0),
@@ -109,8 +102,8 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled(case: Case, steps: int, dt: float, solver: str) -> Compiled:
-    return compile_model(_built(case, steps, dt), solver, _IPOPT_OPTIONS)
+def _compiled(case: Case, steps: int, dt: float) -> Compiled:
+    return compile_model(_built(case, steps, dt), "ipopt", _IPOPT_OPTIONS)
 
 
 @functools.lru_cache(maxsize=2)

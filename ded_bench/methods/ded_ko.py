@@ -17,7 +17,7 @@ import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.solution import Artifact, Settings, Solution, Solver, answer, model_artifact, too_large
+from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
@@ -32,12 +32,7 @@ from ded_bench.surrogates.koopman import Koopman
 #: Raised when answers change.
 VERSION = 1
 #: Solvers of the Pyomo model, and their options.
-SOLVERS: dict[str, dict[str, Any] | None] = {
-    "piqp": None,
-    "ipopt": LINEAR_OPTIONS,
-    "ipopt-executable": LINEAR_OPTIONS,
-    "highs": None,
-}
+SOLVERS: dict[str, dict[str, Any] | None] = {"piqp": None, "ipopt": LINEAR_OPTIONS, "highs": None}
 #: Entries of the equations up to which the default is a Pyomo model; half of it takes 10 s and 0.5 GB
 #: (two-area), once.
 PYOMO_ENTRIES = 1_000_000
@@ -54,11 +49,6 @@ class Options:
     solver: str = option(
         "piqp", "piqp makes arrays where the Pyomo model would be too large", choices=tuple(SOLVERS)
     )
-
-
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The surrogate that `prepare` would use."""
-    return (model_artifact(case, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

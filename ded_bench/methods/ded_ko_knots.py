@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from ded_bench.methods.knots import case_knots, receding_knots
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -33,11 +33,6 @@ class Options:
     margin: float = option(
         0.0, "part of the bound that plans leave free", lowest=0.0, highest=0.99, in_operation=True
     )
-
-
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The surrogate that `prepare` would use."""
-    return (model_artifact(case, settings),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from ded_bench.methods.knots import receding_knots
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.reserve import LIMIT, Reserve
-from ded_bench.methods.solution import Artifact, Settings, Solution, model_artifact
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import Plan, solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -46,11 +46,6 @@ class Options:
         0.5, "part of the bound that plans leave free", lowest=0.0, highest=0.99, in_operation=True
     )
     reserve: bool = option(False, "room to follow ramps that nobody announced")
-
-
-def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-    """The surrogate that `prepare` would use."""
-    return (model_artifact(case, settings, TRAJECTORY),)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:

@@ -1,12 +1,13 @@
 """METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`plugin`).
 
 A method's module offers `Options`, its parameters (see `methods.options`); `VERSION`, a whole number that is
-raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If it depends
-on a trained model or policy, it also offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all
-of them. If it is a policy to be trained, its line here names the module whose `train` does it (see
-`training_record`), and `ded-bench train-dpc` knows it. What `prepare` returns may also have
-`solve(instance, last=None)`, which the closed loop calls: it may start from the plan in force, and where no
-schedule meets every limit it may answer `Infeasible` with the schedule that exceeds them least.
+raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If it plans with
+a surrogate, its line here names the usual one. If it depends on other trained models or policies, it offers
+`artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy to be trained, its
+line here names the module whose `train` does it (see `training_record`), and `ded-bench train-dpc` knows it.
+What `prepare` returns may also have `solve(instance, last=None)`, which the closed loop calls: it may start
+from the plan in force, and where no schedule meets every limit it may answer `Infeasible` with the schedule
+that exceeds them least.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 from ded_bench.files.errors import InputError
 from ded_bench.methods import plugin
 from ded_bench.methods.options import options_text, read_options
-from ded_bench.methods.solution import Artifact, Settings, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
 
@@ -32,7 +33,7 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
-    model: str = "koopman"  # the surrogate that it plans with unless told otherwise, if it takes any
+    model: str = ""  # the surrogate that it plans with unless told otherwise, if it takes any
 
     @property
     def _answering(self) -> Any:
@@ -79,7 +80,9 @@ class Method:
         """
         find = getattr(self._answering, "artifacts", None)
         own = self.canonical(settings)
-        return tuple(find(case, regime, own)) if find else ()
+        if find:
+            return tuple(find(case, regime, own))
+        return (model_artifact(case, own, self.model),) if self.model else ()
 
     @property
     def train(self) -> Trainer:
@@ -107,8 +110,8 @@ METHODS: dict[str, Method] = {
         Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
         Method("ded-rti", "ded_bench.methods.ded_rti", "DED (real-time iteration)", model="trajectory"),
         Method("ed", "ded_bench.methods.ed", "ED"),
-        Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO"),
-        Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (knots)"),
+        Method("ded-ko", "ded_bench.methods.ded_ko", "DED-KO", model="koopman"),
+        Method("ded-ko-knots", "ded_bench.methods.ded_ko_knots", "DED-KO (knots)", model="koopman"),
         Method(
             "ded-dpc-paper",
             "ded_bench.methods.dpc_paper.paper_policy",
@@ -116,7 +119,11 @@ METHODS: dict[str, Method] = {
             trainer="ded_bench.methods.dpc_paper.paper_training",
         ),
         Method(
-            "ded-dpc", "ded_bench.methods.dpc.dpc_policy", "DED-DPC", trainer="ded_bench.methods.dpc.training"
+            "ded-dpc",
+            "ded_bench.methods.dpc.dpc_policy",
+            "DED-DPC",
+            trainer="ded_bench.methods.dpc.training",
+            model="koopman",
         ),
         Method(
             "ded-admm",

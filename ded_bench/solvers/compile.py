@@ -17,7 +17,7 @@ import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
 from ded_bench.solvers import highs, piqp
-from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt, IpoptExecutable
+from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, read_linear
 from ded_bench.solvers.status import Compiled, Options, Outcome, Status
 
@@ -63,10 +63,9 @@ class OnArrays:
         )
 
 
-#: Solvers by name. The name "ipopt" means IPOPT from the `casadi` wheel; linear solvers take no options.
+#: Solvers by name; linear solvers take no options.
 SOLVERS: dict[str, Callable[[pyo.ConcreteModel, Options | None], Compiled]] = {
     "ipopt": CasadiIpopt,
-    "ipopt-executable": IpoptExecutable,
     "piqp": lambda model, _: OnArrays(model, piqp.solve_form),
     "highs": lambda model, _: OnArrays(model, highs.solve_form),
 }
@@ -76,7 +75,7 @@ def compile_model(model: pyo.ConcreteModel, solver: str, options: Options | None
     """Compile a Pyomo model for a solver by name.
 
     Raises:
-        InputError: unknown solver, or one that is not installed.
+        InputError: unknown solver.
         ValueError: a linear solver is asked to solve a model that is not linear.
     """
     if solver not in SOLVERS:

@@ -1,10 +1,8 @@
-"""IPOPT: from the `casadi` wheel, which needs no installation, or as an `ipopt` executable."""
+"""IPOPT from the `casadi` wheel, which needs no installation."""
 
 from __future__ import annotations
 
 import importlib.metadata
-import re
-import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -13,11 +11,8 @@ from typing import Any
 import casadi
 import numpy as np
 import pyomo.environ as pyo
-from pyomo.common.errors import ApplicationError
-from pyomo.opt import TerminationCondition
 from pyomo.repn.plugins.nl_writer import NLWriter
 
-from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Array
 from ded_bench.solvers.linear_program import LinearProgram, assign, bounds, read_linear
 from ded_bench.solvers.status import Options, Outcome, Status
@@ -156,65 +151,3 @@ class _Nl:
     def current(self) -> _Current:
         lower, upper = bounds(self.columns)
         return {"lbx": lower, "ubx": upper}, 0.0
-
-
-class IpoptExecutable:
-    """An `ipopt` executable on the PATH, through Pyomo's own interface and files.
-
-    Raises:
-        InputError: there is none.
-    """
-
-    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
-        self._model = model
-        # Pyomo passes options with this prefix in a file, which knows more of them than the command line.
-        self._options = {f"OF_{name}": value for name, value in (options or {}).items()}
-        path = shutil.which("ipopt")
-        if path is None:
-            raise InputError("ipopt", "", "no such executable on the PATH; the default settings need none")
-        self._solver = pyo.SolverFactory("ipopt", executable=path)
-        self._version = "ipopt " + ".".join(map(str, self._solver.version() or ()))
-
-    def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """See `Compiled`; writing the .nl file and reading the answer count as set-up."""
-        started = time.perf_counter()
-        limit = {} if time_limit_s is None else {"OF_max_wall_time": time_limit_s}
-        with tempfile.TemporaryDirectory() as folder:
-            log = Path(folder, "ipopt.log")
-            try:
-                results = self._solver.solve(
-                    self._model, options=self._options | limit, load_solutions=False, logfile=str(log)
-                )
-            except ApplicationError as error:
-                said = time.perf_counter() - started, None, self._version, str(error)
-                return Outcome(Status.FAILED, False, None, 0.0, *said)
-            found = re.search(r"Number of Iterations\.*:\s*(\d+)", log.read_text(errors="replace"))
-        message = str(results.solver.message).replace("\\x3a", ":")
-        status = _executable_status(results.solver.termination_condition, message)
-        has_values = status in (Status.OPTIMAL, Status.FEASIBLE)
-        objective = None
-        if has_values:
-            self._model.solutions.load_from(results)
-            objective = pyo.value(next(self._model.component_data_objects(pyo.Objective, active=True)))
-        solve_s = float(results.solver.time)
-        return Outcome(
-            status,
-            has_values,
-            int(found.group(1)) if found else None,
-            time.perf_counter() - started - solve_s,
-            solve_s,
-            objective,
-            self._version,
-            message,
-        )
-
-
-def _executable_status(condition: TerminationCondition, message: str) -> Status:
-    """IPOPT's answer in a .sol file: a condition, and a sentence that tells more."""
-    if "time exceeded" in message.lower():
-        return Status.TIME_LIMIT
-    if condition == TerminationCondition.infeasible:
-        return Status.INFEASIBLE
-    if condition == TerminationCondition.optimal:
-        return Status.FEASIBLE if "acceptable" in message.lower() else Status.OPTIMAL
-    return Status.FAILED

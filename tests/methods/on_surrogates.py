@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ded_bench.methods import ded_ko, ded_ko_knots
-from ded_bench.methods.ded_ko import SOLVERS
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE
 from ded_bench.plants.lossless.network import Network
@@ -21,8 +20,6 @@ from ded_bench.surrogates.koopman import Koopman
 
 HORIZON = 3.0
 METHODS = (ded_ko, ded_ko_knots)
-#: Solvers that need nothing installed beside the package's dependencies.
-INSTALLED = [name for name in SOLVERS if name != "ipopt-executable"]
 
 
 def short(case: Case, index: int, **changes) -> Instance:

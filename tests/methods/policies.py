@@ -75,7 +75,7 @@ def modal_grid(case: Case, horizon: float = HORIZON) -> ModalGrid:
 
 def started(grid: ModalGrid, count: int = 6, seed: int = 0) -> tuple[Start, ModalLinearisation]:
     """Drawn problems, and the grid along their first schedules."""
-    start = grid.start(draw(grid.case, grid.bound, grid.points, count, np.random.default_rng(seed)))
+    start = grid.start(draw(grid.case, grid.bound, grid.points, POLICY_SEED, seed * count, count))
     return start, grid.along_first(start)
 
 

@@ -11,6 +11,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_ko
 from ded_bench.methods.ded_ko import SOLVERS, build_ded_ko, set_instance
 from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Artifact, Settings
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
@@ -20,12 +21,14 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.instance_model import model_along
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
-from tests.methods.on_surrogates import INSTALLED, METHODS, check_limits, replay, short
+from tests.methods.on_surrogates import METHODS, check_limits, replay, short
+
+NAMES = ("ded-ko", "ded-ko-knots")
 
 
 def ways(method) -> list[str]:
     """Options that name a solver, if the method has them."""
-    return [f"solver={name}" for name in INSTALLED] if method is ded_ko else ["default"]
+    return [f"solver={name}" for name in SOLVERS] if method is ded_ko else ["default"]
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])
@@ -33,17 +36,17 @@ def test_solvers_agree_and_their_solution_replays_on_the_model(
     case: Case, koopman: Koopman, regime: str
 ) -> None:
     instance = short(case, 3)
-    solve = [ded_ko.prepare_with(case, koopman, regime, Settings(f"solver={slug}")) for slug in INSTALLED]
+    solve = [ded_ko.prepare_with(case, koopman, regime, Settings(f"solver={slug}")) for slug in SOLVERS]
     solutions = [each(instance) for each in solve]
     for solution in solutions:
         check_limits(case, koopman, instance, solution, regime)
         assert solution.iterations > 0
         assert solution.solve_s > 0
         assert solution.solver_objective == pytest.approx(solutions[0].solver_objective, rel=1e-7)
-    assert len({solution.solver_version for solution in solutions}) == len(INSTALLED)
+    assert len({solution.solver_version for solution in solutions}) == len(SOLVERS)
 
 
-@pytest.mark.parametrize("slug", INSTALLED)
+@pytest.mark.parametrize("slug", SOLVERS)
 def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Koopman, slug: str) -> None:
     """One built model serves all instances."""
     first, last = (short(case, index, horizon_s=1.0) for index in range(2))
@@ -141,9 +144,9 @@ def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> N
         method.prepare(case, "NO", Settings(model="nowhere"))
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_prepare_finds_the_model_that_the_settings_name(method, case: Case) -> None:
-    settings, instance = Settings(model="linear"), short(case, 0)
+@pytest.mark.parametrize("name", NAMES)
+def test_prepare_finds_the_model_that_the_settings_name(name: str, case: Case) -> None:
+    settings, instance, method = Settings(model="linear"), short(case, 0), get_method(name)
     assert method.artifacts(case, "NO", settings) == (
         Artifact("model", "linear", nominal_model(case).fingerprint),
     )
@@ -151,11 +154,13 @@ def test_prepare_finds_the_model_that_the_settings_name(method, case: Case) -> N
     check_limits(case, nominal_model(case), instance, solution, "NO")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_along_a_trajectory_answers_are_nearly_those_of_the_true_system(method, regime, case: Case) -> None:
+def test_along_a_trajectory_answers_are_nearly_those_of_the_true_system(
+    name: str, regime: str, case: Case
+) -> None:
     """Nothing is trained or found in a file; the claim is the scorer's but for the surrogate's error."""
-    instance, settings = short(case, 2), Settings(model="trajectory")
+    instance, settings, method = short(case, 2), Settings(model="trajectory"), get_method(name)
     (artifact,) = method.artifacts(case, regime, settings)
     assert (artifact.name, artifact.path) == ("trajectory", None)
     solution = method.prepare(case, regime, settings)(instance)

@@ -122,10 +122,8 @@ class _AdmmTraining(TrainingRun):
 
     def loss(self, step: int, progress: float) -> Tensor | None:
         """Cost and priced penalty of fresh draws."""
-        generator = np.random.default_rng(np.random.SeedSequence([POLICY_SEED + self.seed, step]))
-        start = self.grid.start(
-            draw(self.grid.case, self.grid.bound, self.grid.points, self.batch, generator)
-        )
+        grid, drawn = self.grid, (POLICY_SEED + self.seed, step * self.batch, self.batch)
+        start = grid.start(draw(grid.case, grid.bound, grid.points, *drawn))
         judged = self.judge(start, self.network(start), MARGIN)
         used = torch.as_tensor(start.served)
         penalty = PRICE * judged.penalty

@@ -1,7 +1,4 @@
-"""Problems on the time grid: of instances, and drawn for training without files; their first schedules.
-
-Those drawn are of the benchmark's kind, or like those of a closed loop.
-"""
+"""Problems on the time grid: of instances, and drawn for training; their first schedules."""
 
 from __future__ import annotations
 
@@ -16,11 +13,12 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.sampling import sample_instances
 
 #: Points of the time grid per interval between knots.
 POINTS = 4
-#: Which part of drawn problems is of the closed loop's kind.
-OPERATING = 0.25
+#: One of so many drawn problems is of the closed loop's kind.
+OPERATING = 4
 #: Their fluctuation: standard deviation as a part of the nominal load, and decay, s.
 FLUCTUATION, DECAY_S = 5e-4, 20.0
 
@@ -58,76 +56,32 @@ def time_grid(knots: Array) -> Array:
     return np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
 
 
-def draw(case: Case, bound: float, points: Array, count: int, generator: np.random.Generator) -> Problems:
-    """Draw problems.
+def draw(case: Case, bound: float, points: Array, master: int, first: int, count: int) -> Problems:
+    """Draw problems: the benchmark's instances; every fourth becomes one of the closed loop.
 
-    The benchmark's kind is the sampler's (`problem.sampling`). The closed loop's kind has a second ramp in
-    each load, a decaying fluctuation, powers nearer to the static dispatch, and a state within the bound
-    that is no equilibrium.
+    That kind has the ramps of another instance besides, a decaying fluctuation, powers nearer to the static
+    dispatch, and mostly a state within the bound that is no equilibrium.
 
     Args:
         case: gives the ranges.
         bound: of |ω|, rad/s.
         points: the time grid, (n_points,), s.
+        master: seed, see `problem.sampling`.
+        first: index of the first instance.
         count: how many.
-        generator: of random numbers.
     """
-    n_gen, ranges = len(case.generators), case.sampling
-    operating = generator.random(count) < OPERATING
-    cost = _uniform(generator, ranges.cost, (count, 1 + n_gen))
-    load = _ramps(case, points, count, generator)
-    chosen = np.flatnonzero(operating)
-    more = _ramps(case, points, len(chosen), generator)
-    load[chosen] += more - more[:, :1]
-    noise = generator.standard_normal((len(chosen), 1, len(case.loads))) * FLUCTUATION * case.load_nominal
-    load[chosen] += noise * (np.exp(-points / DECAY_S) - 1.0)[None, :, None]
-    p_opt = merit_order(case, cost[:, 1:], cost[:, 0], load[:, 0])
-    perturbation = _uniform(generator, ranges.perturbation, (count, n_gen))
-    perturbation *= np.where(operating, generator.random(count), 1.0)[:, None]
-    omega = _uniform(generator, ranges.omega_rad_per_s, (count, n_gen))
-    delta = np.where(operating[:, None], 0.5 * bound * generator.standard_normal((count, n_gen)), 0.0)
-    inside = np.clip(bound * generator.uniform(-1.0, 1.0, (count, n_gen)), -0.05, 0.05)
-    omega = np.where(operating[:, None] & (generator.random((count, 1)) < 0.7), inside, omega)
-    delta = np.clip(delta, -0.02, 0.02)
-    return Problems(load, cost, p_opt - 0.5 * (p_opt - case.p_nominal) * perturbation, delta, omega)
-
-
-def _ramps(case: Case, points: Array, count: int, generator: np.random.Generator) -> Array:
-    """Loads that ramp once, (count, n_points, n_load), pu; in case/2 none changes its sign."""
-    ranges, shape = case.sampling, (count, len(case.loads))
-    draws = [_ramp(case, shape, generator)]
-    if case.schema_ != "ded-bench/case/1":
-        for _ in range(50):
-            initial, start, duration, rate = draws[-1]
-            last = initial + rate * np.clip(ranges.horizon_s - start, 0.0, duration)
-            wrong = np.minimum(initial * case.load_nominal, last * case.load_nominal) < 0
-            if not wrong.any():
-                break
-            again = _ramp(case, shape, generator)
-            draws.append(tuple(np.where(wrong, new, old) for new, old in zip(again, draws[-1], strict=True)))
-    initial, start, duration, rate = draws[-1]
-    none = np.zeros(shape)
-    pieces = (
-        (none, initial, none),
-        (start, initial, rate),
-        (start + duration, initial + rate * duration, none),
-    )
-    return sampled(np.stack([np.stack(piece, axis=-1) for piece in pieces], axis=2), points)
-
-
-def _ramp(case: Case, shape: tuple[int, int], generator: np.random.Generator) -> tuple[Array, ...]:
-    ranges = case.sampling
-    spread = (-ranges.load_relative, ranges.load_relative)
-    initial = case.load_nominal * (1.0 + _uniform(generator, spread, shape))
-    start, duration = (_uniform(generator, ends, shape) for ends in (ranges.start_s, ranges.duration_s))
-    low, high = case.load_rate
-    rate = low + (high - low) * generator.random(shape)
-    rate *= np.where(generator.random(shape) < 0.5, -1.0, 1.0)
-    return initial, start, duration, rate * (generator.random(shape) >= ranges.rate_zero_probability)
-
-
-def _uniform(generator: np.random.Generator, ends: tuple[float, float], shape: tuple[int, ...]) -> Array:
-    return np.asarray(generator.uniform(ends[0], ends[1], shape))
+    found = Problems.of(case, list(sample_instances(case, master, count, first)), points)
+    chosen = found[::OPERATING]
+    generator, shape = np.random.default_rng([master, first, count]), chosen.omega.shape
+    more = np.roll(found.load, 1, axis=0)[::OPERATING]
+    noise = generator.standard_normal((shape[0], 1, len(case.loads))) * FLUCTUATION * case.load_nominal
+    chosen.load[:] += more - more[:, :1] + noise * (np.exp(-points / DECAY_S) - 1.0)[None, :, None]
+    dispatch = merit_order(case, chosen.cost[:, 1:], chosen.cost[:, 0], chosen.load[:, 0])
+    chosen.p_initial[:] += generator.random((shape[0], 1)) * (dispatch - chosen.p_initial)
+    chosen.delta[:] = np.clip(0.5 * bound * generator.standard_normal(shape), -0.02, 0.02)
+    inside = np.clip(bound * generator.uniform(-1.0, 1.0, shape), -0.05, 0.05)
+    chosen.omega[:] = np.where(generator.random((shape[0], 1)) < 0.7, inside, chosen.omega)
+    return found
 
 
 @compiled

@@ -92,6 +92,18 @@ class Plant(Protocol):
     def check_servable(self, instance: Instance, source: str) -> None:
         """Raise InputError, which names source and field, unless static dispatch can serve it throughout."""
 
+    def static_dispatch(self, instance: Instance, times: Array) -> Array:
+        """Cheapest powers that serve the loads at some times, whatever frequencies do; (n, n_gen), pu.
+
+        Args:
+            instance: costs, loads, and powers at t = 0.
+            times: ascending from 0, (n,), s. Where no slack takes what is missing, powers at 0 are those of
+                the instance, and each is within the ramp limits from the one before.
+
+        Raises:
+            SimulationError: no powers within reach do.
+        """
+
     def balanced(self, instance: Instance) -> Instance:
         """A drawn instance with powers at t = 0 that are balanced, where no slack does that.
 

@@ -21,10 +21,10 @@ from ded_bench.plants.detailed.case_system import CaseSystem, DetailedRun, Detai
 from ded_bench.plants.detailed.detailed_linearisation import linearised
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.start import initial_point, start
+from ded_bench.plants.detailed.static_dispatch import StaticDispatch
 from ded_bench.plants.plant import Piece, SimulationError
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Case
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import AgcState, Instance, State
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.trajectory import Trajectory
@@ -65,6 +65,11 @@ class DetailedPlant:
     def equations(self) -> CaseSystem:
         """Its equations, by the case's generators and loads."""
         return CaseSystem(self.case)
+
+    @functools.cached_property
+    def dispatcher(self) -> StaticDispatch:
+        """Its static dispatch."""
+        return StaticDispatch(self.equations)
 
     def initial(self, instance: Instance) -> DetailedState:
         """See `Plant.initial` and `start`.
@@ -164,11 +169,19 @@ class DetailedPlant:
         columns |= {f"delta_{name}": column for name, column in zip(names, delta.T, strict=True)}
         return columns | ({"agc": found.held} if self.case.agc is not None else {})
 
+    def balanced(self, instance: Instance) -> Instance:
+        """See `Plant.balanced`: on an island all machines take what powers and losses differ by."""
+        return instance if self.case.slack else self.dispatcher.balanced_instance(instance)
+
+    def static_dispatch(self, instance: Instance, times: Array) -> Array:
+        """See `Plant.static_dispatch`: losses are balanced at the least cost."""
+        return self.dispatcher.course(instance, times)
+
     def check_servable(self, instance: Instance, source: str) -> None:
         """See `Plant.check_servable`.
 
-        Powers and loads at t = 0 must have a stable equilibrium; the static dispatch at 0, at each kink of a
-        load and at the horizon a power flow.
+        Powers and loads at t = 0 must have a stable equilibrium; with the exciters' references of it, the
+        static dispatch must have one at 0, at each kink of a load and, a stable one, at the horizon.
         """
         equations = self.equations
         try:
@@ -180,14 +193,7 @@ class DetailedPlant:
         except SimulationError as error:
             problem = f"initial loads and power cannot be served: {error}"
             raise InputError(source, "load, initial.power", problem) from None
-        case, kinks = self.case, (t for load in instance.load.values() for t in load.kinks)
-        times = np.array(sorted({t for t in (0.0, instance.horizon_s, *kinks) if t <= instance.horizon_s}))
-        p_load = instance.p_load(case, times)
-        price = np.inf if case.slack is None else instance.cost_slack(case)
-        for t, powers, loads in zip(
-            times, merit_order(case, instance.cost_gen(case), price, p_load), p_load, strict=True
-        ):
-            try:
-                equations.system.network.power_flow(equations.p_machine(powers), equations.p_drawn(loads))
-            except SimulationError as error:
-                raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
+        try:
+            self.dispatcher.check_kinks(instance, equations.system.equilibrium(point).v_ref)
+        except SimulationError as error:
+            raise InputError(source, "load", str(error)) from None

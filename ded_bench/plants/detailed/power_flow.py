@@ -56,7 +56,9 @@ class PortNetwork:
         """The buses of the ports."""
         return tuple(self.buses[i] for i in self.ports)
 
-    def power_flow(self, p_machine: Array, p_drawn: Array, guess: Complex | None = None) -> OperatingPoint:
+    def power_flow(
+        self, p_machine: Array, p_drawn: Array, guess: Complex | None = None, sizes: Array | None = None
+    ) -> OperatingPoint:
         """Solve for voltages, with magnitudes held where machines are; one machine's power follows.
 
         Newton's method in polar coordinates.
@@ -65,6 +67,7 @@ class PortNetwork:
             p_machine: active power, (n_machine,), pu; that of the balancing one is not looked at.
             p_drawn: active power that loads draw at the ports, (n_port,), pu.
             guess: voltages to start from, (n_port,), pu; default: nominal.
+            sizes: magnitudes, which are held where machines are, (n_port,), pu; default: nominal.
 
         Raises:
             SimulationError: there is no solution.
@@ -77,6 +80,8 @@ class PortNetwork:
         if guess is not None:
             size = np.abs(guess)
             size[held] = np.abs(self.guess[held])
+        if sizes is not None:
+            size[held] = sizes[held]
         balancing = self.machine_port[self.balancing]
         turning = np.delete(np.arange(n), balancing)
         free = np.setdiff1d(np.arange(n), held)

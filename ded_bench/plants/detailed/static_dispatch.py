@@ -1,4 +1,4 @@
-"""Static dispatch of an island: cheapest powers that balance loads and losses on the AC power flow.
+"""Static dispatch: on an island the cheapest powers that balance loads and losses on the AC power flow.
 
 Marginal losses count: the balance is that of the power flow linearised at the powers found before, until they
 stay. What the balancing machine of the power flow would have to add is what the powers are short of.
@@ -6,16 +6,17 @@ stay. What the balancing machine of the power flow would have to add is what the
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linprog
 
-from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork
+from ded_bench.plants.detailed.case_system import CaseSystem
+from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint
 from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import rounded
 
@@ -23,6 +24,12 @@ from ded_bench.problem.sampling import rounded
 BALANCED, STAYS = 1e-9, 1e-6
 #: Programs, and Newton steps, after which there is no balance.
 PROGRAMS, NEWTON_STEPS = 12, 12
+#: Programs with marginal losses of their own.
+RENEWED = 4
+#: What a balance on a file's rounded powers may be short of, pu.
+SHORT = 1e-6
+#: What exciters may miss their references by, pu, and steps after which they find no voltages.
+REGULATED, REGULATIONS = 1e-6, 30
 
 
 @dataclass(frozen=True)
@@ -37,12 +44,14 @@ class Balance:
 
 @dataclass(frozen=True)
 class StaticDispatch:
-    """Dispatch of the machines of an island."""
+    """Dispatch of the generators of a case."""
 
-    case: Case
-    network: PortNetwork
-    machines: Indices  # of the generators, (n_gen,)
-    load_ports: Indices  # (n_load,)
+    equations: CaseSystem
+
+    @property
+    def case(self) -> Case:
+        """Whose machines are dispatched."""
+        return self.equations.case
 
     def weigh(self, power: Array, p_load: Array, guess: Complex | None = None) -> Balance:
         """Solve the power flow and say what the powers are short of.
@@ -55,13 +64,12 @@ class StaticDispatch:
         Raises:
             SimulationError: the power flow has no solution.
         """
-        machines, drawn = np.zeros(len(self.machines)), self.network.p_drawn.copy()
-        machines[self.machines], drawn[self.load_ports] = power, -p_load
-        point = self.network.power_flow(machines, drawn, guess)
-        slopes, balancing = self.network.balance_slopes(point)[0], self.network.balancing
-        slopes[balancing] = -1.0
-        short = float(point.power.real[balancing] - machines[balancing])
-        return Balance(power, point, short, slopes[self.machines])
+        network, machines = self.equations.system.network, self.equations.p_machine(power)
+        point = network.power_flow(machines, self.equations.p_drawn(p_load), guess)
+        slopes = network.balance_slopes(point)[0]
+        slopes[network.balancing] = -1.0
+        short = float(point.power.real[network.balancing] - machines[network.balancing])
+        return Balance(power, point, short, slopes[self.equations.scheduled])
 
     def cheapest(self, cost: Array, p_load: Array, start: Balance, reach: Array | None = None) -> Balance:
         """Cheapest powers within limits and transfers that balance loads and losses.
@@ -70,7 +78,8 @@ class StaticDispatch:
             cost: (n_gen,).
             p_load: load injections, (n_load,), pu.
             start: powers and voltages near these.
-            reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere.
+            reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere. Where none
+                within reach balance the loads, they go as far as they can.
 
         Raises:
             SimulationError: no powers within limits balance the loads.
@@ -80,10 +89,16 @@ class StaticDispatch:
         if reach is not None:
             lower, upper = np.maximum(lower, start.power - reach), np.minimum(upper, start.power + reach)
         found = self.weigh(np.clip(start.power, lower, upper), p_load, start.point.voltage)
-        for _ in range(PROGRAMS):
+        for number in range(PROGRAMS):
+            if number == RENEWED:  # else two machines of equal marginal cost may change places for ever
+                slopes = found.slopes
+            if number >= RENEWED:
+                found = dataclasses.replace(found, slopes=slopes)
             power = self._program(cost, p_load, found, lower, upper)
             if power is None:
-                break
+                if reach is None:
+                    break
+                return self.weigh(upper if found.short > 0 else lower, p_load, found.point.voltage)
             moved = float(np.abs(power - found.power).max())
             found = self.weigh(power, p_load, found.point.voltage)
             if abs(found.short) < BALANCED and moved < STAYS:
@@ -159,16 +174,21 @@ class StaticDispatch:
         raise SimulationError("the powers cannot be balanced within limits and transfers")
 
     def course(self, instance: Instance, times: Array) -> Array:
-        """Dispatch at one time after another, within the ramp limits from the one before; (n, n_gen), pu.
+        """Dispatch at one time after another, on an island within the ramp limits from the one before.
 
         Args:
-            instance: gives costs, loads and the powers at t = 0, which are near balance.
-            times: ascending from 0, (n,), s; the powers at 0 are given.
+            instance: gives costs, loads and the powers at t = 0.
+            times: ascending from 0, (n,), s; on an island the powers at 0 are given.
+
+        Returns:
+            Powers, (n, n_gen), pu. Behind an infinite machine they are a merit order.
 
         Raises:
             SimulationError: no powers within reach balance the loads.
         """
         cost, p_load = instance.cost_gen(self.case), instance.p_load(self.case, times)
+        if self.case.slack is not None:
+            return merit_order(self.case, cost, instance.cost_slack(self.case), p_load)
         found = self.weigh(instance.p_initial(self.case), p_load[0])
         powers = [found.power]
         for load, apart in zip(p_load[1:], np.diff(times).tolist(), strict=True):
@@ -176,7 +196,7 @@ class StaticDispatch:
             powers.append(found.power)
         return np.array(powers)
 
-    def drawn(self, instance: Instance) -> Instance:
+    def balanced_instance(self, instance: Instance) -> Instance:
         """An instance whose powers at t = 0 are balanced, rounded as the sampler does.
 
         Raises:
@@ -187,17 +207,69 @@ class StaticDispatch:
         by_name = dict(zip(self.case.generators, rounded(power).tolist(), strict=True))
         return instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": by_name})})
 
-    def check_kinks(self, instance: Instance, source: str) -> None:
-        """Raise InputError unless powers balance the loads at 0, at every kink and at the horizon."""
-        cost, times = instance.cost_gen(self.case), instance.kinks
+    def regulated(self, near: Balance, p_load: Array, v_ref: Array) -> OperatingPoint:
+        """The power flow whose voltages at machines are what exciters make of their references.
+
+        They fall with the field voltage that is needed: a network can carry less with them than with nominal
+        ones. References that are missed move the voltages, until none is.
+
+        Args:
+            near: the powers, with nominal voltages at machines.
+            p_load: load injections, (n_load,), pu.
+            v_ref: (n_machine,), pu; a machine without exciter holds its voltage.
+
+        Raises:
+            SimulationError: there is none.
+        """
+        system = self.equations.system
+        network, point = system.network, near.point
+        sizes, port = np.abs(point.voltage), network.machine_port
+        machines, drawn = self.equations.p_machine(near.power), self.equations.p_drawn(p_load)
+        for _ in range(REGULATIONS):
+            missed = np.zeros_like(
+                sizes
+            )  # by the mean of the machines at a bus, which share its reactive power
+            np.add.at(missed, port, (v_ref - system.equilibrium(point).v_ref) / np.bincount(port)[port])
+            if np.abs(missed).max() < REGULATED:
+                return point
+            sizes = np.abs(point.voltage) + missed
+            point = network.power_flow(machines, drawn, point.voltage, sizes)
+        raise SimulationError("exciters find no voltages")
+
+    def check_kinks(self, instance: Instance, v_ref: Array) -> None:
+        """Check that it can serve the loads at 0, at every kink and, stably, at the horizon.
+
+        On an island powers within the ramp limits must balance the loads from kink to kink, too.
+
+        Args:
+            instance: of the case.
+            v_ref: exciters' references, (n_machine,), pu.
+
+        Raises:
+            SimulationError: it cannot.
+        """
+        times, before = instance.kinks, 0.0
         p_load = instance.p_load(self.case, times)
-        try:
-            found = self.weigh(instance.p_initial(self.case), p_load[0])
-        except SimulationError as error:
-            problem = f"initial loads and powers cannot be served: {error}"
-            raise InputError(source, "load, initial.power", problem) from None
+        found = following = self.weigh(instance.p_initial(self.case), p_load[0])
         for t, load in zip(times.tolist(), p_load, strict=True):
             try:
-                found = self.cheapest(cost, load, found)
+                found = self._unhurried(instance, load, found)
+                point = self.regulated(found, load, v_ref)
+                if t == times[-1] and not self.equations.system.stable(point):
+                    raise SimulationError("the equilibrium is not stable")
+                if self.case.slack is None:
+                    reach = self.case.ramp * (t - before)
+                    following = self.cheapest(instance.cost_gen(self.case), load, following, reach)
+                    if abs(following.short) > SHORT:
+                        raise SimulationError("no powers within ramp limits balance them")
             except SimulationError as error:
-                raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
+                raise SimulationError(f"loads at t = {t:g} s cannot be served: {error}") from None
+            before = t
+
+    def _unhurried(self, instance: Instance, p_load: Array, near: Balance) -> Balance:
+        """Dispatch without ramp limits."""
+        cost = instance.cost_gen(self.case)
+        if self.case.slack is None:
+            return self.cheapest(cost, p_load, near)
+        power = merit_order(self.case, cost, instance.cost_slack(self.case), p_load)
+        return self.weigh(power, p_load, near.point.voltage)

@@ -127,6 +127,11 @@ class LosslessPlant:
             f"theta_{bus.id}": column for bus, column in zip(lossless(self.case).buses, states.T, strict=True)
         }
 
+    def static_dispatch(self, instance: Instance, times: Array) -> Array:
+        """See `Plant.static_dispatch`: the merit order; the slack takes what is missing."""
+        prices = instance.cost_gen(self.case), instance.cost_slack(self.case)
+        return merit_order(self.case, *prices, instance.p_load(self.case, times))
+
     def balanced(self, instance: Instance) -> Instance:
         """The instance: its slack balances it."""
         return instance
@@ -144,8 +149,7 @@ class LosslessPlant:
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
         case, times = self.case, instance.kinks
-        p_load = instance.p_load(case, times)
-        p_gen = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+        p_load, p_gen = instance.p_load(case, times), self.static_dispatch(instance, times)
         with contextlib.suppress(PowerFlowError):  # all at once is faster, one by one tells where it fails
             self.network.power_flow(p_gen, p_load)
             return

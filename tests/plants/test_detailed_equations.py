@@ -131,7 +131,7 @@ def test_symbolic_and_compiled_equations_agree(system):
     """At random states, to 1e-10 of the rates, with the network solved by Newton's method symbolically."""
     x, guess, point, v_ref = random_states(system, 3)
     p_ref, n_load = point.power.real + 0.1, system.network.n_load_port
-    network = system.compiled_network._replace(change=1e-13)
+    network = system.compiled_network._replace(change=1e-12)
     references = np.stack([p_ref, v_ref])
     compiled = rates_at(system.data, network, point.p_drawn[:n_load], references, x, interleaved(guess))
     for states, rates in zip(x, compiled, strict=True):
@@ -146,7 +146,7 @@ def test_linearisation_is_that_of_differences(system):
     x, guess, point, v_ref = random_states(system, 1)
     n, step, drawn = len(system.moving), 1e-5, point.p_drawn[: system.network.n_load_port]
     references = np.stack([point.power.real, v_ref])
-    network = system.compiled_network._replace(change=1e-13)
+    network = system.compiled_network._replace(change=1e-12)
     moved = np.tile(x, (2 * n, 1, 1))
     moved.reshape(2 * n, -1)[np.arange(2 * n), np.tile(system.moving, 2)] += np.repeat([step, -step], n)
     rates = rates_at(system.data, network, drawn, references, moved, interleaved(guess)).reshape(2, n, -1)

@@ -19,6 +19,7 @@ from ded_bench.plants.detailed.equations import (
     machine_rates,
     mean_angle,
     renew,
+    solve_afresh,
     solve_voltages,
     sources,
 )
@@ -118,14 +119,13 @@ def integrate_plant(
                 for i in range(2 * n_load):
                     ahead = 4.0 * (recent[0, s, i] + recent[2, s, i])
                     v[i] = ahead - 6.0 * recent[1, s, i] - recent[3, s, i]
-                needed = solve_voltages(network, drawn, source, load, v)
-                if needed > FIXED_POINT_STEPS:  # from the voltages of the step before, with fresh slopes
-                    v[: 2 * n_load] = recent[0, s]
-                    renew(network, drawn, v, load)
-                    needed = solve_voltages(network, drawn, source, load, v)
-                    if needed > FIXED_POINT_STEPS:
+                needed = solve_voltages(network, drawn, source, load, v, FIXED_POINT_STEPS)
+                if needed > FIXED_POINT_STEPS:
+                    v[: 2 * n_load] = recent[0, s]  # those of the step before
+                    if not solve_afresh(network, drawn, source, load, v):
                         return k
-                if needed > SLOW and age > RENEWED_AFTER:
+                    age = 0
+                elif needed > SLOW and age > RENEWED_AFTER:
                     renew(network, drawn, v, load)
                     age = 0
                 recent[3, s], recent[2, s], recent[1, s] = recent[2, s], recent[1, s], recent[0, s]

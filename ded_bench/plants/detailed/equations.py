@@ -38,8 +38,8 @@ from ded_bench.plants.detailed.machine_arrays import (
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 
-#: The fixed point gives up after so many steps.
-FIXED_POINT_STEPS = 40
+#: The fixed point gives up after so many steps, Newton's method, which renews W in each, after so many.
+FIXED_POINT_STEPS, NEWTON_STEPS = 12, 20
 
 
 class CompiledNetwork(NamedTuple):
@@ -98,7 +98,9 @@ def mean_angle(data: MachineArrays, x: Array) -> float:
 
 
 @compiled
-def solve_voltages(network: CompiledNetwork, drawn: Array, source: Array, load: LoadSlopes, v: Array) -> int:
+def solve_voltages(
+    network: CompiledNetwork, drawn: Array, source: Array, load: LoadSlopes, v: Array, most: int
+) -> int:
     """Find the voltages at all ports, (2 n_port,), pu.
 
     Args:
@@ -107,9 +109,10 @@ def solve_voltages(network: CompiledNetwork, drawn: Array, source: Array, load: 
         source: of the machines, (2 n_port,), pu.
         load: their slopes; not changed.
         v: a guess at ports with loads, and receives the answer at all.
+        most: steps.
 
     Returns:
-        The number of steps; more than FIXED_POINT_STEPS where they do not converge.
+        The number of steps; more than `most` where they do not converge.
     """
     n, n_all = 2 * len(drawn), len(v)
     base, new, current = np.zeros(n_all), np.empty(n_all), np.empty(n)
@@ -118,7 +121,7 @@ def solve_voltages(network: CompiledNetwork, drawn: Array, source: Array, load: 
             row, factor = load.answer[j], source[j]
             for i in range(n_all):
                 base[i] += row[i] * factor
-    for step in range(1, FIXED_POINT_STEPS + 1):
+    for step in range(1, most + 1):
         for i in range(len(drawn)):
             p, q, re, im = drawn[i], network.q_drawn[i], v[2 * i], v[2 * i + 1]
             square = re * re + im * im
@@ -134,7 +137,7 @@ def solve_voltages(network: CompiledNetwork, drawn: Array, source: Array, load: 
         for i in range(n):
             off = abs(new[i] - v[i])
             if not off < np.inf:
-                return FIXED_POINT_STEPS + 1
+                return most + 1
             worst = max(worst, off)
             v[i] = new[i]
         if worst < network.change:
@@ -144,7 +147,17 @@ def solve_voltages(network: CompiledNetwork, drawn: Array, source: Array, load: 
                 for i in range(n, n_all):
                     v[i] += row[i] * factor
             return step
-    return FIXED_POINT_STEPS + 1
+    return most + 1
+
+
+@compiled
+def solve_afresh(network: CompiledNetwork, drawn: Array, source: Array, load: LoadSlopes, v: Array) -> bool:
+    """As `solve_voltages`, by Newton's method, and tell whether there is a solution; slopes are renewed."""
+    for _ in range(NEWTON_STEPS):
+        renew(network, drawn, v, load)
+        if solve_voltages(network, drawn, source, load, v, 1) == 1:
+            return True
+    return False
 
 
 @compiled
@@ -226,6 +239,6 @@ def rates_at(
     for k in range(len(x)):
         sources(data, x[k], source)
         found = v.copy()
-        if solve_voltages(network, drawn, source, load, found) <= FIXED_POINT_STEPS:
+        if solve_voltages(network, drawn, source, load, found, FIXED_POINT_STEPS) <= FIXED_POINT_STEPS:
             machine_rates(data, x[k], found, references[0], references[1], rates[k], p_e)
     return rates

@@ -107,11 +107,9 @@ class PowerSystem:
         references = np.zeros(n)  # they enter linearly
         given = x.ravel(), interleaved(voltage), references, p_drawn, references
         full = self.symbolic.jacobian(*given).sparse().tocsr()
-        columns = full[:, : x.size].tocsc()[:, self.moving].toarray()
-        by_v = full[:, x.size :].toarray()
+        columns, by_v = full[:, : x.size].tocsc()[:, self.moving].toarray(), full[:, x.size :]
         balance = slice(x.size, x.size + n_v)
-        v_by_x = np.linalg.solve(by_v[balance], -columns[balance])
-        reduced = columns + by_v @ v_by_x
+        reduced = columns + by_v @ np.linalg.solve(by_v[balance].toarray(), -columns[balance])
         outputs = reduced[x.size + n_v :]
         return Slopes(reduced[self.moving], outputs[:n], outputs[n:])
 

@@ -239,6 +239,11 @@ def rates_at(
     for k in range(len(x)):
         sources(data, x[k], source)
         found = v.copy()
-        if solve_voltages(network, drawn, source, load, found, FIXED_POINT_STEPS) <= FIXED_POINT_STEPS:
+        solved = solve_voltages(network, drawn, source, load, found, FIXED_POINT_STEPS) <= FIXED_POINT_STEPS
+        if not solved:
+            found[:] = v
+            solved = solve_afresh(network, drawn, source, load, found)
+            renew(network, drawn, v, load)
+        if solved:
             machine_rates(data, x[k], found, references[0], references[1], rates[k], p_e)
     return rates

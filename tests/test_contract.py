@@ -62,8 +62,8 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def solved(case: Case, folder: Path, name: str, instance: Instance, options: str = "default") -> Solution:
-    settings = Settings(options, search=(folder,))
+def solved(case: Case, folder: Path, name: str, instance: Instance, limit_s: float | None = None) -> Solution:
+    settings = Settings(search=(folder,), time_limit_s=limit_s)
     return METHODS[name].prepare(case, REGIME, settings)(instance)
 
 
@@ -139,6 +139,25 @@ def test_too_little_memory_is_an_answer(
     instance = sample_instance(strange, 77, 1)
     answer = solved(strange, folder, name, instance)
     assert answer.schedule is not None or "GiB" in answer.error
+
+
+def test_no_time_is_no_optimum(name: str, folder: Path, strange: Case) -> None:
+    """What stops early says so; what takes no time to speak of may answer."""
+    answer = solved(strange, folder, name, sample_instance(strange, 77, 0), 1e-6)
+    assert answer.status in (Status.TIME_LIMIT, Status.POLICY) or name == "ed"
+    assert answer.schedule is not None or answer.error
+
+
+@pytest.mark.parametrize("beyond", ["power", "omega"])
+def test_what_cannot_be_is_no_optimum(name: str, beyond: str, folder: Path, strange: Case) -> None:
+    """Machines that start beyond their limits, or turn far faster than the bound."""
+    instance = sample_instance(strange, 77, 0)
+    values = strange.p_max + 0.05 if beyond == "power" else np.full(len(strange.generators), 2.0)
+    initial = {beyond: dict(zip(strange.generators, values.tolist(), strict=True))}
+    bad = instance.model_copy(update={"initial": instance.initial.model_copy(update=initial)})
+    answer = solved(strange, folder, name, bad)
+    assert answer.status != Status.OPTIMAL
+    assert answer.schedule is not None or (answer.status, bool(answer.error)) == (Status.INFEASIBLE, True)
 
 
 @pytest.mark.parametrize("plant", ["lossless", "lagged"])

@@ -11,29 +11,13 @@ from ded_bench.analysis.compare import Tolerance, compare
 from ded_bench.cli.comparison import to_text
 from ded_bench.files.errors import InputError
 from ded_bench.results.rows import Results, Row
+from tests.analysis import test_summary
 
 
 def row(instance: str, method: str = "ded-radau", objective: float | None = 100.0, **changes) -> Row:
-    facts = {
-        "instance": instance,
-        "split": "test",
-        "regime": "TO",
-        "method": method,
-        "settings": "default",
-        "status": "Optimal",
-        "solve_s": 2.0,
-        "objective": objective,
-        "freq_violation_hz": 2e-5,
-        "ramp_violation": 0.0,
-        "bound_violation": 0.0,
-        "initial_violation": 0.0,
-        "feasible": True,
-        "feasible_strict": False,
-        "problems_version": "1-abc",
-        "version": "0.1.0",
-        "case": "grid",
-    }
-    return Row(**(facts | changes))
+    facts = {"solve_s": 2.0, "freq_violation_hz": 2e-5, "feasible_strict": False}
+    facts |= {"problems_version": "1-abc", "version": "0.1.0", "case": "grid"}
+    return test_summary.row(instance, method, objective, **(facts | changes))
 
 
 BASE = [row("a"), row("b"), row("a", "mine", 101.0, solve_s=0.1), row("b", "mine", 103.0, solve_s=0.1)]

@@ -196,34 +196,23 @@ def test_instances_of_one_run_differ_in_id_and_share_a_case(threebus, ninebus, a
     assert load_instances([paths[0], heavier / "instances" / "2.json"], threebus)[1] is threebus
 
 
+SPLIT = {"schema": "ded-bench/split/1", "seed": 1, "train": [], "test": []}
+MANIFEST = {"schema": "ded-bench/manifest/1", "version": "1", "files": {}}
+
+
 @pytest.mark.parametrize(
-    ("reader", "name", "text", "field"),
+    ("reader", "name", "data", "field"),
     [
-        (load_split, "split.json", '{"schema": "ded-bench/split/1", "seed": 1, "train": []}', "test"),
-        (
-            load_split,
-            "split.json",
-            '{"schema": "ded-bench/split/1", "seed": 1.5, "train": [], "test": []}',
-            "seed",
-        ),
-        (
-            load_split,
-            "split.json",
-            '{"schema": "ded-bench/split/1", "seed": 1, "train": ["../a"], "test": []}',
-            "train.0",
-        ),
-        (load_manifest, "MANIFEST.json", '{"schema": "ded-bench/manifest/1", "files": {}}', "version"),
-        (
-            load_manifest,
-            "MANIFEST.json",
-            '{"schema": "ded-bench/manifest/1", "version": "1", "files": {"a": 1}}',
-            "files.a",
-        ),
+        (load_split, "split.json", {k: v for k, v in SPLIT.items() if k != "test"}, "test"),
+        (load_split, "split.json", SPLIT | {"seed": 1.5}, "seed"),
+        (load_split, "split.json", SPLIT | {"train": ["../a"]}, "train.0"),
+        (load_manifest, "MANIFEST.json", MANIFEST | {"version": 1}, "version"),
+        (load_manifest, "MANIFEST.json", MANIFEST | {"files": {"a": 1}}, "files.a"),
     ],
 )
-def test_split_and_manifest_are_read_strictly(tmp_path, reader, name, text, field):
+def test_split_and_manifest_are_read_strictly(tmp_path, reader, name, data, field):
     """The other two files of a benchmark folder obey the same rules."""
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(json.dumps(data))
     with pytest.raises(InputError) as caught:
         reader(tmp_path)
     assert (caught.value.source, caught.value.field) == (str(tmp_path / name), field)

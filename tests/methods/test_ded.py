@@ -103,21 +103,6 @@ def test_the_model_is_backward_euler_of_the_true_system(case: Case) -> None:
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.15)
 
 
-def test_impossible_instances_are_reported_as_such(case: Case) -> None:
-    instance = short(case, 0)
-    outside = dict(zip(case.generators, (case.p_max + 0.05).tolist(), strict=True))
-    bad = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": outside})})
-    solution = prepare(case, "NO", Settings())(bad)
-    assert solution.status == Status.INFEASIBLE
-    assert solution.schedule is None
-    assert solution.error
-
-
-def test_time_limit_is_never_called_optimal(case: Case) -> None:
-    solution = prepare(case, "TO", Settings(time_limit_s=1e-3))(short(case, 0))
-    assert solution.status == Status.TIME_LIMIT
-
-
 def test_accelerated_finds_the_same_optimum(case: Case) -> None:
     """The same discretised problem, to 1e-6; then to what IPOPT relaxes bounds by, 1e-8 of a bound."""
     for index, regime in enumerate(case.regimes):

@@ -124,17 +124,6 @@ def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, k
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_time_limit_is_never_called_optimal(method, case: Case, koopman: Koopman) -> None:
-    for options in ways(method):
-        settings = Settings(options, time_limit_s=1e-5)
-        solution = method.prepare_with(case, koopman, "TO", settings)(short(case, 0))
-        assert solution.status == Status.TIME_LIMIT
-        assert solution.error or solution.schedule is not None
-    enough = Settings(time_limit_s=100.0)
-    assert method.prepare_with(case, koopman, "TO", enough)(short(case, 0)).status == Status.OPTIMAL
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> None:
     with pytest.raises(InputError, match="unknown regime"):
         method.prepare_with(case, koopman, "XX", Settings())

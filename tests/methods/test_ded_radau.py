@@ -139,14 +139,3 @@ def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_inst
         assert again.status == outcome.status == Status.OPTIMAL
         assert again.solver_objective == pytest.approx(outcome.objective, rel=1e-12)
         np.testing.assert_allclose(again.schedule.p, fresh.schedule(x, instance, ends).p, atol=1e-12)
-
-
-def test_impossible_instances_and_time_limits_are_reported_as_such(threebus: Case) -> None:
-    instance = short(threebus, 0)
-    initial = instance.initial.model_copy(update={"power": {"plant": 0.95}})  # p_max is 0.9
-    solution = prepare(threebus, "NO", Settings())(instance.model_copy(update={"initial": initial}))
-    assert solution.status == Status.INFEASIBLE
-    assert solution.schedule is None
-    assert solution.error
-    solution = prepare(threebus, "TO", Settings(time_limit_s=1e-4))(instance)
-    assert solution.status == Status.TIME_LIMIT

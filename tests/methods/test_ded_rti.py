@@ -93,12 +93,6 @@ def test_build_and_solution_times_are_those_of_one_step(ninebus: Case) -> None:
     assert sum(parts) == pytest.approx(call.seconds, rel=0.2)
 
 
-def test_a_time_limit_is_kept(ninebus: Case) -> None:
-    settings = Settings(model="linear", time_limit_s=1e-4)
-    solution = get_method("ded-rti").prepare(ninebus, "NO", settings)(sample_instance(ninebus, 77, 0))
-    assert (solution.status, solution.schedule) == (Status.TIME_LIMIT, None)
-
-
 def answered(case: Case, instance: Instance, settings: str, regime: str, model: str) -> Schedule:
     solver = get_method("ded-rti").prepare(case, regime, Settings(settings, model=model))
     solution = solver(instance)

@@ -150,27 +150,6 @@ def test_finer_knots_cost_no_more(ninebus):
     assert costs[1] <= costs[0] * (1 + 1e-5)
 
 
-def test_what_cannot_be_met_is_infeasible(case, alter):
-    """A frequency far beyond the bound at t = 0; a generator too far outside its bounds for its ramp."""
-    solver, instance = prepare(case, "TO", Settings()), short(case, 0)
-    initial = instance.model_dump(by_alias=True)["initial"]
-    fast = alter(instance, initial=initial | {"omega": dict.fromkeys(case.generators, 0.05)})
-    low = {g: case.machines[g].p_min - 0.1 for g in case.generators}
-    outside = alter(instance, initial=initial | {"power": low})
-    for impossible in (fast, outside):
-        solution = solver(impossible)
-        assert solution.status == Status.INFEASIBLE
-        assert solution.schedule is None
-        assert solution.error == Status.INFEASIBLE.sentence
-
-
-def test_time_limit_is_kept(case):
-    """No time: no claim."""
-    solution = prepare(case, "TO", Settings(time_limit_s=0.0))(short(case, 0))
-    assert solution.status == Status.TIME_LIMIT
-    assert solution.schedule is None
-
-
 def test_failures_are_said(case, monkeypatch):
     """A system that loses synchronism under every schedule."""
 

@@ -69,6 +69,8 @@ class CertificateRow:
 
 
 ROWS: Table[CertificateRow] = Table(CertificateRow)
+#: Columns that are numbers of a policy's score.
+SCORES = [name for name in ROWS.names if name in Score.__dataclass_fields__]
 
 
 class Certificate(Record):
@@ -279,7 +281,7 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
     for index in indices:
         instance = next(sample_instances(case, CERTIFICATE_SEED + seed, 1, index, servable))
         own, other = (_score(case, m, candidate.regime, s, instance) for m, s in candidate.pair)
-        cells = asdict(own) if own else {}
+        cells = {name: getattr(own, name) for name in SCORES} if own else {}
         rows.append(CertificateRow(index, "", reference=other.objective if other else None, **cells))
     return rows
 

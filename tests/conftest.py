@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ded_bench.files.strict import Record, parse_record
+from ded_bench.problem.benchmark import write_benchmark
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -89,6 +90,14 @@ def _quiet_instance(case: Case, **changes: Any) -> Instance:
 def quiet_instance() -> Callable[..., Instance]:
     """`quiet_instance(case, **fields)`: at rest at nominal power, no load ramps, unless fields say so."""
     return _quiet_instance
+
+
+@pytest.fixture(scope="module")
+def problem(threebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A benchmark folder with five instances of the three-bus chain, one for testing."""
+    folder = tmp_path_factory.mktemp("problems") / "threebus"
+    write_benchmark(threebus, 5, 2022, folder)
+    return folder
 
 
 def _constant(instance: Instance, power: Any) -> Schedule:

@@ -1,4 +1,4 @@
-"""A small benchmark folder, and files of it."""
+"""Files of the small benchmark folder."""
 
 from __future__ import annotations
 
@@ -7,22 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ded_bench.cli import main
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from tests.conftest import CASE_FILES
-
-
-@pytest.fixture(scope="module")
-def problem(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small benchmark folder on the three-bus case."""
-    folder = tmp_path_factory.mktemp("problems") / "threebus"
-    code = main(
-        ["instances", "--case", str(CASE_FILES["threebus"].parent), "--count", "5", "--out", str(folder)]
-    )
-    assert code == 0
-    return folder
 
 
 @pytest.fixture

@@ -18,17 +18,7 @@ from ded_bench.problem.case import Case
 from ded_bench.run.tasks import make_tasks, pack, solve_task
 from ded_bench.surrogates.find import model_file
 from ded_bench.surrogates.linear import linear_model
-from tests.conftest import CASE_FILES
 from tests.learned_method import LEARNED
-
-
-@pytest.fixture
-def problem(tmp_path: Path) -> Path:
-    """Five instances on the three-bus case."""
-    folder = tmp_path / "problem"
-    case = str(CASE_FILES["threebus"])
-    assert main(["instances", "--case", case, "--count", "5", "--out", str(folder)]) == 0
-    return folder
 
 
 @pytest.fixture

@@ -33,30 +33,23 @@ def random_powers(case, n: int, seed: int = 0):
 # Known numbers of the 9-bus case at nominal power, given to 4 digits.
 
 
-def test_ninebus_angles_and_slack_power(ninebus):
-    """Angles at buses s, 2..9 in rad and P_s in pu, as documented."""
+def test_ninebus_has_its_documented_numbers(ninebus):
+    """Angles at buses s, 2..9 in rad, P_s in pu, two damped pairs in rad/s.
+
+    The slack answers a load step at once: shares .53, .14 and .53 of a step at loads 5, 7 and 9, where
+    δP_s = -share · δL, L being an injection.
+    """
     network = Network(ninebus)
     theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
     known = [0, 0.1705, 0.0889, -0.0371, -0.0637, 0.0403, 0.0161, 0.0709, -0.0695]
     np.testing.assert_allclose(theta, known, rtol=0, atol=0.5e-4)
     assert network.injections(theta)[network.slack] == pytest.approx(0.67, abs=1e-12)
-
-
-def test_ninebus_modes(ninebus):
-    """Two damped pairs in rad/s, as documented."""
-    network = Network(ninebus)
-    theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
-    modes = sorted(network.linearise(theta).modes(), key=lambda mode: (mode.imag, mode.real))
+    linear = network.linearise(theta)
+    modes = sorted(linear.modes(), key=lambda mode: (mode.imag, mode.real))
     known = [-0.1722 - 1.4285j, -0.1892 - 0.6636j, -0.1892 + 0.6636j, -0.1722 + 1.4285j]
     np.testing.assert_allclose(np.real(modes), np.real(known), rtol=0, atol=0.5e-4)
     np.testing.assert_allclose(np.imag(modes), np.imag(known), rtol=0, atol=0.5e-4)
-
-
-def test_ninebus_slack_answers_a_load_step_at_once(ninebus):
-    """Shares .53, .14 and .53 of a step at loads 5, 7 and 9: δP_s = -share · δL, L being an injection."""
-    network = Network(ninebus)
-    theta = network.power_flow(ninebus.p_nominal, ninebus.load_nominal)
-    np.testing.assert_allclose(-network.linearise(theta).slack_share, [0.53, 0.14, 0.53], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(-linear.slack_share, [0.53, 0.14, 0.53], rtol=0, atol=5e-3)
 
 
 # Closed forms of the three-bus chain.

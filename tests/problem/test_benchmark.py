@@ -23,11 +23,9 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 
 
-@pytest.fixture(scope="module")
-def folder(threebus: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("problems") / "threebus"
-    write_benchmark(threebus, 5, 7, folder)
-    return folder
+@pytest.fixture
+def folder(problem: Path) -> Path:
+    return problem
 
 
 def test_splits_are_parts_of_the_whole_in_order(folder: Path, threebus: Case) -> None:

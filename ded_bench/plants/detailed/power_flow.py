@@ -6,12 +6,14 @@ exact. Loads draw constant P and Q. Everything is in pu of the network's base po
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgetrf, dgetrs
 
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
@@ -23,7 +25,9 @@ Complex = NDArray[np.complex128]
 #: without it, powers of the slack differ by up to 8e-6 pu.
 LINE_EPSILON = 1e-8
 #: Newton stops at this mismatch, pu, and gives up after so many steps.
-MISMATCH, NEWTON_STEPS = 1e-11, 30
+MISMATCH, NEWTON_STEPS = 1e-11, 60
+#: Derivatives are renewed where a step leaves more of the mismatch than this.
+KEPT = 0.1
 
 
 class OperatingPoint(NamedTuple):
@@ -61,7 +65,7 @@ class PortNetwork:
     ) -> OperatingPoint:
         """Solve for voltages, with magnitudes held where machines are; one machine's power follows.
 
-        Newton's method in polar coordinates.
+        Newton's method in polar coordinates; derivatives stay while they lead on fast.
 
         Args:
             p_machine: active power, (n_machine,), pu; that of the balancing one is not looked at.
@@ -72,8 +76,8 @@ class PortNetwork:
         Raises:
             SimulationError: there is no solution.
         """
-        n, held = len(self.ports), np.unique(self.machine_port)
-        wanted = np.zeros(n)
+        unknown, held = self._unknown, self.machine_port
+        wanted = np.zeros(len(self.ports))
         np.add.at(wanted, self.machine_port, p_machine)
         wanted -= p_drawn
         angle, size = np.angle(self.guess if guess is None else guess), np.abs(self.guess)
@@ -82,24 +86,24 @@ class PortNetwork:
             size[held] = np.abs(self.guess[held])
         if sizes is not None:
             size[held] = sizes[held]
-        balancing = self.machine_port[self.balancing]
-        turning = np.delete(np.arange(n), balancing)
-        free = np.setdiff1d(np.arange(n), held)
+        balancing, factors, before = self.machine_port[self.balancing], None, np.inf
         for _ in range(NEWTON_STEPS):
             voltage = size * np.exp(1j * (angle - angle[balancing]))
             injected = voltage * (self.admittance @ voltage).conj()
-            off = np.concatenate([(injected.real - wanted)[turning], (injected.imag + self.q_drawn)[free]])
+            off = np.concatenate([injected.real - wanted, injected.imag + self.q_drawn])[unknown]
             worst = np.abs(off).max(initial=0.0)
             if worst < MISMATCH:
                 return self._point(voltage, injected, p_machine, p_drawn)
             if not worst < np.inf:
                 break
-            try:
-                step = np.linalg.solve(self._jacobian(voltage, injected, turning, free), off)
-            except np.linalg.LinAlgError:
-                break
-            angle[turning] -= step[: n - 1]
-            size[free] -= step[n - 1 :]
+            if factors is None or worst > KEPT * before:
+                *factors, singular = dgetrf(self._jacobian(voltage, injected))
+                if singular:
+                    break
+            step = np.zeros(2 * len(wanted))
+            step[unknown], before = dgetrs(*factors, off)[0], worst
+            angle -= step[: len(wanted)]
+            size -= step[len(wanted) :]
         raise SimulationError("the power flow has no solution")
 
     def nominal(self) -> OperatingPoint:
@@ -115,14 +119,12 @@ class PortNetwork:
         """
         n = len(self.ports)
         balancing = self.machine_port[self.balancing]
-        turning = np.delete(np.arange(n), balancing)
-        free = np.setdiff1d(np.arange(n), self.machine_port)
         injected = point.voltage * (self.admittance @ point.voltage).conj()
-        by_angle, by_size = self._slopes(point.voltage, injected)
-        own = np.concatenate([by_angle.real[balancing, turning], by_size.real[balancing, free]])
-        jacobian = self._jacobian(point.voltage, injected, turning, free)
-        by_injection = np.zeros(n)
-        by_injection[turning] = np.linalg.solve(jacobian.T, own)[: n - 1]
+        slopes = self._slopes(point.voltage, injected)
+        jacobian = slopes[np.ix_(self._unknown, self._unknown)]
+        by_all = np.zeros(2 * n)
+        by_all[self._unknown] = np.linalg.solve(jacobian.T, slopes[balancing, self._unknown])
+        by_injection = by_all[:n]
         by_machine = by_injection[self.machine_port]
         drawn = -by_injection
         drawn[balancing] = 1.0
@@ -134,19 +136,26 @@ class PortNetwork:
         power[self.balancing] = delivered[self.balancing]
         return OperatingPoint(voltage, power, p_drawn)
 
-    def _slopes(self, voltage: Complex, injected: Complex) -> tuple[Complex, Complex]:
-        """Derivatives of the complex injections by angles and magnitudes, each (n_port, n_port)."""
-        coupled = voltage[:, None] * (self.admittance * voltage).conj()
-        return 1j * (np.diag(injected) - coupled), (coupled + np.diag(injected)) / np.abs(voltage)
+    @functools.cached_property
+    def _unknown(self) -> Indices:
+        """Which of all angles and magnitudes, (2 n_port,), a power flow solves for: those not held."""
+        n = len(self.ports)
+        return np.setdiff1d(np.arange(2 * n), [self.machine_port[self.balancing], *(n + self.machine_port)])
 
-    def _jacobian(self, voltage: Complex, injected: Complex, turning: Indices, free: Indices) -> Array:
-        by_angle, by_size = self._slopes(voltage, injected)
-        return np.block(
-            [
-                [by_angle.real[np.ix_(turning, turning)], by_size.real[np.ix_(turning, free)]],
-                [by_angle.imag[np.ix_(free, turning)], by_size.imag[np.ix_(free, free)]],
-            ]
-        )
+    def _slopes(self, voltage: Complex, injected: Complex) -> Array:
+        """Derivatives of injected P, Q by angles and magnitudes, (2 n_port, 2 n_port)."""
+        n, coupled = len(voltage), voltage[:, None] * (self.admittance * voltage).conj()
+        by_angle, by_size = -1j * coupled, coupled / np.abs(voltage)
+        diagonal = np.arange(n)
+        by_angle[diagonal, diagonal] += 1j * injected
+        by_size[diagonal, diagonal] += injected / np.abs(voltage)
+        slopes = np.empty((2 * n, 2 * n))
+        slopes[:n, :n], slopes[:n, n:] = by_angle.real, by_size.real
+        slopes[n:, :n], slopes[n:, n:] = by_angle.imag, by_size.imag
+        return slopes
+
+    def _jacobian(self, voltage: Complex, injected: Complex) -> Array:
+        return self._slopes(voltage, injected)[np.ix_(self._unknown, self._unknown)]
 
 
 def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> PortNetwork:

@@ -26,10 +26,10 @@ BALANCED, STAYS = 1e-9, 1e-6
 PROGRAMS, NEWTON_STEPS = 12, 12
 #: Programs with marginal losses of their own.
 RENEWED = 4
-#: What a balance on a file's rounded powers may be short of, pu.
-SHORT = 1e-6
+#: Time in which what rounding and the curvature of losses leave is made up, s.
+SHORTEST_S = 0.01
 #: What exciters may miss their references by, pu, and steps after which they find no voltages.
-REGULATED, REGULATIONS = 1e-6, 30
+REGULATED, REGULATIONS = 1e-4, 30
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,9 @@ class StaticDispatch:
         short = float(point.power.real[network.balancing] - machines[network.balancing])
         return Balance(power, point, short, slopes[self.equations.scheduled])
 
-    def cheapest(self, cost: Array, p_load: Array, start: Balance, reach: Array | None = None) -> Balance:
+    def cheapest(
+        self, cost: Array, p_load: Array, start: Balance, reach: Array | None = None, rough: bool = False
+    ) -> Balance:
         """Cheapest powers within limits and transfers that balance loads and losses.
 
         Args:
@@ -80,6 +82,8 @@ class StaticDispatch:
             start: powers and voltages near these.
             reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere. Where none
                 within reach balance the loads, they go as far as they can.
+            rough: one program is enough, whose powers may be short of the curvature of losses, and powers
+                that are out of reach are an error.
 
         Raises:
             SimulationError: no powers within limits balance the loads.
@@ -96,12 +100,12 @@ class StaticDispatch:
                 found = dataclasses.replace(found, slopes=slopes)
             power = self._program(cost, p_load, found, lower, upper)
             if power is None:
-                if reach is None:
+                if reach is None or rough:
                     break
                 return self.weigh(upper if found.short > 0 else lower, p_load, found.point.voltage)
             moved = float(np.abs(power - found.power).max())
             found = self.weigh(power, p_load, found.point.voltage)
-            if abs(found.short) < BALANCED and moved < STAYS:
+            if rough or (abs(found.short) < BALANCED and moved < STAYS):
                 return found
         raise SimulationError("no powers within limits and transfers balance loads and losses")
 
@@ -258,10 +262,8 @@ class StaticDispatch:
                 if t == times[-1] and not self.equations.system.stable(point):
                     raise SimulationError("the equilibrium is not stable")
                 if self.case.slack is None:
-                    reach = self.case.ramp * (t - before)
-                    following = self.cheapest(instance.cost_gen(self.case), load, following, reach)
-                    if abs(following.short) > SHORT:
-                        raise SimulationError("no powers within ramp limits balance them")
+                    reach = self.case.ramp * max(t - before, SHORTEST_S)
+                    following = self.cheapest(instance.cost_gen(self.case), load, following, reach, True)
             except SimulationError as error:
                 raise SimulationError(f"loads at t = {t:g} s cannot be served: {error}") from None
             before = t
@@ -270,6 +272,6 @@ class StaticDispatch:
         """Dispatch without ramp limits."""
         cost = instance.cost_gen(self.case)
         if self.case.slack is None:
-            return self.cheapest(cost, p_load, near)
+            return self.cheapest(cost, p_load, near, rough=True)
         power = merit_order(self.case, cost, instance.cost_slack(self.case), p_load)
         return self.weigh(power, p_load, near.point.voltage)

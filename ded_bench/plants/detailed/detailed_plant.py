@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Longest step times the fastest mode: Kutta's method is stable up to 2.78.
 STEP_BY_MODE = 2.0
+#: Longest step of an exact simulation, s: frequencies of shipped grids are then exact to 1e-8 Hz.
+LONGEST_S = 0.01
 #: Voltages are solved for less sharply where a linearisation follows, pu.
 PLANNING_CHANGE = 1e-8
 #: How far a time of secondary control may be from a grid point, in steps.
@@ -113,7 +115,8 @@ class DetailedPlant:
         states = DetailedStates(x, v, np.empty(n), np.empty((n, len(system.data))))
         states.x[0], states.v[0], states.held[0] = state.x, state.v, state.held
         inputs = PlantInputs(p_ref, drawn, state.v_ref, dt_s)
-        steps = max(int(np.ceil(system.fastest * dt_s / STEP_BY_MODE)), 1)
+        needed = max(system.fastest * dt_s / STEP_BY_MODE, dt_s / LONGEST_S if exact else 1.0)
+        steps = int(np.ceil(needed - 1e-9))
         try:
             done = integrate_plant(system.data, network, inputs, control, steps, states)
         except np.linalg.LinAlgError:

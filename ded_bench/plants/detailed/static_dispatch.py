@@ -261,7 +261,7 @@ class StaticDispatch:
                 point = self.regulated(found, load, v_ref)
                 if t == times[-1] and not self.equations.system.stable(point):
                     raise SimulationError("the equilibrium is not stable")
-                if self.case.slack is None:
+                if self.case.slack is None and t > 0.0:  # at 0 the balancing machine takes a remainder
                     reach = self.case.ramp * max(t - before, SHORTEST_S)
                     following = self.cheapest(instance.cost_gen(self.case), load, following, reach, True)
             except SimulationError as error:

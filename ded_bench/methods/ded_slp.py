@@ -42,6 +42,8 @@ OPEN = ACCEPTED = 2 * np.pi * 5e-7
 #: model's error is no smaller, and another trajectory is cheaper than another program. Around the first one
 #: a single program is solved, unless it comes from an earlier solution.
 REFINEMENT = 0.01
+#: So many steps may be of any length.
+FREE_STEPS = 3
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
 
@@ -138,6 +140,8 @@ class _OnPlant:
     is_near: bool  # the first schedule is thought to be near the optimum: its limits get rows at once
     limits: set[Limit] = field(default_factory=set)
     best: Simulated | None = None  # the cheapest strictly feasible one
+    steps: list[float] = field(default_factory=list)  # largest move of a set-point by each program, pu
+    radius: float = np.inf  # most that a program may move one, pu
 
     def run(self, start: Schedule) -> End[Simulated, Prediction]:
         """Go on until a simulated schedule confirms its program; P_0 replaces the start's first power."""
@@ -171,11 +175,19 @@ class _OnPlant:
 
     def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
-        program = KnotProgram(self.case, self.instance, self.bounds.tightened(MARGIN), model)
+        bounds = self.bounds.tightened(MARGIN)
+        program = KnotProgram(self.case, self.instance, bounds, model, radius=self.radius)
         if self.is_near:
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
-        return solve_with_rows_added(program, self.limits, Rows(OPEN, enough, self.soft), self.deadline)
+        rows = Rows(OPEN, enough, self.soft)
+        attempt = solve_with_rows_added(program, self.limits, rows, self.deadline)
+        if attempt.wanted is not None:
+            self.steps.append(float(np.abs(attempt.wanted - around.at).max()))
+            # Where steps do not shrink, programs jump between vertices of nearly the same cost.
+            if len(self.steps) >= FREE_STEPS and self.steps[-1] > self.steps[-2] / 2:
+                self.radius = self.steps[-1] / 2
+        return attempt
 
     def _is_confirmed(self, found: Simulated, claimed: Prediction) -> bool:
         """Whether a schedule meets the bound and costs what its program said."""

@@ -79,6 +79,7 @@ class KnotProgram:
         bounds: of outputs of ω.
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
+        radius: most that a set-point may move, pu (trust region).
     """
 
     def __init__(
@@ -88,9 +89,10 @@ class KnotProgram:
         bounds: Bounds,
         model: TimeVarying,
         reserve: Reserve | None = None,
+        radius: float = np.inf,
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
-        self.bounds, self._reserve = bounds, reserve
+        self.bounds, self._reserve, self._radius = bounds, reserve, radius
         self._case, self._instance = case, instance
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         self.pieces = piece_starts(model.points) if case.slack is not None else np.empty(0, dtype=int)
@@ -232,7 +234,8 @@ class KnotProgram:
         transfers, room = self._transfer_rows()
         lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
         lower[self._s] = 0.0
-        lower[self._u], upper[self._u] = p_min - model.p_gen[1:], p_max - model.p_gen[1:]
+        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self._radius)
+        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self._radius)
         return FreeForm(
             cost=self._cost,
             equal=self._dynamics,

@@ -77,7 +77,7 @@ def suggested_knots(case: Case, fastest_hz: float) -> int:
 
 def _peak(case: Case, instance: Instance) -> float:
     """Largest |ω| in Hz under static dispatch; ∞ where the system collapses."""
-    schedule = ed.dispatch(case, instance, ed.Options().every)
+    schedule = ed.dispatch(case, instance)
     try:
         run = simulate(case, instance, schedule)
     except SimulationError:

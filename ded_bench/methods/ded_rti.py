@@ -22,6 +22,7 @@ import dataclasses
 import functools
 from dataclasses import dataclass
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import receding_knots
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.reserve import LIMIT, Reserve
@@ -53,6 +54,8 @@ def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     case.check_regimes([regime])
     surrogate = find_surrogate(case, settings.model or TRAJECTORY, settings.search)
     options = read_options(Options, settings.options)
+    if options.reserve and case.slack is None:
+        raise InputError("--set", "reserve", f"needs a slack, which the island {case.id} has not")
     return RealTimeSolver(case, surrogate, regime, options, settings.time_limit_s)
 
 
@@ -87,8 +90,9 @@ class RealTimeSolver:
 
     @functools.cached_property
     def _reserve(self) -> Reserve | None:
-        bound = self.case.omega_bound(self.regime)
-        return Reserve.of(self.case, LIMIT * bound) if self.options.reserve else None
+        if not self.options.reserve:
+            return None
+        return Reserve.of(self.case, LIMIT * self.case.omega_bound(self.regime))
 
     def _step(self, bounds: Bounds, instance: Instance, last: Schedule | None) -> Solution:
         points, plan = receding_knots(self.case, instance, last), Plan(last, self._reserve)

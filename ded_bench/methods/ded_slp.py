@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ded_bench.methods import ed
-from ded_bench.methods.first_schedules import first_schedules
+from ded_bench.methods.first_schedules import first_schedules, static_dispatch
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
 from ded_bench.methods.knots import case_knots, is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
@@ -90,7 +89,7 @@ class SlpSolver:
         bounds = self.case.bounds(self.regime)
         parts = _OnPlant(self.case, instance, bounds, points, deadline, soft, near is not None)
         if is_reachable(self.case, instance, points):
-            start = ed.dispatch(self.case, instance, 1.0) if near is None else near
+            start = static_dispatch(self.case, instance) if near is None else near
             end = parts.run(start)
         else:
             end = End(Status.INFEASIBLE, None, None, 0, "")

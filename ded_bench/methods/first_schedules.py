@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ded_bench.methods import ed
+from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -20,8 +21,25 @@ PACE = 0.2
 
 
 def slow_dispatch(case: Case, instance: Instance, points: Indices) -> Array:
-    """The static dispatch of every second, followed slowly: powers at the knots, (n_knots, n_gen), pu."""
+    """The static dispatch of every second, followed slowly: powers at the knots, (n_knots, n_gen), pu.
+
+    On an island, where what is missing moves all frequencies, it is followed as fast as turbines can.
+    """
+    if case.slack is None:
+        return _within_ramps(case, instance, static_dispatch(case, instance), points, 1.0)
     return _within_ramps(case, instance, ed.dispatch(case, instance, 1.0), points, PACE)
+
+
+def static_dispatch(case: Case, instance: Instance) -> Schedule:
+    """The static dispatch of every second, on an island as turbines are to deliver it.
+
+    Where no powers within reach balance the loads, P_0 throughout.
+    """
+    try:
+        return ed.dispatch(case, instance, 1.0, lead=case.slack is None)
+    except SimulationError:
+        p_initial = instance.p_initial(case)
+        return Schedule(np.array([0.0, instance.horizon_s]), np.stack([p_initial, p_initial]))
 
 
 def corrected(case: Case, instance: Instance, plan: Schedule, points: Indices) -> Array:
@@ -65,5 +83,9 @@ def _shared_load(case: Case, instance: Instance) -> Array:
         Powers at all grid points, shape (n_points, n_gen), pu.
     """
     load = instance.p_load(case)[:: round(1.0 / instance.dt_s)].sum(axis=1)
-    target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
+    if case.slack is None:  # P_0 balances the first loads
+        change = (load - load[0]) / case.load_nominal.sum()
+        target = instance.p_initial(case) + np.outer(change, case.p_nominal)
+    else:
+        target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
     return ed.follow_set_points(case, instance, np.clip(target, case.p_min, case.p_max)[1:], 1.0).p

@@ -104,6 +104,14 @@ class Plant(Protocol):
             SimulationError: no powers within reach do.
         """
 
+    def set_points_delivering(self, p_gen: Array, dt_s: float) -> Array:
+        """Set-points that deliver given powers at rest and at nominal frequency, whatever ramps allow.
+
+        Args:
+            p_gen: on the grid of time, (n, n_gen), pu.
+            dt_s: its step, s.
+        """
+
     def balanced(self, instance: Instance) -> Instance:
         """A drawn instance with powers at t = 0 that are balanced, where no slack does that.
 

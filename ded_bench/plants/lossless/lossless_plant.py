@@ -132,6 +132,10 @@ class LosslessPlant:
         prices = instance.cost_gen(self.case), instance.cost_slack(self.case)
         return merit_order(self.case, *prices, instance.p_load(self.case, times))
 
+    def set_points_delivering(self, p_gen: Array, dt_s: float) -> Array:
+        """See `Plant.set_points_delivering`: set-points are delivered."""
+        return p_gen
+
     def balanced(self, instance: Instance) -> Instance:
         """The instance: its slack balances it."""
         return instance

@@ -325,12 +325,11 @@ class KnotProgram:
 
     def _transfer_rows(self) -> tuple[sp.csc_matrix, Array]:
         """What the machines of each transfer deliver at all knots but the first, and how far it may go up."""
-        case, model = self._case, self.model
-        of = np.array([[g in one.machines for g in case.generators] for one in case.transfers], dtype=float)
-        room = transfer_room(case, self._instance, model.points)
+        by_machine = self._case.transfer_rows[0]
+        room = transfer_room(self._case, self._instance, self.model.points)
         row = np.arange(room.size).reshape(room.shape)
-        blocks = [(row, self._u, np.broadcast_to(of, (self._n, *of.shape)))] if room.size else []
-        return self._matrix(room.size, blocks), (room - model.p_gen[1:] @ of.T if room.size else room).ravel()
+        blocks = [(row, self._u, np.broadcast_to(by_machine, (self._n, *by_machine.shape)))]
+        return self._matrix(room.size, blocks), (room - self.model.p_gen[1:] @ by_machine.T).ravel()
 
     def _slack_rows(self) -> sp.csc_matrix:
         """Σ δP_s - s over every piece, then -Σ δP_s - s."""

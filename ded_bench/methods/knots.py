@@ -100,11 +100,11 @@ def transfer_room(case: Case, instance: Instance, points: Indices) -> Array:
     interval beside a knot, is taken off.
     """
     p_load, grid = instance.p_load(case), np.arange(instance.steps + 1)
-    room = np.empty((len(points) - 1, len(case.transfers)))
-    for column, transfer in zip(room.T, case.transfers, strict=True):
-        drawn = [case.loads.index(bus) for bus in transfer.loads]
-        most = transfer.max - p_load[:, drawn].sum(axis=1)
-        short = np.maximum(np.interp(grid, points, most[points]) - most, 0.0)
+    _, by_load, limit = case.transfer_rows
+    most = limit - p_load @ by_load.T
+    room = most[points[1:]]
+    for column, whole in zip(room.T, most.T, strict=True):
+        short = np.maximum(np.interp(grid, points, whole[points]) - whole, 0.0)
         largest = np.maximum.reduceat(short, points[:-1])
-        column[:] = most[points[1:]] - np.maximum(largest, np.append(largest[1:], 0.0))
+        column -= np.maximum(largest, np.append(largest[1:], 0.0))
     return room

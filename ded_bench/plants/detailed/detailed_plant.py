@@ -186,16 +186,16 @@ class DetailedPlant:
         Where a slope changes, a set-point jumps by t1 t3 / t2 of the change.
         """
         data, machines = self.equations.system.data, self.equations.scheduled
-        rate_g, reheat, t3 = (data[name][machines] for name in ("rate_g", "reheat", "rate_h"))
-        t3 = 1.0 / t3
-        t2 = np.maximum(reheat * t3, dt_s)  # without the zero, jumps would be impulses
-        slope = np.diff(p_gen, axis=0, append=p_gen[-1:]) / dt_s
-        gate = p_gen + slope / rate_g
+        t1, t3 = 1.0 / data.rate_g[machines], 1.0 / data.rate_h[machines]
+        t2 = np.maximum(data.reheat[machines] * t3, dt_s)  # at zero, jumps would be impulses
+        change = np.diff(p_gen, axis=0, append=p_gen[-1:])
+        gate = p_gen + t1 * change / dt_s
         kept, lagging = np.exp(-dt_s / t2), np.empty_like(gate)
         lagging[0] = p_gen[0]
         for k in range(len(gate) - 1):
-            lagging[k + 1] = gate[k] + kept * (lagging[k] - gate[k])
-        return gate * (t3 / t2) + lagging * (1.0 - t3 / t2)
+            mean = gate[k] + change[k] / 2
+            lagging[k + 1] = mean + kept * (lagging[k] - mean)
+        return np.asarray(gate * (t3 / t2) + lagging * (1.0 - t3 / t2))
 
     def check_servable(self, instance: Instance, source: str) -> None:
         """See `Plant.check_servable`.

@@ -1,0 +1,123 @@
+"""Methods on an island: every machine is scheduled, the mean frequency and swings about it are bounded."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods import ed
+from ded_bench.methods.registry import METHODS, get_method
+from ded_bench.methods.solution import Settings
+from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
+from ded_bench.plants.plant import plant_of
+from ded_bench.plants.score import score
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Transfer
+from ded_bench.solvers.status import Status
+from tests.detailed_cases import MIXED
+
+PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots")
+HORIZON = 8.0
+
+
+@pytest.fixture(scope="module")
+def island() -> Case:
+    return Case.load(MIXED)
+
+
+@pytest.fixture
+def instance(island: Case, quiet_instance: Any) -> Instance:
+    """Loads that ramp one after another, and machines of different costs."""
+    load = {
+        bus: {"initial": value, "start": 0.5 + i, "duration": 3.0, "rate": 0.01 * value * (-1) ** i}
+        for i, (bus, value) in enumerate(zip(island.loads, island.load_nominal.tolist(), strict=True))
+    }
+    cost = {name: 0.2 + 0.1 * i for i, name in enumerate(island.generators)}
+    return quiet_instance(island, horizon_s=HORIZON, load=load, cost=cost)
+
+
+def settings(method: str) -> Settings:
+    return Settings(model="trajectory" if method == "ded-ko-knots" else None)
+
+
+@pytest.mark.parametrize("every", [None, 4.0])
+@pytest.mark.parametrize("lead", [False, True])
+def test_base_points_start_at_p_0_and_keep_limits(
+    island: Case, instance: Instance, every: float | None, lead: bool
+) -> None:
+    schedule = ed.dispatch(island, instance, every, lead)
+    p_set = schedule.at(instance.grid)
+    np.testing.assert_array_equal(p_set[0], instance.p_initial(island))
+    assert (np.abs(np.diff(p_set, axis=0)) <= island.ramp * instance.dt_s + 1e-12).all()
+    assert ((p_set >= island.p_min - 1e-12) & (p_set <= island.p_max + 1e-12)).all()
+    if not lead:
+        kinks = instance.kinks if every is None else []
+        assert set(schedule.t) == {*np.arange(0.0, HORIZON + 0.5, every or 1.0), *kinks}
+
+
+def test_turbines_deliver_what_is_led(island: Case) -> None:
+    """(1 + s t2) / ((1 + s t1)(1 + s t3)) of the set-points, by another integrator."""
+    dt_s, t = 0.01, np.arange(801) * 0.01
+    wanted = 0.5 + 0.01 * np.outer(np.clip(t - 1.0, 0.0, 3.0), np.ones(len(island.generators)))
+    p_set = plant_of(island).set_points_delivering(wanted, dt_s)
+    machines = {machine.name: machine for machine in island.detailed.machines.values()}
+    for name, column, target in zip(island.generators, p_set.T, wanted.T, strict=True):
+        governor = machines[name].governor
+        lags = np.polymul([governor.t1, 1.0], [governor.t3, 1.0])
+        _, delivered, _ = lsim((np.trim_zeros([governor.t2, 1.0]), lags), column - 0.5, t)
+        # Between grid points a jump of the set-point is a ramp; a zero t2 is a step of the grid.
+        np.testing.assert_allclose(delivered + 0.5, target, atol=3 * 0.01 * dt_s)
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_what_ded_slp_confirms_is_what_the_scorer_finds(
+    island: Case, instance: Instance, regime: str
+) -> None:
+    solution = get_method("ded-slp").prepare(island, regime, Settings())(instance)
+    assert solution.status == Status.OPTIMAL
+    found = score(island, instance, solution.schedule, regime)
+    assert found.feasible_strict
+    assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)
+
+
+def test_transfers_are_limits_of_programs(island: Case, instance: Instance) -> None:
+    """What two machines deliver beyond a load is held below what it would be, at every grid point."""
+    free = get_method("ded-slp").prepare(island, "NO", Settings())(instance).schedule.at(instance.grid)
+    by, bus = ["south", "north-a"], island.loads[0]
+    drawn = -instance.p_load(island)[:, 0]
+    of = [island.generators.index(name) for name in by]
+    beyond = free[:, of].sum(axis=1) - drawn
+    limit = (beyond[0] + beyond.max()) / 2
+    assert beyond.max() > limit + 0.01
+    transfer = Transfer(name="cut", machines=by, loads=(bus,), max=limit)
+    held = island.model_copy(update={"transfers_": (transfer,)})
+    for name in ("transfer_rows", "fingerprint"):
+        vars(held).pop(name, None)
+    solution = get_method("ded-slp").prepare(held, "NO", Settings())(instance)
+    assert solution.status == Status.OPTIMAL
+    p_set = solution.schedule.at(instance.grid)
+    assert held.transfer_excess(p_set, instance.p_load(island)).max() < 1e-6
+
+
+@pytest.mark.parametrize(("method", "share"), [("ded-rti", 2 * SOFT_TOLERANCE), ("ded-ko-knots", 0.2)])
+def test_programs_along_trajectories_nearly_keep_bounds(
+    island: Case, instance: Instance, method: str, share: float
+) -> None:
+    """ded-rti's second program is along a trajectory near its answer, the only one of the other is not."""
+    solution = get_method(method).prepare(island, "TO", settings(method))(instance)
+    found = score(island, instance, solution.schedule, "TO")
+    best = get_method("ded-slp").prepare(island, "TO", Settings())(instance)
+    assert found.objective == pytest.approx(best.solver_objective, rel=1e-3)
+    assert found.freq_violation_hz < share * island.regimes["TO"].relative_hz
+
+
+@pytest.mark.parametrize("method", sorted(set(METHODS) - set(PLANNING)))
+def test_others_refuse_with_one_line(island: Case, instance: Instance, method: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        get_method(method).prepare(island, "TO", Settings())(instance)
+    assert "\n" not in str(refusal.value)

@@ -38,6 +38,8 @@ STEP_BY_MODE = 2.0
 LONGEST_S = 0.01
 #: Voltages are solved for less sharply where a linearisation follows, pu.
 PLANNING_CHANGE = 1e-8
+#: Least t2 of an inverted governor, s: at zero, set-points would have impulses.
+LEAST_LEAD_S = 0.1
 #: How far a time of secondary control may be from a grid point, in steps.
 BETWEEN = 1e-6
 
@@ -187,7 +189,7 @@ class DetailedPlant:
         """
         data, machines = self.equations.system.data, self.equations.scheduled
         t1, t3 = 1.0 / data.rate_g[machines], 1.0 / data.rate_h[machines]
-        t2 = np.maximum(data.reheat[machines] * t3, dt_s)  # at zero, jumps would be impulses
+        t2 = np.maximum(data.reheat[machines] * t3, LEAST_LEAD_S)
         change = np.diff(p_gen, axis=0, append=p_gen[-1:])
         gate = p_gen + t1 * change / dt_s
         kept, lagging = np.exp(-dt_s / t2), np.empty_like(gate)

@@ -88,26 +88,6 @@ def _spread(name: str, values: pd.Series[float]) -> dict[str, float]:
     return {f"{name}_{part}": float(value) for part, value in zip(SPREAD, found, strict=True)}
 
 
-def claims(frame: pd.DataFrame) -> pd.DataFrame:
-    """What solvers claimed against what the scorer found, as counts per line and status."""
-    rows = []
-    for regime, key, group in groups(frame):
-        for status in [str(s) for s in Status if str(s) in set(group["status"])]:
-            part = group[group["status"] == status]
-            counts = {
-                "status": status,
-                "meaning": Status(status).sentence,
-                "rows": len(part),
-                "feasible": int((part["feasible"] == True).sum()),  # noqa: E712
-                "feasible_strict": int((part["feasible_strict"] == True).sum()),  # noqa: E712
-                "infeasible": int((part["feasible"] == False).sum()),  # noqa: E712
-                "not_scored": int(part["feasible"].isna().sum()),
-            }
-            rows.append(head(regime, key) | counts)
-    columns = ("status", "meaning", "rows", "feasible", "feasible_strict", "infeasible", "not_scored")
-    return line_table(rows, [*HEAD, *columns])
-
-
 def worst(frame: pd.DataFrame, count: int = 3) -> pd.DataFrame:
     """The worst instances of each line: largest gaps, and largest violations, of rows with their gaps.
 

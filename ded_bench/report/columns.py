@@ -148,13 +148,6 @@ VIOLATIONS = (
     *(Column(f"bound_violation_{part}", f"bounds {part}", "pu") for part in ("mean", "max")),
     *(Column(f"initial_violation_{part}", f"initial {part}", "pu") for part in ("mean", "max")),
 )
-CLAIMS = (
-    *(*_HEAD, Column("status", "status"), Column("meaning", "which means"), ROWS),
-    Column("feasible", "feasible"),
-    Column("feasible_strict", "strictly"),
-    Column("infeasible", "infeasible"),
-    Column("not_scored", "not scored"),
-)
 PROVENANCE = (
     *_HEAD,
     ROWS,
@@ -238,13 +231,6 @@ GRIDS = (
     Column("tight_hz", "tightest bound", "Hz"),
     Column("knots", "knots"),
     Column("reference", "gaps are to"),
-)
-SLOPES = (
-    *_HEAD,
-    Column("solve_s", "exponent of time", form=".2f"),
-    Column("solve_s_grids", "grids"),
-    Column("peak_memory_mib", "exponent of memory", form=".2f"),
-    Column("peak_memory_mib_grids", "grids"),
 )
 TRAININGS = (
     *(CASE, Column("name", "model or policy"), SECONDS, INSTANCES),

@@ -10,37 +10,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.lines import titled
+from ded_bench.analysis.lines import GROUP, groups, main_lines, records, titled
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.report.columns import (
-    CASE,
-    GRIDS,
-    ONLINE,
-    REGIME,
-    SLOPES,
-    TITLE,
-    TRAININGS,
-    Column,
-)
-from ded_bench.report.figures.growth import VALUES, growth_figure
+from ded_bench.analysis.summary import summary
+from ded_bench.files.errors import InputError
+from ded_bench.plants.lossless.network import Network
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, TRAININGS, Column
+from ded_bench.report.figures.growth import growth_figure
 from ded_bench.report.figures.style import save_figure
-from ded_bench.report.grids import (
-    across,
-    points,
-    read_grid,
-    sizes,
-    slopes,
-)
-from ded_bench.report.page import (
-    Block,
-    Heading,
-    Items,
-    PageTable,
-    Picture,
-    Text,
-    write_page,
-)
-from ded_bench.report.sources import Sources, trainings
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, write_page
+from ded_bench.report.sources import Sources, read_sources, trainings
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.rows import Results
 from ded_bench.run.environment import environment, now
 
 EXPLANATION = (
@@ -50,8 +32,7 @@ EXPLANATION = (
     "**Claimed → verified**: share of the instances on which the method says it succeeded, and on which the "
     "scorer finds every limit kept.",
     "Times are medians, alone on one machine with one thread (`ded-bench bench`); memory is the most that "
-    "the method's process held, all that it imports included. Exponents b are of value = a · generators^b, "
-    "by least squares on logarithms, on three grids at least.",
+    "the method's process held, all that it imports included.",
 )
 
 
@@ -96,9 +77,6 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
     def side_by_side(file: str, cell: Callable[[dict[str, Any]], str], caption: str) -> list[Block]:
         return table(file, across(found, cell), cases, caption)
 
-    values = [name for name, _ in VALUES]
-    fitted = slopes(found, values)
-    fitted = fitted[fitted[values].notna().any(axis=1)]
     operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
     excess = "Largest excess over the frequency bound, Hz"
     trained = [
@@ -115,13 +93,86 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
         ],
         "Time and memory against size": [
             *_growth(found, out),
-            *table("slopes", fitted, SLOPES, "How time and memory grow with the number of generators"),
             *side_by_side("times", _number("solve_s"), "Median time of a schedule, s"),
             *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
         ],
         "The closed loop": table("online", operated, (CASE, *ONLINE), loop),
         "Trainings": table("trainings", pd.concat(trained), TRAININGS, "What was trained"),
     }
+
+
+def read_grid(folder: Path) -> Sources:
+    """Read the results of one shipped case.
+
+    Raises:
+        InputError: no results, several cases or one that is not shipped, or a table that is wrong.
+    """
+    path = ResultsFolder(folder).results
+    if not path.is_file():
+        raise InputError(path, "", "is missing: this is no results folder")
+    names = sorted({row.case for row in Results(folder).rows.values()})
+    if len(names) != 1:
+        raise InputError(path, "case", f"is not one: {', '.join(names) or 'no rows'}")
+    case = Case.load(names[0])
+    return read_sources(case, folder, SHIPPED_CASES / case.id)
+
+
+def sizes(grids: Sequence[Sources]) -> pd.DataFrame:
+    """One row per grid: how large it is, how it oscillates, what its results are about."""
+    rows = []
+    for grid in grids:
+        case, network = grid.case, Network(grid.case)
+        modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
+        modes = modes[modes.imag > 0]
+        hertz = np.abs(modes) / (2 * np.pi)
+        rows.append(
+            {
+                "case": case.id,
+                "buses": case.n_bus,
+                "generators": len(case.generators),
+                "loads": len(case.loads),
+                "tests": grid.test_count,
+                "modes_hz": f"{hertz.min():.2g}–{hertz.max():.2g}" if len(hertz) else "–",
+                "damping": float((-modes.real / np.abs(modes)).min()) if len(modes) else np.nan,
+                "tight_hz": min(limit.largest_hz for limit in case.regimes.values()),
+                "knots": case.n_knots,
+                "judged": int(grid.judged["instance"].nunique()),
+                "reference": grid.reference.title,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def points(grids: Sequence[Sources]) -> pd.DataFrame:
+    """One row per (grid, regime, method): gaps, rates, violations, times, memory of its main line."""
+    rows = main_lines(pd.concat([grid.judged.assign(case=grid.case.id) for grid in grids], ignore_index=True))
+    parts = []
+    for grid in grids:
+        found = summary(rows[rows["case"] == grid.case.id])
+        timing = grid.timing.set_index(GROUP)
+        keys = pd.MultiIndex.from_frame(found[GROUP])
+        for name in ("solve_s", "peak_memory_mib"):
+            found[name] = timing[name].reindex(keys).to_numpy(dtype=float)
+        found["is_reference"] = found["method"] == grid.reference.method
+        parts.append(found.assign(case=grid.case.id, generators=len(grid.case.generators)))
+    return pd.concat(parts, ignore_index=True)
+
+
+def across(table: pd.DataFrame, cell: Callable[[dict[str, Any]], str]) -> pd.DataFrame:
+    """One row per regime and method, one column per grid, from the smallest to the largest.
+
+    Args:
+        table: see `points`.
+        cell: what to print of a row; empty where there is nothing.
+    """
+    order = table.drop_duplicates("case").sort_values("generators")["case"].tolist()
+    rows = []
+    for regime, _, part in groups(table):
+        cells = {str(row["case"]): cell(row) for row in records(part)}
+        if any(cells.values()):
+            known = {name: cells.get(name) or "–" for name in order}
+            rows.append({"regime": regime, "title": part["title"].iloc[0]} | known)
+    return pd.DataFrame(rows, columns=["regime", "title", *order])
 
 
 def _growth(found: pd.DataFrame, out: Path) -> list[Block]:

@@ -7,9 +7,7 @@ from pathlib import Path
 from ded_bench.problem.case import Case
 from ded_bench.report.figures import draw_figures
 from ded_bench.report.page import write_page
-from ded_bench.report.sections.closed_loop import closed_loop
-from ded_bench.report.sections.each_method import each_method, solve_times
-from ded_bench.report.sections.made_by import made_by, trained
+from ded_bench.report.sections.details import closed_loop, each_method, made_by, solve_times, trained
 from ded_bench.report.sections.opening import opening
 from ded_bench.report.sources import read_sources
 

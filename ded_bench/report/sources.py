@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,8 +18,6 @@ from ded_bench.analysis.reference import Reference, choose_reference
 from ded_bench.analysis.summary import gaps, summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import read_text
-from ded_bench.files.table import records
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.benchmark import load_manifest, load_split
@@ -184,26 +181,17 @@ def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
 
 
 def _history(path: Path) -> tuple[tuple[str, str], pd.DataFrame]:
-    table = _read_numbers(path)
+    try:
+        table = pd.read_csv(path).select_dtypes("number")
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(path, "", f"is no table of numbers ({' '.join(str(error).split())[:100]})") from None
     if "seconds" not in table or not len(table):
         raise InputError(path, "seconds", "a column with at least one number is needed")
     name = path.name.removesuffix(".history.csv")
     method = ""
     with contextlib.suppress(InputError):  # the table of trainings says what is wrong with the policy
         method = str(read_arrays(path.with_name(f"{name}.safetensors"))[1].get("method", ""))
-    return (method, name), table.select_dtypes("number")
-
-
-def _read_numbers(path: Path) -> pd.DataFrame:
-    """A table that has numbers in most columns; InputError if it is none."""
-    text = read_text(path)
-    (_, header), *rest = records(text, path) or [(0, [])]
-    for line, cells in rest:
-        if len(cells) != len(header):
-            raise InputError(path, f"line {line}", f"{len(cells)} values for {len(header)} columns")
-    if not header:
-        raise InputError(path, "", "is empty")
-    return pd.read_csv(io.StringIO(text))
+    return (method, name), table
 
 
 #: What headers of models and policies say of their training.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-from ded_bench.report.figures import history, latency, profile, schedules, tradeoff, worst_runs
+from ded_bench.report.figures import history, latency, profile, schedules, tradeoff
 from ded_bench.report.figures.style import Drawn, save_figure
 from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
@@ -14,7 +14,6 @@ FIGURES: Mapping[str, Callable[[Sources], Iterator[Drawn]]] = {
     "tradeoff": tradeoff.draw,
     "schedules": schedules.draw,
     "profile": profile.draw,
-    "worst": worst_runs.draw,
     "training": history.draw,
     "online": latency.draw,
 }

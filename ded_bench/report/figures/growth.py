@@ -4,18 +4,9 @@ from __future__ import annotations
 
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from ded_bench.report.figures.style import (
-    colour,
-    legend_below,
-    legend_height,
-    look,
-    marker,
-    new_figure,
-    plain,
-)
+from ded_bench.report.figures.style import colour, legend_below, look, marker, new_figure, plain
 from ded_bench.report.figures.tradeoff import LINEAR_GAP
 
 #: Values on a logarithmic axis.
@@ -27,14 +18,13 @@ def growth_figure(points: pd.DataFrame) -> Figure:
     """Values of each method against the number of generators; hollow where some schedules are infeasible.
 
     Args:
-        points: see `grids.points`.
+        points: see `overview.points`.
     """
     values = (*VALUES, GAP)
     regimes = sorted(points["regime"].unique())
     sizes = points.drop_duplicates("case").sort_values("generators")
-    with new_figure(0.7 + 2.3 * len(values) + legend_height(points["title"].nunique())) as figure:
+    with new_figure(0.7 + 2.3 * len(values)) as figure:
         axes = figure.subplots(len(values), len(regimes), sharex=True, sharey="row", squeeze=False)
-        handles: list[Line2D] = []
         for (name, label), row in zip(values, axes, strict=True):
             row[0].set_ylabel(label)
             for ax, regime in zip(row, regimes, strict=True):
@@ -42,7 +32,7 @@ def growth_figure(points: pd.DataFrame) -> Figure:
                 for text, family in known.sort_values("generators").groupby("title", sort=False):
                     method = str(family["method"].iloc[0])
                     style = {"marker": marker(method), "markersize": 5}
-                    handles += ax.plot(
+                    ax.plot(
                         family["generators"], family[name], label=plain(str(text)), **style, **look(method)
                     )
                     hollow = family[family["correct_rate"] < 1]
@@ -62,5 +52,5 @@ def growth_figure(points: pd.DataFrame) -> Figure:
             names = [f"{n}\n{case}" for n, case in zip(sizes["generators"], sizes["case"], strict=True)]
             ax.set_xticklabels(names, fontsize=6.5)
             ax.set_xlabel("generators besides the slack, and grid")
-        legend_below(figure, handles)
+        legend_below(figure)
     return figure

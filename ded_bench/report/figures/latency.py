@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ded_bench.analysis.lines import titled, where
 from ded_bench.analysis.online_summary import STATIC, own_latency
@@ -20,15 +19,7 @@ from ded_bench.report.figures.panels import (
     slack_panel,
     time_figure,
 )
-from ded_bench.report.figures.style import (
-    Drawn,
-    colour,
-    legend_below,
-    legend_height,
-    marker,
-    new_figure,
-    plain,
-)
+from ded_bench.report.figures.style import Drawn, colour, legend_below, marker, new_figure, plain
 from ded_bench.report.sources import Sources
 from ded_bench.results.online_results import OnlineFiles, read_trajectory
 
@@ -68,12 +59,11 @@ def latency_figure(own: pd.DataFrame, heading: str) -> Figure:
         heading: above the figure.
     """
     regimes = list(dict.fromkeys(own["regime"]))
-    with new_figure(5.4 + legend_height(own["title"].nunique(), 2)) as figure:
+    with new_figure(5.4) as figure:
         axes = figure.subplots(2, len(regimes), sharex=True, squeeze=False)
-        handles: list[Line2D] = []
         for (name, label, linear), row in zip(MEASURES, axes, strict=True):
             for regime, ax in zip(regimes, row, strict=True):
-                handles += _points(ax, own[own["regime"] == regime], name)
+                _points(ax, own[own["regime"] == regime], name)
                 ax.set_xscale("symlog", linthresh=LINEAR_S)
                 ax.set_yscale("symlog", linthresh=linear)
                 ax.set_xlim(left=-LINEAR_S / 5)
@@ -81,20 +71,18 @@ def latency_figure(own: pd.DataFrame, heading: str) -> Figure:
         for regime, top, bottom in zip(regimes, *axes, strict=True):
             top.set_title(regime)
             bottom.set_xlabel("latency (s)")
-        legend_below(figure, handles, columns=2)
+        legend_below(figure, columns=2)
         figure.suptitle(plain(heading))
     return figure
 
 
-def _points(ax: Axes, own: pd.DataFrame, name: str) -> list[Line2D]:
+def _points(ax: Axes, own: pd.DataFrame, name: str) -> None:
     """Methods at their own latency; hollow where plans do not come every second."""
-    handles = []
     for one in own.to_dict("records"):
         often = "" if one["period_s"] == 1.0 else f", every {one['period_s']:g} s"
         style: dict[str, Any] = {"marker": marker(one["method"]), "color": colour(one["method"])}
         style |= {"label": plain(one["title"] + often), "fillstyle": "none" if often else "full"}
-        handles += ax.plot([one["latency_s"]], [one[name]], linestyle="none", zorder=3, **style)
-    return handles
+        ax.plot([one["latency_s"]], [one[name]], linestyle="none", zorder=3, **style)
 
 
 def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:

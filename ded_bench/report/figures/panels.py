@@ -98,25 +98,17 @@ def slack_panel(case: Case, shown: Sequence[Shown]) -> Panel:
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
 
 
-def time_figure(
-    heading: str, panels: Sequence[Panel], columns: int, legend: bool = True, time: str = "time (s)"
-) -> Figure:
+def time_figure(heading: str, panels: Sequence[Panel], columns: int, time: str = "time (s)") -> Figure:
     """All panels, and one legend below."""
     rows = -(-len(panels) // columns)
-    with new_figure(0.9 + (1.35 if columns == 1 else 1.8) * rows) as figure:
+    with new_figure(0.7 + (1.35 if columns == 1 else 1.8) * rows) as figure:
         axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-        handles = []
         for ax, panel in zip(axes, panels, strict=False):
             for curve in panel.curves:
                 step = max(1, len(curve.t) // POINTS)
-                lines = ax.plot(
-                    curve.t[::step], curve.values[::step], label=plain(curve.label), **curve.style
-                )
-                handles += lines[:1]
+                ax.plot(curve.t[::step], curve.values[::step], label=plain(curve.label), **curve.style)
             for level in panel.limits:
-                handles.append(
-                    ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
-                )
+                ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
             ax.margins(x=0.0)
             ax.set_yscale("log" if panel.log and panel.curves else "linear")
             ax.set_ylabel(panel.label)
@@ -126,8 +118,7 @@ def time_figure(
             ax.tick_params(labelbottom=True)
         for ax in axes[len(panels) :]:
             ax.set_visible(False)
-        if legend:
-            legend_below(figure, handles)
+        legend_below(figure)
         figure.suptitle(plain(heading))
     return figure
 

@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ded_bench.analysis.lines import GROUP, main_lines
 from ded_bench.analysis.summary import performance_profile, timed_rows
-from ded_bench.report.figures.style import Drawn, legend_below, legend_height, look, new_figure, plain
+from ded_bench.report.figures.style import Drawn, legend_below, look, new_figure, plain
 from ded_bench.report.sources import Sources
 
 #: Smallest excess over the best that profiles resolve, %.
@@ -40,29 +39,26 @@ def profile_figure(times: pd.DataFrame, objectives: pd.DataFrame) -> Figure:
         times, objectives: see `summary.performance_profile`.
     """
     regimes = sorted({*times["regime"], *objectives["regime"]})
-    titles = pd.concat([times, objectives])["title"].nunique()
-    with new_figure(4.4 + legend_height(titles)) as figure:
+    with new_figure(4.4) as figure:
         axes = figure.subplots(2, len(regimes), sharey=True, sharex="row", squeeze=False)
-        handles: list[Line2D] = []
         for column, regime in zip(axes.T, regimes, strict=True):
             excess = objectives.assign(ratio=np.maximum(100.0 * (objectives["ratio"] - 1.0), SMALLEST_EXCESS))
             for ax, profile in ((column[0], times), (column[1], excess)):
-                handles += _curves(ax, profile[profile["regime"] == regime], 2.0 * profile["ratio"].max())
+                _curves(ax, profile[profile["regime"] == regime], 2.0 * profile["ratio"].max())
             column[0].set_title(regime)
             column[0].set_xlabel("solve time over the fastest")
             column[1].set_xlabel("objective above the best method's (%)")
         for ax in axes[:, 0]:
             ax.set_ylabel("share of instances")
-        legend_below(figure, handles)
+        legend_below(figure)
     return figure
 
 
-def _curves(ax: Axes, profile: pd.DataFrame, end: float) -> list[Line2D]:
+def _curves(ax: Axes, profile: pd.DataFrame, end: float) -> None:
     """A step for each instance solved; flat up to the end."""
-    handles = []
     for key, curve in profile.groupby(GROUP[1:], sort=False):
         x, y = curve["ratio"].to_numpy(dtype=float), curve["fraction"].to_numpy(dtype=float)
-        handles += ax.step(
+        ax.step(
             [x[0], *x, end],
             [0.0, *y, y[-1]],
             where="post",
@@ -71,4 +67,3 @@ def _curves(ax: Axes, profile: pd.DataFrame, end: float) -> list[Line2D]:
         )
     ax.set_xscale("log")
     ax.set_ylim(-0.03, 1.03)
-    return handles

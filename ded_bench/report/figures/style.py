@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,6 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
@@ -113,13 +112,11 @@ def _place(method: str) -> int:
     return known.index(method) if method in known else len(known)
 
 
-def legend_below(figure: Figure, handles: Sequence[Line2D], columns: int = 3) -> None:
-    """One legend under all panels, each label once, so that it never covers data."""
-    unique: Mapping[str, Line2D] = {str(handle.get_label()): handle for handle in handles}
+def legend_below(figure: Figure, columns: int = 3) -> None:
+    """One legend under all panels, each label once, so that it never covers data; the figure grows by it."""
+    unique = {
+        label: line for ax in figure.axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
     if unique:
+        figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(unique) // columns))
         figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=columns)
-
-
-def legend_height(entries: int, columns: int = 3) -> float:
-    """What a legend below takes, inches."""
-    return 0.19 * -(-entries // columns)

@@ -5,30 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter
+from matplotlib.transforms import Bbox
 
 from ded_bench.analysis.lines import on_usual_model, title
 from ded_bench.analysis.paper_numbers import Paper
 from ded_bench.analysis.summary import tradeoff
 from ded_bench.methods.options import DEFAULT
-from ded_bench.report.figures.style import (
-    GREY,
-    Drawn,
-    colour,
-    legend_below,
-    legend_height,
-    marker,
-    new_figure,
-    plain,
-)
+from ded_bench.report.figures.style import GREY, Drawn, colour, legend_below, marker, new_figure, plain
 from ded_bench.report.sources import Sources
 
 #: Gaps below this are drawn on a linear scale, larger ones on a logarithmic one, %.
 LINEAR_GAP = 0.01
+#: Where a word may stand beside its point: how it is aligned, and how far away, points.
+SIDES = (
+    *(("left", "bottom", (6, 2)), ("left", "top", (6, -2)), ("right", "top", (-6, -2))),
+    *(("right", "bottom", (-6, 2)), ("center", "bottom", (0, 6)), ("center", "top", (0, -6))),
+)
 
 
 def draw(sources: Sources) -> Iterator[Drawn]:
@@ -66,42 +64,58 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
         papers: see `paper_points`; drawn in grey.
     """
     regimes = sorted(points["regime"].unique())
-    with new_figure(0.5 + 2.9 * len(regimes) + legend_height(points["method"].nunique())) as figure:
+    with new_figure(0.5 + 2.9 * len(regimes)) as figure:
         panels = figure.subplots(len(regimes), 1, sharex=True, squeeze=False)[:, 0]
-        handles: list[Line2D] = []
         for ax, regime in zip(panels, regimes, strict=True):
             for row in papers[papers["regime"] == regime].to_dict("records"):
                 place = row["seconds"], row["gap_percent"]
                 ax.plot(*place, marker=marker(row["method"]), color=GREY, linestyle="none")
                 _word(ax, f"paper's {row['name']}", place, GREY)
             for method, family in points[points["regime"] == regime].groupby("method", sort=False):
-                handles += _draw_family(ax, str(method), family.sort_values(["seconds", "gap_percent"]))
+                _draw_family(ax, str(method), family.sort_values(["seconds", "gap_percent"]))
             ax.set_xscale("log")
             ax.set_yscale("symlog", linthresh=LINEAR_GAP)
             ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             ax.axhline(0.0, color=GREY, linewidth=0.8)
-            ax.margins(0.1, 0.14)
+            ax.margins(0.1, 0.2)
             ax.set_ylabel(f"{regime}: gap to {plain(reference)} (%)")
         panels[-1].set_xlabel("time per schedule (s), median")
-        legend_below(figure, handles)
+        legend_below(figure)
+        figure.draw_without_rendering()  # sizes are known then
+        for ax in panels:
+            _keep_apart(ax)
     return figure
 
 
-def _draw_family(ax: Axes, method: str, family: pd.DataFrame) -> list[Line2D]:
+def _draw_family(ax: Axes, method: str, family: pd.DataFrame) -> None:
     """The points of one method, from fast to slow, and a word at each line but the usual one."""
     style: dict[str, Any] = {"color": colour(method), "marker": marker(method), "markersize": 6}
     x, y = family["seconds"], family["gap_percent"]
-    handles = ax.plot(x, y, linewidth=0.6, label=plain(title(method)), **style)
+    ax.plot(x, y, linewidth=0.6, label=plain(title(method)), **style)
     hollow = family["correct_rate"] < 1
     ax.plot(x[hollow], y[hollow], linestyle="none", markerfacecolor="white", **style)
     for row in family.to_dict("records"):
         own = row["settings"] if row["settings"] != DEFAULT else row["model"]
         text = own * (row["title"] != title(method)) + " *" * (not row["alone"])
         _word(ax, text, (row["seconds"], row["gap_percent"]), colour(method))
-    return handles
 
 
 def _word(ax: Axes, text: str, place: tuple[float, float], paint: str) -> None:
-    """A word close to a point."""
-    look: dict[str, Any] = {"fontsize": 6.5, "color": paint, "rotation": 20}
-    ax.annotate(plain(text), place, xytext=(4, 3), textcoords="offset points", **look)
+    """A word close to a point (see `_keep_apart`)."""
+    ax.annotate(plain(text), place, (0, 0), textcoords="offset points", fontsize=6.5, color=paint)
+
+
+def _keep_apart(ax: Axes) -> None:
+    """Put each word on the side of its point where it covers least of other words and points."""
+    places = [ax.transData.transform(np.asarray(line.get_xydata())) for line in ax.get_lines()]
+    taken = [Bbox.from_extents(x - 6, y - 6, x + 6, y + 6) for x, y in np.concatenate(places)]
+    for word in (child for child in ax.texts if isinstance(child, Annotation) and child.get_text()):
+        boxes = {}
+        for side in SIDES:
+            word.set(ha=side[0], va=side[1])
+            word.xyann = side[2]
+            boxes[side] = word.get_window_extent()
+        ha, va, offset = min(SIDES, key=lambda side: sum(map(boxes[side].overlaps, taken)))
+        word.set(ha=ha, va=va)
+        word.xyann = offset
+        taken.append(boxes[ha, va, offset])

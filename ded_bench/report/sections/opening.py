@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.lines import on_usual_model, title
+from ded_bench.analysis.lines import GROUP, groups, on_usual_model, title
 from ded_bench.analysis.paper_numbers import result_lines
 from ded_bench.methods.options import DEFAULT
+from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
-from ded_bench.problem.case import Case
 from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate, without_paper
-from ded_bench.report.notes import alarms, data_notes, rows_caption
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
 
@@ -55,7 +53,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     five, six = _paper_tables(sources, lines)
     papers = lines["paper_solve_s"].notna()
     shown = papers if papers.any() else lines["settings"] == DEFAULT
-    said = [*_fastest(case, lines, reference.title), *_against_paper(five.frame, six.frame)]
+    said = [*_against_paper(five.frame, six.frame)]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     notes = (*data_notes(sources), *sources.notes)
     return [
@@ -88,26 +86,6 @@ def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:
         yield PageTable(tabulate(own, lines), own, caption, file)
 
 
-def _fastest(case: Case, lines: pd.DataFrame, reference: str) -> Iterator[str]:
-    """The fastest method that keeps every limit in the tightest regime (lines: see `result_lines`)."""
-    tight = min(case.regimes, key=lambda name: case.regimes[name].largest_hz)
-    timed = lines[(lines["regime"] == tight) & (lines["rows"] > 0) & lines["solve_s"].notna()]
-    good = timed[timed["correct_rate"] == 1].sort_values("solve_s", kind="stable")
-    limit = f"{tight} (|ω| ≤ {case.regimes[tight].largest_hz:g} Hz)"
-    if len(timed) and not len(good):
-        yield f"**Fast and feasible:** no timed method keeps every limit on every instance of {limit}."
-    for best in good[:1].to_dict("records"):
-        text = (
-            f"**Fast and feasible:** in {limit}, {best['title']} is the fastest method whose schedules keep "
-            f"every limit on all {best['rows']} instances: {_seconds(best['solve_s'])}"
-        )
-        if np.isfinite(best["increase_percent"]):
-            text += f" and a mean gap of {best['increase_percent']:+.2g} % to {reference}"
-        ratio = timed.loc[timed["is_reference"], "solve_s"].max() / best["solve_s"]
-        text += f", {float(f'{ratio:.2g}'):,g} times faster than that" if ratio > 1 else ""
-        yield text + "."
-
-
 def _against_paper(five: pd.DataFrame, six: pd.DataFrame) -> Iterator[str]:
     """How many cells of the paper's tables are ahead of its numbers."""
     marks = pd.concat([table.filter(like="against_paper") for table in (five, six)], axis=1)
@@ -122,5 +100,97 @@ def _against_paper(five: pd.DataFrame, six: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _seconds(value: float) -> str:
-    return f"{1e3 * value:.3g} ms" if value < 1 else f"{value:.3g} s"
+def rows_caption(sources: Sources) -> str:
+    """Which rows the tables are about, in words."""
+    frame = sources.judged
+    if not len(frame):
+        return "no rows yet"
+    instances = frame["instance"].nunique()
+    if (frame["split"] == "test").all():
+        left = len(sources.rows) - len(frame)
+        return f"{instances} test instances" + (f"; {left} other rows left out" if left else "")
+    return f"all {instances} instances, none of them of the test split"
+
+
+def alarms(sources: Sources) -> list[str]:
+    """Why a report has nothing to compare; empty if it has."""
+    case, judged, reference = sources.case, sources.judged, sources.reference
+    solve = f"ded-bench solve --case {case.id} --method {reference.method} --regime {','.join(case.regimes)}"
+    if not len(sources.rows):
+        return [f"No rows yet: `{solve}` makes some."]
+    if not judged["objective"].notna().any():
+        return ["No row has a score: every method failed, or nothing was scored yet (see the column error)."]
+    if judged["gap_percent"].notna().any():
+        return []
+    return [
+        f"No gap can be given: gaps are to {reference.title}, which has no scored row in this folder, and "
+        "the reference run that ships holds no objective for these instances of problem version "
+        f"{_versions(judged)}. `{solve}` makes rows to compare with."
+    ]
+
+
+def data_notes(sources: Sources) -> list[str]:
+    """What is missing, mixed or old."""
+    return [
+        *_problems(sources),
+        *_missing(sources),
+        *_makers(sources),
+        *_times(sources),
+    ]
+
+
+def _versions(rows: pd.DataFrame) -> str:
+    return ", ".join(version or "(none given)" for version in sorted(set(rows["problems_version"])))
+
+
+def _problems(sources: Sources) -> Iterator[str]:
+    """Rows of several problem versions, of unknown regimes, or without scores; objectives from elsewhere."""
+    rows, judged = sources.rows, sources.judged
+    versions = set(rows["problems_version"])
+    if len(versions) > 1:
+        yield f"Rows of different problem versions are not comparable: {_versions(rows)}."
+    elif sources.problems_version and versions - {sources.problems_version}:
+        yield f"Rows are of problem version {_versions(rows)}, but the files are {sources.problems_version}."
+    if strange := sorted(set(judged["regime"]) - set(sources.case.regimes)):
+        yield f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}."
+    reference = sources.reference
+    if reference.shipped:
+        yield (
+            f"{reference.shipped} objectives of {reference.title} are those of the reference run that ships "
+            "with the case, since it was not run on these instances here."
+        )
+
+
+def _missing(sources: Sources) -> Iterator[str]:
+    """Test instances without rows."""
+    tests = list(sources.instances)[: sources.test_count]
+    if tests and (sources.judged["split"] == "test").all():
+        for regime, key, rows in groups(sources.judged):
+            if missing := [name for name in tests if name not in set(rows["instance"])]:
+                names = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
+                run = f"Only {len(tests) - len(missing)} of {len(tests)} test instances were run"
+                yield f"{run}: {title(*key)} {regime} (without {names})."
+
+
+def _makers(sources: Sources) -> Iterator[str]:
+    """Rows that today's methods would not make."""
+    made = sources.judged[sources.judged["objective"].notna()]
+    today = {str(name): METHODS[str(name)].version for name in set(made["method"]) & set(METHODS)}
+    old = sorted(
+        {m for m, v in zip(made["method"], made["method_version"], strict=True) if v != today.get(m, v)}
+    )
+    if old:
+        names = ", ".join(title(method) for method in old)
+        yield f"Rows come from other versions of their methods than those installed here: {names}."
+
+
+def _times(sources: Sources) -> Iterator[str]:
+    """Times of other problems or models than the rows."""
+    timing = sources.timing
+    if set(timing["problems_version"]) - set(sources.rows["problems_version"]):
+        yield f"Times were taken on problem version {_versions(timing)}."
+    rows = sources.judged.drop_duplicates(GROUP).set_index(GROUP)["made_with"]
+    timed = sources.calls.drop_duplicates(GROUP, keep="last").set_index(GROUP)["made_with"]
+    both = timed.index.intersection(rows.index)
+    if other := [title(*key[1:]) + f" {key[0]}" for key in both if rows[key] != timed[key]]:
+        yield f"Times were taken with another model or policy than the rows: {', '.join(other)}."

@@ -1,0 +1,145 @@
+"""What stands below the first screen: methods in detail, times, trainings, the closed loop, provenance."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+import pandas as pd
+
+from ded_bench.analysis.lines import HEAD, groups, head, titled
+from ded_bench.analysis.online_summary import own_latency
+from ded_bench.analysis.summary import SMALLEST_GAP, worst
+from ded_bench.methods.options import DEFAULT
+from ded_bench.report.columns import (
+    CERTIFICATE,
+    GAPS,
+    ONLINE,
+    PROVENANCE,
+    RATES,
+    TIMING,
+    TRAINING,
+    VIOLATIONS,
+    WORST,
+)
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
+from ded_bench.report.sections.opening import rows_caption
+from ded_bench.report.sources import Sources, trainings
+from ded_bench.run.environment import environment, now
+
+CLOSED_LOOP = (
+    "Every scenario is operated for its whole length: every period, or when the last plan is due if that is "
+    "later, a method gets the measured state and a forecast, and its plan takes effect after its latency, "
+    "the median time of `timing.csv`. Cost is that of the true trajectory over the optimum of the "
+    "whole scenario with true loads (hindsight), which keeps the bound: who exceeds it may cost less.",
+    "Largest excess: of any generator at any time over the bound, the mean over scenarios. Time outside: "
+    "share of grid points with some generator more than 1e-6 Hz beyond the bound. Slack travel: Σ|ΔP_s|.",
+    "Moved by unforeseen loads: how far loads that no plan in force knew of move the frequency of some "
+    "generator, the largest of a scenario. A plan can have room for twice the bound at most.",
+    "Late: no answer within the limit of the clock. Failed: an answer without a schedule; the last plan goes "
+    "on. Infeasible: by the method's own word no schedule meets every limit, and the one of least excess is "
+    "followed.",
+)
+
+
+def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
+    """Default settings in sight, all others folded away."""
+    overview, usual = sources.summary, sources.summary["settings"] == DEFAULT
+    caption = f"Gap to {sources.reference.title}, % ({rows_caption(sources)})"
+    shares = PageTable(overview, RATES, "Claimed and verified: shares of all rows")
+    return [
+        Heading("Each method in detail"),
+        *usual_first(PageTable(overview, GAPS, caption, "summary"), usual),
+        *usual_first(shares, usual),
+        *usual_first(PageTable(overview, VIOLATIONS, "Largest violation of each schedule"), usual),
+        *_worst(worst(sources.judged)),
+    ]
+
+
+def _worst(frame: pd.DataFrame) -> list[Block]:
+    """Who breaks limits; the instances folded away."""
+    usual = frame["settings"] == DEFAULT
+    broken = frame[usual & (frame["worst_by"] == "violation")]
+    names = ", ".join(dict.fromkeys(f"{row.title} {row.regime}" for row in broken.itertuples()))
+    said = f"Limits are broken, beyond the tolerance, by {names}." if names else "No limit is broken."
+    caption = (
+        "The three largest gaps and violations of each method, default settings; "
+        f"gaps up to {SMALLEST_GAP:g} % and violations within tolerance are left out"
+    )
+    instances = usual_first(PageTable(frame, WORST, caption, "worst"), usual)
+    return [Heading("Worst instances"), Text(said), *folded("Which instances", *instances)]
+
+
+def solve_times(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
+    """Default settings in sight, all others folded away; performance profiles."""
+    made: list[Block] = [Text("No method was timed alone yet; run `ded-bench bench`.")]
+    if len(sources.timing):
+        timing = titled(pd.concat([rows for *_, rows in groups(sources.timing)]))
+        caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
+        made = usual_first(PageTable(timing, TIMING, caption), timing["settings"] == DEFAULT)
+    return [Heading("Times"), *made, *pictures["profile"]]
+
+
+def trained(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
+    """How policies were trained, and their certificates."""
+    frame = trainings(sources.results.paths.policies)
+    made: list[Block] = [Heading("Training of the policies")]
+    if len(frame):
+        filled = frame.map(lambda value: value not in ("", None)).any()
+        columns = tuple(column for column in TRAINING if filled[column.name])
+        made.append(PageTable(frame, columns, "", "training"))
+    else:
+        made.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
+    made += [*pictures["training"], Heading("Certificate")]
+    if not sources.certificates:
+        return [*made, Text("No certificate was made for these results; `ded-bench certify` makes one.")]
+    certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in sources.certificates]))
+    return [*made, PageTable(certificates, CERTIFICATE, "All that makes them up stands in certificate.json")]
+
+
+def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
+    """Nothing without rows."""
+    own = titled(own_latency(sources.online))
+    if not len(own):
+        return []
+    caption = "Methods in the closed loop at their own latency, forecasts as announced"
+    explained = folded("How to read the closed loop", Items(CLOSED_LOOP))
+    table = PageTable(own, ONLINE, caption, "online_methods")
+    return [Heading("The closed loop"), table, *explained, *pictures["online"]]
+
+
+def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
+    """Versions of every line folded away; machines and versions in sight."""
+    rows = sources.rows
+    names = ("version", "commit", "method_version", "made_with", "solver_version")
+    lines = [
+        head(regime, key) | {"rows": len(group)} | {name: _listed(group[name]) for name in names}
+        for regime, key, group in groups(sources.judged)
+    ]
+    table = PageTable(pd.DataFrame(lines, columns=[*HEAD, "rows", *names]), PROVENANCE, "", "provenance")
+
+    def distinct(name: str) -> str:
+        return "; ".join(sorted({str(value) for value in rows[name] if value})) or "–"
+
+    masters = sorted({seed.split(" ")[0] for seed in rows["seed"] if seed})
+    counts = rows["split"].replace({"train": "training", "none": "other"}).value_counts()
+    dates = sorted(date for date in rows["date"] if date) or ["–"]
+    here = "; ".join(f"{name} {value}" for name, value in environment().items())
+    items = (
+        f"Rows: {', '.join(f'{count} on {name} instances' for name, count in counts.items()) or 'none'}.",
+        f"Rows made: {dates[0]} to {dates[-1]}; problem version: {distinct('problems_version')}.",
+        f"Hosts of the rows: {distinct('host')}; parallel workers: {distinct('workers')}, one thread each.",
+        f"Versions of ded-bench: {distinct('version')}; solvers: {distinct('solver_version')}.",
+        f"Master seeds of the instances: {', '.join(masters) or '–'}.",
+        f"This report was written {now()} with: {here}.",
+    )
+    whole = folded("Versions, surrogates and policies of every line", table)
+    return [Heading("What made the rows"), *whole, Items(items)]
+
+
+def _listed(values: pd.Series[str]) -> str:
+    """Distinct values, the most frequent first; with their numbers, if there are several."""
+    counts = Counter(str(value) for value in values)
+    if len(counts) == 1:
+        return next(iter(counts))
+    return ", ".join(f"{value or 'unknown'} × {count}" for value, count in counts.most_common())

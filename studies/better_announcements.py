@@ -22,7 +22,7 @@ from ded_bench.problem.benchmark import scenario_folder
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.scenario import Scenario, ScenarioRamp, load_scenarios
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.folder import search_folders
 from ded_bench.run.online import loop
 from ded_bench.run.online.judgement import Judgement, judge_operation
 from ded_bench.run.online.planner import Planner

@@ -22,7 +22,7 @@ from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.sampling import sample_instance
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.folder import search_folders
 
 REGIME, SEED, CASE, LINE = "TO", 20241, "two-area", 10
 

@@ -8,7 +8,7 @@ its first answer away. Run it from the folder that holds this file, or with that
 
 from ded_bench import Schedule, Settings
 from ded_bench.methods.registry import get_method
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.folder import search_folders
 
 
 class NoFirstPlan:

@@ -23,10 +23,10 @@ VERSION = 3
 STRANGE = Method("ded", "tests.strange_methods", "strange")
 
 
-def solve_strange(case: Case, task: tasks.Task) -> object:
-    """`solve_task` for worker processes, which import afresh: tells them where the strange method is."""
+def solve_strange(case: Case, task: tasks.Task, plant: str) -> object:
+    """`solve_and_score` for worker processes, which import afresh: tells them where the strange method is."""
     METHODS["ded"] = STRANGE
-    return tasks.solve_task(case, task)
+    return tasks.solve_and_score(case, task, plant)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

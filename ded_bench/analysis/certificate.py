@@ -11,7 +11,6 @@ reference for such guarantees uses. An instance on which either method fails is 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
@@ -28,9 +27,9 @@ from ded_bench.files.strict import Record, read_record, write_record
 from ded_bench.files.table import Table, cell
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings, Solver, named
-from ded_bench.plants.plant import SimulationError, servable
-from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score, score
+from ded_bench.methods.solution import Settings, named
+from ded_bench.plants.plant import plant_of, servable
+from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
@@ -39,6 +38,7 @@ from ded_bench.results.legacy import upgraded
 from ded_bench.results.timing import model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
+from ded_bench.run.tasks import Task, solve_and_score
 
 #: Instances answered, re-simulated and saved together.
 CHUNK = 50
@@ -288,20 +288,9 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
 
 def _score(case: Case, method: str, regime: str, settings: Settings, instance: Instance) -> Score | None:
     """The score of an answer; None where there is no schedule, or its plant cannot follow it."""
-    solve = _prepared(case, method, regime, settings)
-    try:
-        schedule = solve(instance).schedule
-    except Exception:  # the boundary to the methods: an instance without an answer is no success
-        return None
-    try:
-        return None if schedule is None else score(case, instance, schedule, regime)
-    except SimulationError:
-        return None
-
-
-@functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    return get_method(method).prepare(case, regime, settings)
+    task = Task(instance, "", regime, method, settings, "")
+    verdict = solve_and_score(case, task, plant_of(case).name).verdict
+    return verdict if isinstance(verdict, Score) else None
 
 
 def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:

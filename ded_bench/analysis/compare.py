@@ -169,27 +169,22 @@ def _distance(x: object, y: object, relative: bool) -> float:
 
 def _summary(a: Path, b: Path) -> pd.DataFrame:
     """Mean gap and time per method over the common rows that have one in both folders."""
-    names = list(Asked._fields)
-    frames = []
+    frames, timings = [], []
     for folder in (a, b):
         frame = named(Results(folder).frame()).sort_values("date", kind="stable")
-        frames.append(_with_gaps(frame.drop_duplicates(names, keep="last")).set_index(names, drop=False))
-    common = frames[0].index.intersection(frames[1].index, sort=False)
-    x, y = (frame.loc[common] for frame in frames)
-    timings = [
-        timing_summary(read_timing(folder / "timing.csv")).set_index(GROUP)["solve_s"] for folder in (a, b)
-    ]
+        frame = _with_gaps(frame.drop_duplicates(list(Asked._fields), keep="last"))
+        frames.append(frame[[*Asked._fields, "gap_percent", "solve_s"]])
+        timings.append(timing_summary(read_timing(folder / "timing.csv")).set_index(GROUP)["solve_s"])
+    both = frames[0].merge(frames[1], on=list(Asked._fields), suffixes=("_a", "_b"))
     rows = []
-    for regime, key, part in groups(x.reset_index(drop=True)):
-        chosen = pd.MultiIndex.from_frame(part[names])
-        mine, theirs = x.loc[chosen], y.loc[chosen]
-        both = (mine["gap_percent"].notna() & theirs["gap_percent"].notna()).to_numpy()
-        ratios = (theirs["solve_s"] / mine["solve_s"].where(mine["solve_s"] > 0)).dropna()
+    for regime, key, part in groups(both):
+        known = part.dropna(subset=["gap_percent_a", "gap_percent_b"])
+        ratios = (part["solve_s_b"] / part["solve_s_a"].where(part["solve_s_a"] > 0)).dropna()
         alone = [timing.get((regime, *key), math.nan) for timing in timings]
         facts = {
             "common": len(part),
-            "gap_percent_a": float(mine["gap_percent"][both].mean()),
-            "gap_percent_b": float(theirs["gap_percent"][both].mean()),
+            "gap_percent_a": float(known["gap_percent_a"].mean()),
+            "gap_percent_b": float(known["gap_percent_b"].mean()),
             "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
             "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
         }

@@ -20,11 +20,11 @@ from ded_bench.methods.solution import Settings
 from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.folder import search_folders
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import model_name
 from ded_bench.run.pool import Workers
-from ded_bench.run.tasks import Task, make_tasks, reason_of, score_all, solve_task
+from ded_bench.run.tasks import Answered, Task, failed, make_tasks, solve_and_score
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import MODELS, TRAINED
 
@@ -101,24 +101,13 @@ def reproduce(
         ]
         for sentence in line.skipped:
             on_sentence(f"{line.name}: {sentence}")
-    calls = [(solve_again, (case, task, row.plant)) for _, row, task in tasks]
+    calls = [(solve_and_score, (case, task, row.plant)) for _, row, task in tasks]
     with Workers(workers) as pool, tqdm(total=len(tasks), unit="row", disable=None, desc="reproduce") as bar:
         for (line, row, _), answer in pool.imap(calls, tasks):
             for sentence in _compared(line, row, answer):
                 on_sentence(f"{line.name}: {sentence}")
             bar.update()
     return lines
-
-
-def solve_again(case: Case, task: Task, plant: str) -> Score | str | None:
-    """Solve and score one task in this process; else why there is no score, or None for a time limit."""
-    solution, _ = solve_task(case, task)
-    if solution.status == Status.TIME_LIMIT:
-        return None
-    if solution.schedule is None:
-        return solution.error or solution.status.sentence
-    (verdict,) = score_all(case, [(task.instance, solution.schedule, task.regime, plant)])
-    return verdict if isinstance(verdict, Score) else reason_of(verdict)
 
 
 def _sample(line: Sampled, rows: Sequence[Row], instances: Mapping[str, Instance], count: int) -> list[Row]:
@@ -160,23 +149,25 @@ def _task(
 
 def _compared(line: Sampled, row: Row, answer: object) -> Iterator[str]:
     """Note one answer; yields a sentence if it is not that of the row."""
-    if answer is None:
+    solution, verdict = answer[:2] if isinstance(answer, Answered) else (failed(answer), None)
+    if solution.status == Status.TIME_LIMIT:
         line.skipped.append(f"{row.instance}: ended by its limit this time")
         yield line.skipped[-1]
         return
     line.rows += 1
-    if not isinstance(answer, Score) or row.objective is None or row.freq_violation_hz is None:
-        line.differences.append(f"{row.instance}: no score this time ({answer})")
+    if not isinstance(verdict, Score) or row.objective is None or row.freq_violation_hz is None:
+        reason = verdict or solution.error or solution.status.sentence
+        line.differences.append(f"{row.instance}: no score this time ({reason})")
         line.objective = float("inf")
         yield line.differences[-1]
         return
-    relative = abs(answer.objective / row.objective - 1) if row.objective else abs(answer.objective)
-    hz = abs(answer.freq_violation_hz - row.freq_violation_hz)
+    relative = abs(verdict.objective / row.objective - 1) if row.objective else abs(verdict.objective)
+    hz = abs(verdict.freq_violation_hz - row.freq_violation_hz)
     line.objective, line.hz = max(line.objective, relative), max(line.hz, hz)
     if relative > OBJECTIVE_RELATIVE or hz > VIOLATION_HZ:
         line.differences.append(
-            f"{row.instance}: objective {row.objective!r}, now {answer.objective!r}; "
-            f"freq_violation_hz {row.freq_violation_hz!r}, now {answer.freq_violation_hz!r}"
+            f"{row.instance}: objective {row.objective!r}, now {verdict.objective!r}; "
+            f"freq_violation_hz {row.freq_violation_hz!r}, now {verdict.freq_violation_hz!r}"
         )
         yield line.differences[-1]
 

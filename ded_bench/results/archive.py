@@ -165,16 +165,9 @@ def _bytes(array: NDArray[np.generic]) -> bytes:
 
 
 def _array(data: bytes) -> NDArray[np.generic]:
-    """The array of a `.npy` file; ValueError if it is none, or has not the size that its header claims."""
-    stream = io.BytesIO(data)
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError("is of another version")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    body = data[stream.tell() :]
-    if dtype.hasobject:
-        raise ValueError("holds Python objects")
-    array = np.frombuffer(body, dtype)  # before the shape, so that no header makes it take memory
-    return array.reshape(shape, order="F" if fortran else "C")
+    """The array of a `.npy` file; ValueError if it is none, or holds Python objects."""
+    array: NDArray[np.generic] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    return array
 
 
 @contextlib.contextmanager

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from ded_bench.files.table import Table, cell
 from ded_bench.problem.case import Case
-from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.reference_run import reference_run
+from ded_bench.results.folder import ResultsFolder, reference_run
 from ded_bench.results.rows import Row
 
 #: Rows of drawn validation instances serve choices, not comparisons.

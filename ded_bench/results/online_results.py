@@ -38,14 +38,6 @@ class OnlineKey(NamedTuple):
     plant: str = PLANT
 
 
-class HindsightKey(NamedTuple):
-    """What makes a row of `hindsight.csv` unique."""
-
-    scenario: str
-    regime: str
-    plant: str = PLANT
-
-
 def _quality(text: str) -> str:
     if text not in QUALITIES:
         raise ValueError(text)
@@ -130,9 +122,9 @@ class HindsightRow:
     date: str = ""
 
     @property
-    def key(self) -> HindsightKey:
+    def key(self) -> tuple[str, str, str]:
         """The row's place in the table."""
-        return HindsightKey(self.scenario, self.regime, self.plant)
+        return self.scenario, self.regime, self.plant
 
 
 ONLINE = Table(OnlineRow, since="method_version", upgrade=upgraded)
@@ -178,11 +170,7 @@ class OnlineResults:
     def __init__(self, folder: Path) -> None:
         self.files = OnlineFiles(folder)
         self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
-        self.hindsight = KeyedTable[HindsightKey, HindsightRow](self.files.hindsight, HINDSIGHT)
-
-    def has(self, key: OnlineKey, fingerprint: str, version: int) -> bool:
-        """Whether there is a row of this key, from the same input and by no older version of the method."""
-        return self.table.made_from(key, fingerprint) and self.table.rows[key].method_version >= version
+        self.hindsight = KeyedTable[tuple[str, str, str], HindsightRow](self.files.hindsight, HINDSIGHT)
 
 
 def keep_trajectory(path: Path, trajectory: Trajectory) -> None:

@@ -108,41 +108,13 @@ class Row:
         return f"{self.instance}-{self.fingerprint}"
 
 
-@dataclass(frozen=True)
-class ValidatedRow:
-    """The kept schedule of one row, judged on another plant than the row's."""
-
-    case: str
-    instance: str
-    regime: str
-    method: str
-    settings: str
-    plant: str
-    model: str = ""
-    policy: str = ""
-    time_limit_s: float | None = None
-    objective: float | None = None
-    freq_violation_hz: float | None = None
-    ramp_violation: float | None = None
-    bound_violation: float | None = None
-    initial_violation: float | None = None
-    feasible: bool | None = None
-    feasible_strict: bool | None = None
-    error: str = ""
-    fingerprint: str = ""
-    mean_freq_rms_hz: float | None = None
-    mean_freq_max_hz: float | None = None
-    swing_rms_hz: float | None = None
-    swing_max_hz: float | None = None
-    excess_mean_hz: float | None = None
-    excess_relative_hz: float | None = None
-    excess_end_hz: float | None = None
-    agc_travel_pu: float | None = None
+class ValidatedRow(Row):
+    """A row whose kept schedule was judged on another plant, `plant`."""
 
     @property
-    def key(self) -> tuple[Key, str]:
+    def key(self) -> tuple[Key, str]:  # type: ignore[override]  # rows of several plants share a table
         """The row's place in the table."""
-        return Key(*(getattr(self, name) for name in Key._fields)), self.plant
+        return super().key, self.plant
 
 
 ROWS = Table(Row, since="method_version", upgrade=upgraded)
@@ -168,17 +140,10 @@ class Results(KeyedTable[Key, Row]):
         One without an objective, for which scoring has failed, needs its schedule as well. Others are
         finished without: a published folder keeps a part of its schedules only.
         """
-        if not self._made(key, fingerprint, version):
+        if not self.made_from(key, fingerprint, version):
             return False
         row = self.rows[key]
         return row.objective is not None or (row.scored and self.has_schedule(row))
-
-    def solved(self, key: Key, fingerprint: str, version: int = 0) -> bool:
-        """Whether a schedule for this row is kept, scored or not."""
-        return self._made(key, fingerprint, version) and self.has_schedule(self.rows[key])
-
-    def _made(self, key: Key, fingerprint: str, version: int) -> bool:
-        return self.made_from(key, fingerprint) and self.rows[key].method_version >= version
 
     def archive(self, row: Row) -> Archive:
         """Where the schedule of a row is kept."""

@@ -25,9 +25,8 @@ class TimingRow:
 
     `settings` are those that matter outside the closed loop. `call_s` is the whole call as its process saw
     it, `load_average` the machine's over the last minute, when the call ended: at most about 1 if bench was
-    alone. `schedule_difference_pu` is max |ΔP| between this call's schedule and the one that the results
-    folder keeps, `peak_memory_mib` the most that its process had held by the end of the call, all that it
-    imports included.
+    alone. `peak_memory_mib` is the most that its process had held by the end of the call, all that it imports
+    included.
     """
 
     run: str
@@ -41,7 +40,6 @@ class TimingRow:
     setup_s: float | None = cell(default=None, lowest=0)
     solve_s: float | None = cell(default=None, lowest=0)
     call_s: float | None = cell(default=None, lowest=0)
-    schedule_difference_pu: float | None = cell(default=None, lowest=0)
     load_average: float | None = cell(default=None, lowest=0)
     peak_memory_mib: float | None = cell(default=None, lowest=0)
     error: str = ""
@@ -93,8 +91,7 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     """Median and quartiles per case and job over instances and rounds, s; `model` is the surrogate's name.
 
     The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
-    enter no median. `load_average` is the median of the calls', `schedule_difference_pu` and
-    `peak_memory_mib` are the largest.
+    enter no median. `load_average` is the median of the calls', `peak_memory_mib` the largest.
     """
     parts: dict[tuple[str, ...], list[TimingRow]] = {}
     for row in rows:
@@ -105,7 +102,7 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
 
 _TIMES = tuple(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3"))
 _FIRST = tuple(f"first_{name}" for name in PARTS)
-_MORE = ("load_average", "schedule_difference_pu", "peak_memory_mib")
+_MORE = ("load_average", "peak_memory_mib")
 _NUMBERS = (*_TIMES, *_FIRST, *_MORE)
 _SAID = ("run", "case", "problems_version", "version", "commit", "solver_version", "host", "date", "policy")
 SUMMARY_COLUMNS = (
@@ -125,7 +122,6 @@ def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
         "repeats": max((row.round for row in warm), default=0),
         "failures": len(warm) - len(good),
         "load_average": np.median(_values(warm, "load_average") or [math.nan]),
-        "schedule_difference_pu": max(_values(warm, "schedule_difference_pu"), default=None),
         "peak_memory_mib": max(_values(warm, "peak_memory_mib"), default=None),
         "error": "" if good else next((row.error for row in warm if row.error), ""),
     }

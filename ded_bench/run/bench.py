@@ -12,7 +12,6 @@ machine, never enter it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import gc
 import hashlib
 import itertools
@@ -32,12 +31,11 @@ from ded_bench.methods.registry import Method, get_method, registered
 from ded_bench.methods.solution import Settings, Solution, Solver, named
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import Key, Results, Row
+from ded_bench.results.rows import Row
 from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name, read_timing
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
-from ded_bench.run.tasks import failed
+from ded_bench.run.tasks import failed, prepared
 from ded_bench.surrogates.find import MODELS
 
 #: Instances that are timed, unless the caller says otherwise.
@@ -78,7 +76,6 @@ def bench(
     path: Path,
     *,
     warm_up: Instance,
-    results: Results | None = None,
     rounds: int | None = None,
     force: bool = False,
     problems_version: str = "",
@@ -94,7 +91,6 @@ def bench(
         jobs: what is timed on them.
         path: of the table, which holds one run.
         warm_up: answered first in each turn, untimed; none of the timed instances.
-        results: where schedules are kept that those computed here are compared with.
         rounds: how often every job answers every instance; None: chosen by its speed (see `rounds_of`).
         force: time again what the table holds.
         problems_version: of the problem files.
@@ -124,9 +120,14 @@ def bench(
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
     kept = [] if force else [row for row in read_timing(partial) if row.run == run]
     rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
+
+    def rounds_for(job: Job) -> int:
+        first = [row for row in rows.values() if row.round == 1 and row.job == own[job].job]
+        return rounds or (rounds_of(first) if first else 1)
+
     try:
         for round_ in itertools.count(1):
-            present = [job for job in jobs if round_ <= _last_round(rows.values(), own[job], rounds)]
+            present = [job for job in jobs if round_ <= rounds_for(job)]
             if not present:
                 break
             shift = (round_ - 1) % len(present)
@@ -137,10 +138,9 @@ def bench(
                     for instance, call in zip([warm_up, *instances], calls, strict=True):
                         number = WARM_UP if instance is warm_up else round_
                         row = dataclasses.replace(own[job], run=run, round=number, instance=instance.id)
-                        row = _timed_row(row, call, _kept(case, job, own[job], instance, results))
-                        rows.setdefault(row.key, row)  # the warm-up of the first turn stands
+                        rows.setdefault(row.key, _timed_row(row, call))  # the first turn's warm-up stands
                     TIMING.write(partial, rows.values())
-                if round_ >= _last_round(rows.values(), own[job], rounds):
+                if round_ >= rounds_for(job):
                     pools[job].close()  # on large grids a process holds gigabytes
     finally:
         for pool in pools.values():
@@ -154,11 +154,6 @@ def rounds_of(rows: Iterable[TimingRow]) -> int:
     """How many rounds a job takes part in, from its calls of the first round; 1 if one of them failed."""
     seconds = [ENOUGH_S if row.call_s is None or row.error else row.call_s for row in rows]
     return next((count for count in ROUNDS if count * sum(seconds) >= ENOUGH_S), ROUNDS[-1])
-
-
-def _last_round(rows: Iterable[TimingRow], own: TimingRow, rounds: int | None) -> int:
-    first = [row for row in rows if row.round == 1 and row.job == own.job]
-    return rounds or (rounds_of(first) if first else 1)
 
 
 def _template(case: Case, job: Job, problems_version: str) -> TimingRow:
@@ -200,20 +195,9 @@ def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequ
     return [single[0][0], *(call for _, call in single)]
 
 
-def _kept(
-    case: Case, job: Job, own: TimingRow, instance: Instance, results: Results | None
-) -> Schedule | None:
-    """The schedule that a results folder keeps of a job and an instance, if any."""
-    if results is None:
-        return None
-    made_with = own.regime, own.method, own.settings, own.model, own.policy, job.settings.time_limit_s
-    row = results.rows.get(Key(case.id, instance.id, *made_with))
-    return results.schedule(row, case, instance) if row and results.has_schedule(row) else None
-
-
-def _timed_row(row: TimingRow, call: Call, kept: Schedule | None) -> TimingRow:
-    """A row with what a call told; `kept` is compared with its schedule."""
-    solution, made = call.solution, call.solution.schedule
+def _timed_row(row: TimingRow, call: Call) -> TimingRow:
+    """A row with what a call told."""
+    solution = call.solution
     return dataclasses.replace(
         row,
         status=str(solution.status),
@@ -221,10 +205,9 @@ def _timed_row(row: TimingRow, call: Call, kept: Schedule | None) -> TimingRow:
         setup_s=solution.setup_s,
         solve_s=solution.solve_s,
         call_s=call.seconds,
-        schedule_difference_pu=None if made is None or kept is None else largest_difference(made, kept),
         load_average=call.load_average,
         peak_memory_mib=call.peak_memory_mib,
-        error="" if made is not None else solution.error or solution.status.sentence,
+        error="" if solution.schedule is not None else solution.error or solution.status.sentence,
         solver_version=solution.solver_version,
         date=now(),
     )
@@ -239,7 +222,7 @@ def timed_turn(
     would empty the memory caches.
     """
     try:
-        solve = _prepared(case, method, regime, settings)
+        solve = prepared(case, method, regime, settings)
     except Exception as error:
         return [Call(failed(error), None, os.getloadavg()[0])] * (1 + len(instances))
     gc.unfreeze()
@@ -269,21 +252,6 @@ def _peak_memory_mib() -> float:
     """The most memory that this process has held, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, KiB elsewhere
-
-
-@functools.lru_cache(maxsize=1)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    solve = get_method(method).prepare(case, regime, settings)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-    return solve
-
-
-def largest_difference(a: Schedule, b: Schedule) -> float:
-    """max |ΔP| of two schedules over their common span, pu; both are linear between their points."""
-    times = np.union1d(a.t, b.t)
-    times = times[times <= min(a.t[-1], b.t[-1])]
-    return float(np.abs(a.at(times) - b.at(times)).max())
 
 
 def runs_of(

@@ -75,7 +75,7 @@ class Cluster(Workers):
 
     def __exit__(self, *_: object) -> None:
         if self._client.status == "running":
-            self._client.run(_rest, on_error="ignore")
+            self._client.run(rest, on_error="ignore")
         with contextlib.suppress(OSError):  # the scheduler is gone
             self._client.close(timeout=CONNECT_S)
 
@@ -129,5 +129,6 @@ def code_version() -> str:
     return f"{version()} ({hashlib.sha256(content).hexdigest()[:8]})"
 
 
-def _rest() -> None:
+def rest() -> None:
+    """End the processes of this Dask worker that have nothing to do."""
     _children.rest()

@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.solution import Solution, named
+from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.cluster import open_workers
 from ded_bench.run.environment import commit, host, now, version
-from ded_bench.run.pool import Workers
-from ded_bench.run.scoring import save_scores
-from ded_bench.run.tasks import Task, failed, pack, solve_task
+from ded_bench.run.scoring import scored_row
+from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score
 
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
 #: what comes before the first solve of a process, imports and the building of the model: some seconds.
@@ -35,9 +35,8 @@ def run(
 ) -> list[Row]:
     """Solve and score what the results folder lacks; every row is saved as soon as it exists.
 
-    Finished rows are skipped, solved ones are only scored. A task whose process dies three times
-    becomes a row with its error, and so does one that answers neither within its time limit nor GRACE_S
-    after it.
+    Finished rows are skipped. A task whose process dies three times becomes a row with its error, and so does
+    one that answers neither within its time limit nor GRACE_S after it.
 
     Args:
         case: of all tasks.
@@ -55,50 +54,27 @@ def run(
         InputError: no scheduler answers.
         WorkersLostError: it answers no more, or its workers cannot run this package.
     """
-    todo, unscored = unfinished(tasks, results)
-    waiting = [results.rows[task.key] for task in unscored]
+    todo, plant = unfinished(tasks, results), plant_of(case).name
     with open_workers(workers, scheduler) as pool, results.packed():
-        for row in _solve(case, todo, results, pool, problems_version, is_cluster=scheduler is not None):
-            if results.has_schedule(row):
-                waiting.append(row)
-            else:
+        sent = todo if scheduler is None else _packed(todo)
+        calls = ((solve_and_score, (case, task, plant)) for task in sent)
+        limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
+        with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
+            for task, answer in pool.imap(calls, todo, limits):
+                lost = Answered(failed(answer), None, host() if scheduler is None else "")
+                solution, verdict, where = answer if isinstance(answer, Answered) else lost
+                row = unscored_row(task, solution, plant, pool.count, problems_version, where)
+                row = row if solution.schedule is None else scored_row(row, verdict)
+                results.keep(row, solution.schedule, case)
                 on_row(row)
-        results.pack()
-        save_scores(case, waiting, {t.instance.id: t.instance for t in tasks}, results, pool, on_row)
+                bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
+                bar.update()
     return [results.rows[task.key] for task in tasks]
 
 
-def unfinished(tasks: Sequence[Task], results: Results) -> tuple[list[Task], list[Task]]:
-    """Tasks that are to be solved and scored, and those that are solved and only to be scored."""
-    todo: list[Task] = []
-    unscored: list[Task] = []
-    for task in tasks:
-        made = task.key, task.fingerprint, task.version
-        if not results.finished(*made):
-            (unscored if results.solved(*made) else todo).append(task)
-    return todo, unscored
-
-
-def _solve(
-    case: Case,
-    tasks: Sequence[Task],
-    results: Results,
-    pool: Workers,
-    problems_version: str,
-    is_cluster: bool,
-) -> Iterator[Row]:
-    """Solve tasks, and save each answer before its row is yielded."""
-    calls = [(solve_task, (case, task)) for task in (_packed(tasks) if is_cluster else tasks)]
-    limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in tasks)]
-    with tqdm(total=len(tasks), unit="row", disable=None, desc="solve") as bar:
-        for task, answer in pool.imap(calls, tasks, limits):
-            lost = failed(answer), "" if is_cluster else host()
-            solution, where = answer if isinstance(answer, tuple) else lost
-            row = unscored_row(task, solution, pool.count, problems_version, where)
-            results.keep(row, solution.schedule, case)
-            bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
-            bar.update()
-            yield row
+def unfinished(tasks: Sequence[Task], results: Results) -> list[Task]:
+    """The tasks without a finished row (see `Results.finished`)."""
+    return [task for task in tasks if not results.finished(task.key, task.fingerprint, task.version)]
 
 
 def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
@@ -108,7 +84,9 @@ def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
         yield dataclasses.replace(task, files=files(task.settings, task.artifacts))
 
 
-def unscored_row(task: Task, solution: Solution, workers: int, problems_version: str, where: str) -> Row:
+def unscored_row(
+    task: Task, solution: Solution, plant: str, workers: int, problems_version: str, where: str
+) -> Row:
     """The row of a task with what the solver claims; `where` is the host that solved it."""
     seed, objective = task.instance.seed, solution.solver_objective
     claimed = {
@@ -119,6 +97,7 @@ def unscored_row(task: Task, solution: Solution, workers: int, problems_version:
         **task.key._asdict(),
         **claimed | {"status": str(solution.status)},
         split=task.split,
+        plant=plant,
         workers=workers,
         problems_version=problems_version,
         version=version(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,14 +39,12 @@ class Check:
         rows: those that were compared, as they are scored now.
         differences: one sentence each.
         without_schedule: rows whose schedule is not kept.
-        unscored: rows with a schedule, but no score yet.
         unknown: rows of instances that are not among those given.
     """
 
     rows: list[Row]
     differences: list[str]
     without_schedule: int
-    unscored: int
     unknown: int
 
 
@@ -58,8 +55,8 @@ def verdicts(
     results: Results,
     pool: Workers,
     plant: str = "",
-) -> Iterator[list[tuple[Row, Verdict]]]:
-    """Score the kept schedules of rows, batch by batch, on the plant of each row unless another is named.
+) -> Iterator[tuple[Row, Verdict]]:
+    """Score the kept schedules of rows, in any order, on the plant of each row unless another is named.
 
     A schedule that cannot be read has an InputError, one that its plant cannot follow a SimulationError.
     """
@@ -77,7 +74,7 @@ def verdicts(
     with tqdm(total=len(rows), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
             found: list[Any] = answer if isinstance(answer, list) else [answer] * len(batch)
-            yield list(zip(batch, found, strict=True))
+            yield from zip(batch, found, strict=True)
             bar.update(len(batch))
 
 
@@ -85,48 +82,14 @@ def scored_row(row: Row, verdict: object) -> Row:
     """A row with the scorer's verdict filled in, or with the reason why there is none."""
     cells: dict[str, Any] = dict.fromkeys((*_SCORE, "feasible", "feasible_strict"))
     cells["error"] = "" if row.error.startswith(SCORING_FAILED) else row.error
-    return dataclasses.replace(row, **cells | score_cells(verdict))
-
-
-def score_cells(verdict: object) -> dict[str, Any]:
-    """What a verdict says as the cells of a row, or the error that says why there is none."""
     if not isinstance(verdict, Score):
-        return {"error": f"{SCORING_FAILED}{reason_of(verdict)}"}
-    numbers = dataclasses.asdict(verdict)
-    if not all(value is None or abs(value) <= LARGEST for value in numbers.values()):
-        return {"error": f"{SCORING_FAILED}cost or violations are above {LARGEST:g}"}
-    return numbers | {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
-
-
-def save_scores(
-    case: Case,
-    rows: Sequence[Row],
-    instances: Mapping[str, Instance],
-    results: Results,
-    pool: Workers,
-    on_row: Callable[[Row], None] = lambda row: None,
-) -> list[Row]:
-    """Score the kept schedules of rows and fill them in; returns the scored rows.
-
-    Raises:
-        InputError: a kept schedule is damaged, which is the user's to remove.
-    """
-    done: list[Row] = []
-    for batch in verdicts(case, rows, instances, results, pool):
-        for _, verdict in batch:
-            if isinstance(verdict, InputError):
-                raise verdict
-        scored = [scored_row(row, verdict) for row, verdict in batch]
-        results.add(scored)
-        for row in scored:
-            on_row(row)
-        done += scored
-    return done
-
-
-def unscored(results: Results) -> list[Row]:
-    """Rows whose schedule is kept but has no score, as after an interruption."""
-    return [row for row in results.rows.values() if not row.scored and results.has_schedule(row)]
+        cells["error"] = f"{SCORING_FAILED}{reason_of(verdict)}"
+    elif not all(value is None or abs(value) <= LARGEST for value in dataclasses.astuple(verdict)):
+        cells["error"] = f"{SCORING_FAILED}cost or violations are above {LARGEST:g}"
+    else:
+        judged = {"feasible": verdict.feasible, "feasible_strict": verdict.feasible_strict}
+        cells |= dataclasses.asdict(verdict) | judged
+    return dataclasses.replace(row, **cells)
 
 
 def rescore(
@@ -154,10 +117,9 @@ def rescore(
     kept = results.kept(instances)
     rows, differences = [], []
     with Workers(workers) as pool:
-        asked = kept if update else [row for row in kept if row.scored]
-        for old, verdict in itertools.chain.from_iterable(verdicts(case, asked, instances, results, pool)):
+        for old, verdict in verdicts(case, kept, instances, results, pool):
             rows.append(scored_row(old, verdict))
-            for sentence in _differences(old, rows[-1]) if old.scored else ():
+            for sentence in _differences(old, rows[-1]):
                 differences.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
                 on_difference(differences[-1])
     if update:
@@ -168,7 +130,6 @@ def rescore(
         rows,
         differences,
         without_schedule=len(results.rows) - unknown - len(kept),
-        unscored=0 if update else len(kept) - len(asked),
         unknown=unknown,
     )
 
@@ -184,10 +145,8 @@ def validate(
     table: KeyedTable[tuple[Key, str], ValidatedRow] = KeyedTable(results.paths.validated, VALIDATED)
     rows = []
     with Workers(workers) as pool:
-        batches = verdicts(case, results.kept(instances), instances, results, pool, plant)
-        for row, verdict in itertools.chain.from_iterable(batches):
-            cells = {"plant": plant, "fingerprint": row.fingerprint} | score_cells(verdict)
-            rows.append(ValidatedRow(**row.key._asdict(), **cells))
+        for row, verdict in verdicts(case, results.kept(instances), instances, results, pool, plant):
+            rows.append(ValidatedRow(**vars(scored_row(dataclasses.replace(row, plant=plant), verdict))))
     table.add(rows)
     table.compact()
     return rows

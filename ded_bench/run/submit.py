@@ -7,7 +7,7 @@ subfolder per regime, which goes first.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +15,16 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.plugin import SLUG
 from ded_bench.methods.registry import registered
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.plants.plant import plant_of
 from ded_bench.problem.benchmark import Selection
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.environment import host
-from ded_bench.run.runner import run, unscored_row
+from ded_bench.run.pool import Workers
+from ded_bench.run.runner import unscored_row
+from ded_bench.run.scoring import scored_row, verdicts
 from ded_bench.run.tasks import Task, fingerprint_of, key_of
 from ded_bench.solvers.status import Status
 
@@ -43,7 +46,6 @@ def submit(
     regimes: Sequence[str],
     results: Results,
     workers: int = 1,
-    on_row: Callable[[Row], None] = lambda row: None,
 ) -> Submission:
     """Score the schedules of a folder as rows of a method called `name`.
 
@@ -64,21 +66,21 @@ def submit(
         first, _, regime = wanted[0]
         such = f"{first.id}.csv or {regime}/{first.id}.csv"
         raise InputError(folder, "", f"has none of the schedules asked for (such as {such})")
-    keys, sound = [], []
+    case, plant, keys, sound = chosen.case, plant_of(chosen.case).name, [], []
     for instance, split, regime in wanted:
-        schedule, content, error = _read(chosen.case, folder, instance, regime)
+        schedule, content, error = _read(case, folder, instance, regime)
         key = key_of(instance, regime, name, Settings(), ())
-        fingerprint = fingerprint_of(chosen.case, instance, key, content)
-        task = Task(instance, split, regime, name, Settings(), fingerprint)
+        fingerprint = fingerprint_of(case, instance, key, content)
         keys.append(key)
-        if not results.solved(key, fingerprint):
-            status = Status.FAILED if schedule is None else Status.FEASIBLE
-            row = unscored_row(task, Solution(status, error=error[:300]), workers, chosen.version, host())
-            results.keep(row, schedule, chosen.case)
-            if schedule is None:
-                on_row(row)
-        sound += [task] if schedule is not None else []
-    run(chosen.case, sound, results, workers, chosen.version, on_row)  # solved already: only scored
+        if not results.finished(key, fingerprint):
+            task = Task(instance, split, regime, name, Settings(), fingerprint)
+            answer = Solution(Status.FAILED if schedule is None else Status.FEASIBLE, error=error[:300])
+            row = unscored_row(task, answer, plant, workers, chosen.version, host())
+            results.keep(row, schedule, case)
+            sound += [row] if schedule is not None else []
+    with Workers(workers) as pool, results.packed():
+        instances = {instance.id: instance for instance, _ in chosen.instances}
+        results.add(scored_row(*judged) for judged in verdicts(case, sound, instances, results, pool))
     places = [folder, *(folder / regime for regime in regimes)]
     found = {path for place in places for suffix in SUFFIXES for path in place.glob(f"*{suffix}")}
     return Submission([results.rows[key] for key in keys], sorted(found - used))

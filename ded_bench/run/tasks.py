@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.plugin import accept
@@ -102,6 +103,14 @@ def fingerprint_of(case: Case, instance: Instance, key: Key, content: str = "") 
     return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
+class Answered(NamedTuple):
+    """A method's answer, the scorer's verdict if there is a schedule, and the machine."""
+
+    solution: Solution
+    verdict: Score | Exception | None
+    host: str
+
+
 def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
     """Solve one task in this process; returns the Solution and the machine.
 
@@ -110,14 +119,15 @@ def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
     """
     started = time.perf_counter()
     try:
-        answer = _prepared(case, task.method, task.regime, task.settings, task.files)(task.instance)
+        answer = prepared(case, task.method, task.regime, task.settings, task.files)(task.instance)
         return accept(answer, case, task.instance, time.perf_counter() - started), host()
     except Exception as error:  # the boundary to other people's methods: a failure is a row
         return failed(error), host()
 
 
 @functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings, files: Files) -> Solver:
+def prepared(case: Case, method: str, regime: str, settings: Settings, files: Files = ()) -> Solver:
+    """A method that is ready to solve, kept for the next call in this process; raises as `Method.prepare`."""
     with unpacked(settings, files) if files else contextlib.nullcontext(settings) as own:
         return get_method(method).prepare(case, regime, own)
 
@@ -138,6 +148,15 @@ def score_all(case: Case, questions: Sequence[Question]) -> list[Score | Excepti
         except (InputError, SimulationError) as error:
             verdicts.append(error)
     return verdicts
+
+
+def solve_and_score(case: Case, task: Task, plant: str) -> Answered:
+    """Solve and score one task in this process."""
+    solution, where = solve_task(case, task)
+    verdict: Score | Exception | None = None
+    if solution.schedule is not None:
+        (verdict,) = score_all(case, [(task.instance, solution.schedule, task.regime, plant)])
+    return Answered(solution, verdict, where)
 
 
 def failed(error: object) -> Solution:

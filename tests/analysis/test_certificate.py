@@ -32,6 +32,7 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.tasks import prepared
 
 
 @pytest.mark.parametrize(("successes", "count"), [(1, 1), (7, 10), (995, 1000), (9950, 10_000)])
@@ -80,9 +81,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     for name in ("ded-dpc-paper", "ded"):
         monkeypatch.setitem(METHODS, name, Method(name, "tests.strange_methods", name))
     monkeypatch.setattr(certificate, "CHUNK", 2)
-    certificate._prepared.cache_clear()
+    prepared.cache_clear()
     yield lambda: collections.Counter(log.read_text().split())
-    certificate._prepared.cache_clear()
+    prepared.cache_clear()
 
 
 def candidate(regime: str) -> Candidate:

@@ -9,7 +9,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import REPOSITORY, Case
-from ded_bench.results import reference_run
+from ded_bench.results import folder
 from ded_bench.results.objectives import (
     OBJECTIVES,
     Objective,
@@ -41,7 +41,7 @@ def test_default_settings_only_and_no_instances_that_served_choices() -> None:
 
 
 def test_a_case_has_those_of_its_reference_run(threebus: Case, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(reference_run, "REFERENCE_RUNS", tmp_path)
+    monkeypatch.setattr(folder, "REFERENCE_RUNS", tmp_path)
     assert reference_objectives(threebus) == []
     path = objectives_file(tmp_path / "threebus-reference")
     OBJECTIVES.write(path, objectives_of([ROW]))
@@ -66,8 +66,8 @@ def test_committed_rows_of_success_have_a_score(folder: Path) -> None:
 
 def test_models_are_looked_for_in_the_given_folder_first(threebus: Case, tmp_path: Path, monkeypatch) -> None:
     """Then in the default results folder, then in the reference run; each once."""
-    monkeypatch.setattr(reference_run, "REFERENCE_RUNS", REPOSITORY / "results")
+    monkeypatch.setattr(folder, "REFERENCE_RUNS", REPOSITORY / "results")
     own, default = tmp_path / "own", Path("results/threebus")
     last = REPOSITORY / "results" / "threebus-reference"
-    assert reference_run.search_folders(threebus, own) == (own, default, last)
-    assert reference_run.search_folders(threebus, default) == (default, last)
+    assert folder.search_folders(threebus, own) == (own, default, last)
+    assert folder.search_folders(threebus, default) == (default, last)

@@ -48,10 +48,8 @@ def test_a_row_is_finished_when_it_is_scored_for_the_same_inputs(threebus: Case,
     for row, alone, with_schedule in cases:
         results.keep(row, None, threebus)  # the schedule of the one before goes
         assert results.finished(row.key, "f") is alone
-        assert not results.solved(row.key, "f")
         results.keep(row, schedule, threebus)
         assert results.finished(row.key, "f", 2) is with_schedule
-        assert results.solved(row.key, "f")
         assert not results.finished(row.key, "another fingerprint")
         assert not results.finished(row.key, "f", 3)  # made by an older version of the method
     assert not results.finished(row.key._replace(model="koopman@f00"), "f")

@@ -21,7 +21,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import Key, Results, Row
+from ded_bench.results.rows import Key, Row
 from ded_bench.results.timing import TimingRow, read_timing, timing_summary
 from ded_bench.run import bench as bench_module
 from ded_bench.run.bench import (
@@ -34,6 +34,7 @@ from ded_bench.run.bench import (
     timed,
 )
 from ded_bench.run.pool import WorkerDiedError, Workers
+from ded_bench.run.tasks import prepared
 from ded_bench.solvers.status import Status
 from tests.conftest import answers_here
 
@@ -87,9 +88,9 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     monkeypatch.setitem(sys.modules, "fake_method", module)
     monkeypatch.setitem(METHODS, "fake", Method("fake", "fake_method", "Fake"))
     monkeypatch.setattr(bench_module, "Workers", Inline)
-    bench_module._prepared.cache_clear()
+    prepared.cache_clear()
     yield module
-    bench_module._prepared.cache_clear()
+    prepared.cache_clear()
 
 
 @pytest.fixture
@@ -197,18 +198,6 @@ def test_a_method_that_only_fails_is_rows_with_its_error(fake, run, times) -> No
     assert ("no way" in row["error"]) or ("broken" in row["error"])
 
 
-def test_what_is_timed_is_compared_with_what_is_kept(
-    fake, run, threebus: Case, instances: list[Instance], tmp_path: Path
-) -> None:
-    results = Results(tmp_path)
-    kept = Schedule(np.array([0.0, instances[1].horizon_s]), np.array([[0.0], [0.25]]))
-    key = Key(threebus.id, instances[1].id, "TO", "fake", "default", "", "fake@one")
-    results.keep(Row(split="none", status="Optimal", **key._asdict()), kept, threebus)
-    rows = run([TO], results=results)
-    assert [row.schedule_difference_pu for row in rows] == [None, None, 0.25, None]
-    assert timing_summary(rows)["schedule_difference_pu"].to_list() == [0.25]
-
-
 def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
     first = run(BOTH)
     assert read_timing(tmp_path / "timing.csv") == first
@@ -242,7 +231,7 @@ def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
     assert not (tmp_path / "timing.csv").exists()
     assert len(read_timing(tmp_path / "timing.partial.csv")) == 4  # the turn that was complete
     fake.times = [2.0]
-    bench_module._prepared.cache_clear()
+    prepared.cache_clear()
     rows = run(BOTH)
     assert [row.solve_s for row in rows] == [1.0] * 4 + [2.0] * 4
     assert len({row.key for row in rows}) == len(rows) == 8

@@ -94,7 +94,7 @@ def make(threebus: Case, quiet_instance):
 def strange(monkeypatch: pytest.MonkeyPatch) -> None:
     """Register the misbehaving method here and in worker processes."""
     monkeypatch.setitem(METHODS, "ded", STRANGE)
-    monkeypatch.setattr(runner, "solve_task", solve_strange)
+    monkeypatch.setattr(runner, "solve_and_score", solve_strange)
 
 
 def test_rows_are_those_of_this_process(address: str, make, threebus: Case, tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_the_death_of_the_scheduler_loses_nothing_that_was_finished(
     rows = run(threebus, tasks, results)
     assert len(Results(tmp_path).rows) == 6
     assert all(row.objective is not None for row in rows)
-    for key, row in saved.items():  # solved once, only scored later
+    for key, row in saved.items():
         assert (results.rows[key].date, results.rows[key].workers) == (row.date, 2)
 
 

@@ -14,7 +14,7 @@ from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
-from ded_bench.results.rows import ROWS, Results
+from ded_bench.results.rows import ROWS, Results, Row
 from ded_bench.run import runner
 from ded_bench.run.environment import commit
 from ded_bench.run.pool import ATTEMPTS
@@ -33,7 +33,7 @@ def strange(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     log.touch()
     monkeypatch.setenv("STRANGE_LOG", str(log))
     monkeypatch.setitem(METHODS, "ded", STRANGE)
-    monkeypatch.setattr(runner, "solve_task", solve_strange)
+    monkeypatch.setattr(runner, "solve_and_score", solve_strange)
     return log
 
 
@@ -92,7 +92,7 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     (limited,) = run(threebus, tasks(dataclasses.replace(settings, time_limit_s=100.0))[:1], results)
     assert limited.key == free[0].key._replace(time_limit_s=100.0)
     assert limited.fingerprint != free[0].fingerprint
-    assert unfinished(tasks(settings), results) == ([], [])
+    assert unfinished(tasks(settings), results) == []
     assert len(results.rows) == 3
     assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
     assert (limited.policy, limited.plant) == ("", "lossless")
@@ -121,27 +121,23 @@ def test_a_row_of_an_older_version_is_made_anew(strange, make, threebus: Case, t
 
 @pytest.mark.usefixtures("inline")
 def test_a_run_leaves_one_line_per_row_even_if_interrupted(
-    strange, make, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    strange, make, threebus: Case, tmp_path: Path
 ) -> None:
-    """What was solved before the interruption is only scored by the next run."""
+    """What was solved before the interruption is not solved again."""
     results = Results(tmp_path / "out")
 
-    def interrupt(*_: object) -> None:
+    def interrupt(row: Row) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(runner, "save_scores", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run(threebus, make("calm-1"), results)
-    monkeypatch.undo()
-    monkeypatch.setitem(METHODS, "ded", STRANGE)
-    todo, unscored = unfinished(make("calm-1"), Results(tmp_path / "out"))
-    assert (todo, unscored) == ([], make("calm-1"))
-    told = [dataclasses.replace(row, error="stopped early") for row in results.rows.values()]
-    results.add(told)  # what a solver says beside its schedule is no verdict
-    assert unfinished(make("calm-1"), results) == ([], make("calm-1"))
+        run(threebus, make("calm-1"), results, on_row=interrupt)
+    (done,) = ROWS.read(results.path)
+    assert done.scored
+    (left,) = unfinished(make("calm-1"), Results(tmp_path / "out"))
+    assert left.key != done.key
     run(threebus, make("calm-1"), results)
     assert len(results.path.read_text().splitlines()) == 3
-    assert all(row.scored for row in ROWS.read(results.path))
+    assert results.rows[done.key] == done
 
 
 def test_failures_are_rows_and_the_run_goes_on(strange, make, threebus: Case, tmp_path: Path) -> None:
@@ -195,12 +191,11 @@ def test_a_failure_takes_an_earlier_schedule_away(
     results = Results(tmp_path / "out")
     (task,) = make("raise", regimes=["NO"])
     power = task.instance.p_initial(threebus)
-    earlier = unscored_row(task, Solution(Status.FEASIBLE), 1, "", "here")
+    earlier = unscored_row(task, Solution(Status.FEASIBLE), "lossless", 1, "", "here")
     earlier = dataclasses.replace(earlier, method_version=0)
     results.keep(earlier, constant(task.instance, power), threebus)
     (row,) = run(threebus, [task], results)
     assert not results.has_schedule(row)
-    assert not Results(results.folder).solved(task.key, task.fingerprint)
 
 
 def test_wrong_choices_name_the_known_ones(threebus: Case, quiet_instance) -> None:

@@ -14,8 +14,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import VALIDATED, Results, Row
-from ded_bench.run.pool import Workers
-from ded_bench.run.scoring import rescore, save_scores, scored_row, unscored, validate
+from ded_bench.run.scoring import rescore, scored_row, validate
 
 pytestmark = pytest.mark.usefixtures("inline")
 
@@ -45,7 +44,7 @@ def row_of(results: Results, name: str) -> Row:
 def test_rows_that_agree_and_rows_without_a_schedule(threebus: Case, instances, results) -> None:
     check = rescore(threebus, instances, results)
     assert [row.instance for row in check.rows] == ["a", "b", "c"]
-    assert (check.differences, check.without_schedule, check.unscored, check.unknown) == ([], 1, 0, 0)
+    assert (check.differences, check.without_schedule, check.unknown) == ([], 1, 0)
     del instances["b"]
     assert rescore(threebus, instances, results).unknown == 1
 
@@ -100,9 +99,8 @@ def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Res
     old = dataclasses.replace(row_of(results, "b"), objective=1.0)
     empty = dataclasses.replace(row_of(results, "c"), objective=None, feasible=None)
     results.add([old, empty])
-    assert rescore(threebus, instances, results).unscored == 1
     check = rescore(threebus, instances, results, update=True)
-    assert [line.split(":")[0] for line in check.differences] == ["ded default TO b"]
+    assert [line.split(":")[0] for line in check.differences] == ["ded default TO b", "ded default TO c"]
     assert Results(results.folder).rows == right
     assert len(results.path.read_text().splitlines()) == 5
 
@@ -110,20 +108,6 @@ def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Res
 def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> None:
     with pytest.raises(InputError, match=r"schedules: holds no schedule of these rows"):
         rescore(threebus, {"d": instances["d"]}, results)
-
-
-def test_what_an_interruption_left_is_scored_later(threebus: Case, instances, results) -> None:
-    """Also where the solver has something to say; rows without a schedule stay as they are."""
-    before = row_of(results, "a"), row_of(results, "d")
-    empty = dict(objective=None, feasible=None, feasible_strict=None, error="stopped early")
-    results.add([dataclasses.replace(row, status="Feasible", **empty) for row in before])
-    with Workers() as pool:
-        rows = save_scores(threebus, unscored(results), instances, results, pool)
-    assert unscored(results) == []
-    assert [row.instance for row in rows] == ["a"]
-    assert rows[0].objective == before[0].objective
-    assert rows[0].error == "stopped early"
-    assert row_of(results, "d").objective is None
 
 
 def test_other_plants_have_a_table_of_their_own(threebus: Case, instances, results) -> None:

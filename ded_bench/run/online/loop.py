@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,18 +42,11 @@ class LoopOptions:
         return max(round(self.period_s / dt_s), 1), math.ceil(self.latency_s / dt_s - WHOLE)
 
 
-@dataclass(frozen=True)
-class LoopOutcome:
-    """What happened, and how the plans came."""
+class LoopOutcome(NamedTuple):
+    """What happened, and every answer, in their order."""
 
     trajectory: Trajectory
-    plans: int  # asked for
-    late: int  # did not come in time
-    failed: int  # came without a schedule that can be followed
-    infeasible: int  # came with one, though by their method none meets every limit
-    warm: bool  # the method was given the plan in force, at least once
-    method_s: float  # the methods' own time, s of the clock
-    error: str  # the first failure
+    answers: list[Planned]
 
 
 @dataclass(frozen=True)
@@ -151,7 +145,7 @@ class _Loop:
             self._take(answer, due if self.options.predict else decision)
             decision = max(decision + period, due)
         self._go_on(last)
-        return self._outcome()
+        return LoopOutcome(self.history.trajectory(), self.asked)
 
     def _decide(self, lag: int) -> Planned:
         """Ask for a plan from `lag` steps after now, or from now on."""
@@ -204,16 +198,3 @@ class _Loop:
         wanted = self.course.at(now, until)
         power: Array = follow(wanted[None, 1:], self.history.p_set[None, now], self.case.ramp * self.dt)[0]
         return power
-
-    def _outcome(self) -> LoopOutcome:
-        missing = [answer for answer in self.asked if answer.schedule is None]
-        return LoopOutcome(
-            trajectory=self.history.trajectory(),
-            plans=len(self.asked),
-            late=sum(answer.late for answer in missing),
-            failed=sum(not answer.late for answer in missing),
-            infeasible=sum(answer.infeasible and answer.schedule is not None for answer in self.asked),
-            warm=any(answer.warm for answer in self.asked),
-            method_s=sum(answer.seconds for answer in self.asked),
-            error=missing[0].error if missing else "",
-        )

@@ -15,17 +15,15 @@ from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.registry import Method, get_method
-from ded_bench.methods.solution import Artifact, Settings, named
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings, named
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import (
-    HindsightKey,
     HindsightRow,
     OnlineFiles,
-    OnlineKey,
     OnlineResults,
     OnlineRow,
     keep_trajectory,
@@ -41,26 +39,12 @@ from ded_bench.run.tasks import reason_of
 
 @dataclass(frozen=True)
 class Operation:
-    """One row to be made. `settings` are canonical, `version` is the method's, `plant` what is operated."""
+    """One row to be made. `settings` are canonical, `row` is all that is known of it before."""
 
     scenario: Scenario
-    regime: str
-    method: str
     settings: Settings
-    version: int
     options: LoopOptions
-    limit_s: float
-    latency_source: str
-    artifacts: tuple[Artifact, ...]
-    plant: str
-    fingerprint: str
-
-    @property
-    def key(self) -> OnlineKey:
-        """The row's place in the table."""
-        o, made_with = self.options, (named(self.artifacts, "model"), named(self.artifacts, "policy"))
-        name = self.scenario.id, self.regime, self.method, self.settings.options, *made_with
-        return OnlineKey(*name, o.period_s, o.latency_s, o.forecast, o.predict, o.warm, self.plant)
+    row: OnlineRow
 
 
 def make_operations(
@@ -97,25 +81,29 @@ def make_operations(
         settings = method.canonical(given)
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
-            seconds, source = _latency(case, regime, method, settings, artifacts, latency, timing)
+            model, policy = named(artifacts, "model"), named(artifacts, "policy")
+            timed = method.canonical(settings, timed=True).options
+            job = regime, method.name, timed, model_name(model)
+            seconds, source = _latency(case, job, latency, timing)
             own = dataclasses.replace(options, latency_s=seconds)
             for scenario in scenarios:
                 made_from = *(a.fingerprint for a in artifacts), f"{limit_s:g}"
-                operations.append(
-                    Operation(
-                        scenario=scenario,
-                        regime=regime,
-                        method=method.name,
-                        settings=settings,
-                        version=method.version,
-                        options=own,
-                        limit_s=limit_s,
-                        latency_source=source,
-                        artifacts=artifacts,
-                        plant=operated.name,
-                        fingerprint=_fingerprint(case, operated.name, scenario, *made_from),
-                    )
+                row = OnlineRow(
+                    *(scenario.id, regime, method.name, settings.options),
+                    period_s=own.period_s,
+                    latency_s=seconds,
+                    forecast=own.forecast,
+                    predicted=own.predict,
+                    warm=own.warm,
+                    plant=operated.name,
+                    **_made(case, operated.name, scenario, *made_from),
+                    model=model,
+                    policy=policy,
+                    limit_s=limit_s,
+                    latency_source=source,
+                    method_version=method.version,
                 )
+                operations.append(Operation(scenario, settings, own, row))
     return operations
 
 
@@ -134,7 +122,8 @@ def operate(
     Raises:
         WorkersLostError: the workers cannot run this package.
     """
-    todo = [o for o in operations if not results.has(o.key, o.fingerprint, o.version)]
+    table = results.table
+    todo = [o for o in operations if not table.made_from(o.row.key, o.row.fingerprint, o.row.method_version)]
     with Workers(workers) as pool:
         _look_back(case, todo, results, pool)
         calls = ((operate_one, (case, o, results.files)) for o in todo)
@@ -142,38 +131,40 @@ def operate(
             for operation, answer in pool.imap(calls, todo):
                 row = answer if isinstance(answer, OnlineRow) else _row(operation, error=reason_of(answer))
                 row = _compared(row, results)
-                results.table.add([row])
+                table.add([row])
                 on_row(row)
                 bar.update()
-    return [results.table.rows[o.key] for o in operations]
+    return [table.rows[o.row.key] for o in operations]
 
 
 def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineRow:
     """Operate one scenario in this process, and keep its trajectory."""
-    o, started, plant = operation, time.perf_counter(), plant_of(case, operation.plant)
-    planner = Planner(case, o.regime, o.method, o.settings, o.limit_s)
-    outcome = run_loop(case, o.scenario, planner, o.options, plant)
-    judgement = judge_operation(case, o.scenario, outcome.trajectory, o.regime)
-    keep_trajectory(files.trajectory(o.key), outcome.trajectory)
-    row = _row(o, judgement, reason_of(outcome.error) if outcome.error else "")
-    loop_s = time.perf_counter() - started - outcome.method_s
+    o, asked, started = operation, operation.row, time.perf_counter()
+    plant = plant_of(case, asked.plant)
+    planner = Planner(case, asked.regime, asked.method, o.settings, asked.limit_s or LIMIT_S)
+    trajectory, answers = run_loop(case, o.scenario, planner, o.options, plant)
+    judgement = judge_operation(case, o.scenario, trajectory, asked.regime)
+    keep_trajectory(files.trajectory(asked.key), trajectory)
+    missing = [answer for answer in answers if answer.schedule is None]
+    row = _row(o, judgement, reason_of(missing[0].error) if missing else "")
+    method_s = sum(answer.seconds for answer in answers)
+    loop_s = time.perf_counter() - started - method_s
     return dataclasses.replace(
         row,
         unforeseen_hz=unforeseen_hz(case, o.scenario, o.options, plant),
-        plans=outcome.plans,
-        late=outcome.late,
-        failed=outcome.failed,
-        infeasible=outcome.infeasible,
-        warm_used=outcome.warm,
-        method_s=outcome.method_s,
+        plans=len(answers),
+        late=sum(answer.late for answer in missing),
+        failed=sum(not answer.late for answer in missing),
+        infeasible=sum(answer.infeasible and answer.schedule is not None for answer in answers),
+        warm_used=any(answer.warm for answer in answers),
+        method_s=method_s,
         loop_s=loop_s,
     )
 
 
-def look_back(case: Case, scenario: Scenario, regime: str, plant: str, files: OnlineFiles) -> HindsightRow:
+def look_back(case: Case, scenario: Scenario, row: HindsightRow, files: OnlineFiles) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
-    found = hindsight(case, scenario, regime, plant_of(case, plant))
-    row = _hindsight_row(case, scenario, regime, plant)
+    found = hindsight(case, scenario, row.regime, plant_of(case, row.plant))
     keep_trajectory(files.hindsight_trajectory(*row.key), found.trajectory)
     return dataclasses.replace(
         row,
@@ -187,22 +178,22 @@ def look_back(case: Case, scenario: Scenario, regime: str, plant: str, files: On
 
 def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:
     """Find the hindsight of every scenario and regime that is not there yet."""
-    asked = {(o.scenario.id, o.regime, o.plant): (o.scenario, o.regime, o.plant) for o in todo}
-    wanted = {one: _hindsight_row(case, *one) for one in asked.values()}
-    missing = [
-        one for one, row in wanted.items() if not results.hindsight.made_from(row.key, row.fingerprint)
+    asked = {(o.row.scenario, o.row.regime, o.row.plant): o.scenario for o in todo}
+    wanted = [
+        (scenario, HindsightRow(*key, **_made(case, key[2], scenario))) for key, scenario in asked.items()
     ]
+    missing = [one for one in wanted if not results.hindsight.made_from(one[1].key, one[1].fingerprint)]
     calls = ((look_back, (case, *one, results.files)) for one in missing)
-    for one, answer in tqdm(
+    for (_, row), answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
     ):
-        failed = dataclasses.replace(wanted[one], error=reason_of(answer))
+        failed = dataclasses.replace(row, error=reason_of(answer))
         results.hindsight.add([answer if isinstance(answer, HindsightRow) else failed])
 
 
 def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:
     """A row with its cost over hindsight, where both are known."""
-    best = results.hindsight.rows[HindsightKey(row.scenario, row.regime, row.plant)].objective
+    best = results.hindsight.rows[row.scenario, row.regime, row.plant].objective
     if row.objective is None or not best:
         return row
     return dataclasses.replace(row, increase_percent=100 * (row.objective / best - 1))
@@ -212,42 +203,23 @@ def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> O
     numbers = {} if judgement is None else dataclasses.asdict(judgement)
     if any(not abs(value) <= LARGEST for value in numbers.values()):
         numbers, error = {}, f"cost or violations are above {LARGEST:g}"
-    return OnlineRow(
-        **o.key._asdict(),
-        **numbers,
-        **_made(o.fingerprint),
-        error=error,
-        limit_s=o.limit_s,
-        latency_source=o.latency_source,
-        case=o.scenario.case,
-        method_version=o.version,
-    )
+    return dataclasses.replace(o.row, **numbers, error=error, date=now())
 
 
-def _hindsight_row(case: Case, scenario: Scenario, regime: str, plant: str) -> HindsightRow:
-    made = _made(_fingerprint(case, plant, scenario))
-    return HindsightRow(scenario=scenario.id, regime=regime, plant=plant, case=case.id, **made)
-
-
-def _made(fingerprint: str) -> dict[str, Any]:
-    """What made a row, where and when."""
-    facts = {"fingerprint": fingerprint, "version": version(), "commit": commit()}
-    return facts | {"host": host(), "date": now()}
+def _made(case: Case, plant: str, scenario: Scenario, *parts: str) -> dict[str, Any]:
+    """What makes a row, where and when; `parts`: what else decides on it."""
+    # A plant whose data are the case's has its fingerprint, which then counts once.
+    data = dict.fromkeys([case.fingerprint, plant_of(case, plant).fingerprint])
+    text = "|".join([*data, scenario.fingerprint, *parts])
+    facts = {"case": case.id, "fingerprint": hashlib.sha256(text.encode()).hexdigest()[:12]}
+    return facts | {"version": version(), "commit": commit(), "host": host(), "date": now()}
 
 
 def _latency(
-    case: Case,
-    regime: str,
-    method: Method,
-    settings: Settings,
-    artifacts: Sequence[Artifact],
-    latency: str,
-    timing: Sequence[Path],
+    case: Case, job: tuple[str, str, str, str], latency: str, timing: Sequence[Path]
 ) -> tuple[float, str]:
     """Seconds from measurement to plan, and where they are from."""
     if latency == "timing":
-        timed = method.canonical(settings, timed=True).options
-        job = regime, method.name, timed, model_name(named(artifacts, "model"))
         return timed_latency(case, job, timing), "timing"
     if latency == "zero":
         return 0.0, "zero"
@@ -282,11 +254,3 @@ def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[
             return float(np.median(times))
     problem = "is not timed; run `ded-bench bench`, or give --latency in seconds"
     raise InputError("--latency timing", " ".join(filter(None, (*job[1:], job[0]))), problem)
-
-
-def _fingerprint(case: Case, plant: str, scenario: Scenario, *parts: str) -> str:
-    """Twelve hex digits that change with case, plant, scenario and what else decides on a row."""
-    # A plant whose data are the case's has its fingerprint, which then counts once.
-    data = dict.fromkeys([case.fingerprint, plant_of(case, plant).fingerprint])
-    text = "|".join([*data, scenario.fingerprint, *parts])
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

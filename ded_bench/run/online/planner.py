@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import atexit
 import functools
-import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ded_bench.methods.plugin import accept
-from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings, Solution, Solver
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.run.pool import Children, NoAnswerError, WorkerDiedError
+from ded_bench.run.pool import NoAnswerError, WorkerDiedError, Workers
 from ded_bench.run.runner import GRACE_S
+from ded_bench.run.tasks import prepared
 from ded_bench.solvers.status import Status
 
 #: How long a method may take for one plan unless told otherwise, s of the clock.
@@ -74,25 +73,19 @@ class Planner:
 
 def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:
     """What a function answers in the other process, or the exception that came instead."""
-    answer = _children().call(pickle.dumps((function, arguments)), limit_s)
-    if not isinstance(answer, bytes):
-        return answer
-    try:
-        found: object = pickle.loads(answer)  # from our own child
-    except Exception as error:  # an exception class may want more than its message
-        return RuntimeError(f"the answer cannot be read: {error}")
-    return found
+    ((_, answer),) = _workers().imap([(function, arguments)], [None], [limit_s])
+    return answer
 
 
 @functools.cache
-def _children() -> Children:
-    children = Children()
-    atexit.register(children.close)
-    return children
+def _workers() -> Workers:
+    workers = Workers()
+    atexit.register(workers.close)
+    return workers
 
 
 def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:
-    _prepared(case, method, regime, settings)
+    prepared(case, method, regime, settings)
     return True
 
 
@@ -101,14 +94,9 @@ def _solve(
 ) -> tuple[Solution, bool]:
     """Solve in this process as in operation, if the method knows how; tells if it was given the last plan."""
     started = time.perf_counter()
-    solver = _prepared(case, method, regime, settings)
+    solver = prepared(case, method, regime, settings)
     operate = getattr(solver, "solve", None)
     start = None if last is None else Solution(Status.FEASIBLE, last)
     answer = solver(instance) if operate is None else operate(instance, last=start)
     warm = operate is not None and start is not None
     return accept(answer, case, instance, time.perf_counter() - started), warm
-
-
-@functools.lru_cache(maxsize=4)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
-    return get_method(method).prepare(case, regime, settings)

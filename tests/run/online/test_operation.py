@@ -97,7 +97,7 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
     assert len(made) == 1
     assert [row.objective for row in again] == [row.objective for row in first_run[0]]
     changed = operations(threebus, scenarios, limit_s=30.0)
-    assert not any(results.table.made_from(o.key, o.fingerprint) for o in changed)
+    assert not any(results.table.made_from(o.row.key, o.row.fingerprint) for o in changed)
 
 
 @pytest.mark.usefixtures("inline")
@@ -128,8 +128,8 @@ def timed(case, scenarios, folder, rows, method, settings) -> float:
     chosen, loaded = [(method, settings)], load_scenarios(scenarios[:1], case)
     folders = [folder / "nothing", folder]
     (found,) = make_operations(case, loaded, chosen, ["TO"], LoopOptions(), "timing", folders)
-    assert found.latency_source == "timing"
-    assert found.key.settings == settings.options
+    assert found.row.latency_source == "timing"
+    assert found.row.settings == settings.options
     return found.options.latency_s
 
 

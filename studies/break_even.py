@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from ded_bench.report.grids import read_grid
+from ded_bench.report.overview import read_grid
 
 from ded_bench.analysis.lines import GROUP, line_table, records
 from ded_bench.analysis.summary import summary

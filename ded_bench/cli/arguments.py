@@ -1,9 +1,11 @@
-"""What the `ded-bench` commands accept: options, defaults, help."""
+"""What the `ded-bench` commands accept and say: options, defaults, help, lines on stderr."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Generator
+import math
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -11,7 +13,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
-from ded_bench.run.environment import version
+from ded_bench.problem.benchmark import SPLITS
 from ded_bench.surrogates.find import MODELS
 
 #: The shipped case that is meant where none is named.
@@ -21,11 +23,47 @@ CASE_HELP = "name of a shipped case, or a folder"
 METHOD_HELP = "see `ded-bench methods`; or module:function"
 MODEL_HELP = f"{', '.join(MODELS)}, or a file"
 
-#: The order of the list of commands: those of the road, then what judges results, then the closed loop.
-ORDER = (
-    *("cases", "instances", "methods", "train-ko", "solve", "train-dpc", "bench", "report"),
-    *("score", "reproduce", "compare", "certify", "scenarios", "online", "overview"),
-)
+
+def names(text: str) -> tuple[str, ...]:
+    """Read names separated by commas, each once."""
+    found = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not found:
+        raise argparse.ArgumentTypeError("names nothing")
+    return tuple(dict.fromkeys(found))
+
+
+def _number(kind: Callable[[str], float], least: float, said: str) -> Callable[[str], Any]:
+    """What reads a finite number of at least `least`."""
+
+    def read(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = -1
+        if not least <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {said}")
+        return value
+
+    return read
+
+
+natural = _number(int, 0, "a whole number")
+positive = _number(int, 1, "a whole number of at least 1")
+not_negative = _number(float, 0, "a number of at least 0")
+positive_number = _number(float, sys.float_info.min, "a number above 0")
+
+#: Options that commands share (see `declare`).
+SHARED: dict[str, dict[str, Any]] = {
+    "--case": {"default": DEFAULT_CASE, "help": CASE_HELP},
+    "--regime": {"type": names, "metavar": "R[,R]", "help": "default: all of the case"},
+    "--set": {"default": DEFAULT, "metavar": "NAME=VALUE[,...]", "help": "options of the one method"},
+    "--model": {"default": "", "help": f"{MODEL_HELP}; default: the method's own"},
+    "--policy": {"type": Path, "help": "policy file; default: the trained one"},
+    "--seed": {"type": natural, "default": 0, "help": "of what is drawn"},
+    "--workers": {"type": positive, "default": 1, "metavar": "N", "help": "processes here"},
+    "--results": {"type": Path, "help": RESULTS_HELP},
+    "--out": {"type": Path, "help": RESULTS_HELP},
+}
 #: Under the list of commands, which must fit a terminal 80 columns wide.
 ROAD = (
     "The road: instances, train-ko, solve, train-dpc, solve, bench, report; `make report` walks it. "
@@ -67,24 +105,6 @@ class OneLinePerCommand(argparse.HelpFormatter):
         super().__init__(prog, max_help_position=16, width=79)
         self._action_max_length = 14  # argparse forgets that commands are indented once more
 
-    def _iter_indented_subactions(self, action: argparse.Action) -> Generator[argparse.Action, None, None]:
-        def place(command: argparse.Action) -> int:
-            return ORDER.index(command.dest) if command.dest in ORDER else len(ORDER)
-
-        if isinstance(action, argparse._SubParsersAction):
-            self._indent()
-            yield from sorted(action._get_subactions(), key=place)
-            self._dedent()
-
-
-class ShowVersion(argparse.Action):
-    """Print the package's version, looked up only then."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        """Print one line and exit with code 0."""
-        print(f"{parser.prog} {version()}")
-        parser.exit()
-
 
 def command(commands: Any, name: str, text: str) -> Parser:
     """Add a command; `text` is its line in the list of commands."""
@@ -95,13 +115,25 @@ def command(commands: Any, name: str, text: str) -> Parser:
     return made
 
 
+def declare(p: argparse._ActionsContainer, *options: str) -> None:
+    """Declare some of the options that commands share."""
+    for name in options:
+        p.add_argument(name, **SHARED[name])
+
+
 def add_methods(p: Parser) -> None:
     """Declare which methods answer, in which regimes, and with what."""
     p.add_argument("--method", type=names, required=True, metavar="M[,M]", help=METHOD_HELP)
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--set", default=DEFAULT, metavar="NAME=VALUE[,...]", help="options of the one method")
-    p.add_argument("--model", default="", help=f"{MODEL_HELP}; default: the method's own")
-    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
+    declare(p, "--regime", "--set", "--model", "--policy")
+
+
+def add_instances(p: Parser) -> None:
+    """Declare which instances are answered or judged."""
+    chosen = p.add_mutually_exclusive_group()
+    chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances")
+    chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
+    p.add_argument("--limit", type=positive, help="only the first so many of the split")
+    p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
 
 
 def chosen_methods(
@@ -118,41 +150,11 @@ def chosen_methods(
     return [(method.name, method.canonical(given)) for method in map(get_method, a.method)]
 
 
-def names(text: str) -> tuple[str, ...]:
-    """Read names separated by commas, each once."""
-    found = tuple(part.strip() for part in text.split(",") if part.strip())
-    if not found:
-        raise argparse.ArgumentTypeError("names nothing")
-    return tuple(dict.fromkeys(found))
+def say(sentence: str) -> None:
+    """Tell on stderr what a command is about to do, before the imports and the work that take seconds."""
+    print(f"ded-bench: {sentence}", file=sys.stderr, flush=True)
 
 
-def natural(text: str) -> int:
-    """Read a whole number of at least 0."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number")
-    return int(text)
-
-
-def positive(text: str) -> int:
-    """Read a whole number of at least 1."""
-    if (value := natural(text)) < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Read a finite number of at least 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
-    return value
-
-
-def positive_number(text: str) -> float:
-    """Read a finite number above 0."""
-    if (value := not_negative(text)) == 0:
-        raise argparse.ArgumentTypeError("must be above 0")
-    return value
+def counted(n: int, noun: str) -> str:
+    """A number of things: `1 row`, `2 rows`."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 
 from ded_bench.cli import (
     evaluation_commands,
-    method_commands,
     online_commands,
     problem_commands,
     solve_commands,
     training_commands,
 )
-from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser, ShowVersion
+from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser
 from ded_bench.files.errors import InputError
+from ded_bench.run.environment import version
 from ded_bench.run.pool import WorkersLostError
 
 
@@ -28,12 +28,11 @@ def parser() -> argparse.ArgumentParser:
         epilog=ROAD,
         formatter_class=OneLinePerCommand,
     )
-    top.add_argument("--version", action=ShowVersion, nargs=0, help="show the version and exit")
+    shown = f"%(prog)s {version()}"
+    top.add_argument("--version", action="version", version=shown, help="show the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for group in (
-        *(problem_commands, method_commands, solve_commands, training_commands),
-        *(evaluation_commands, online_commands),
-    ):
+    groups = problem_commands, training_commands, solve_commands, evaluation_commands, online_commands
+    for group in groups:
         group.add_commands(commands)
     return top
 

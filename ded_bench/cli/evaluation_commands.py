@@ -3,62 +3,48 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
-    CASE_HELP,
-    DEFAULT_CASE,
-    MODEL_HELP,
-    RESULTS_HELP,
     command,
+    counted,
+    declare,
     names,
-    natural,
     not_negative,
     positive,
     positive_number,
+    say,
 )
-from ded_bench.cli.messages import counted, say
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.reference_run import default_results, reference_run, search_folders
-from ded_bench.run.pool import Workers
+from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
 from ded_bench.solvers.status import Status
 
 if TYPE_CHECKING:
-    from ded_bench.results.rows import Results
+    pass
 
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "bench", "time methods in turns, alone on the machine, one thread")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    declare(p, "--case", "--results")
     p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
     p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
     p.add_argument("--repeats", type=positive, help="rounds; default: by the method's speed")
     p.add_argument("--force", action="store_true", help="time again what the table holds")
-    p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.add_argument("--out", type=Path, help="table of the run; default: timing.csv in the results folder")
     p.set_defaults(run=_bench)
 
     p = command(commands, "certify", "certify a policy on fresh instances")
     p.add_argument("--method", default="ded-dpc", help="a policy")
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--set", default="default", metavar="NAME=VALUE[,...]", help="options of the policy")
-    p.add_argument("--model", default="", help=MODEL_HELP)
-    p.add_argument("--policy", type=Path, help="policy file; default: the trained one")
+    declare(p, "--regime", "--set", "--model", "--policy", "--case", "--seed", "--workers", "--results")
     p.add_argument("--count", type=positive, default=10_000, metavar="M", help="how many fresh instances")
-    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     p.add_argument("--gap", type=positive_number, default=1.0, metavar="PERCENT", help="over ded-ko-knots")
     p.add_argument("--tolerance", type=positive_number, default=1e-6, metavar="HZ", help="of the frequency")
     p.add_argument("--delta", type=positive_number, default=0.01, help="1 - confidence")
-    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
-    p.add_argument("--results", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_certify)
 
     p = command(commands, "compare", "what changed between two results folders")
@@ -72,9 +58,8 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_compare)
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--workers", type=positive, default=min(os.cpu_count() or 1, 4), help="that score")
-    p.add_argument("--results", type=Path, help=RESULTS_HELP)
+    declare(p, "--case", "--results")
+    p.add_argument("--workers", type=positive, help="of no effect any more: rows are scored when solved")
     p.set_defaults(run=_report)
 
     p = command(commands, "overview", "one page over several grids: gaps, violations, time and memory")
@@ -118,7 +103,6 @@ def _bench(a: argparse.Namespace) -> int:
         jobs,
         a.out or ResultsFolder(results.folder).timing,
         warm_up=validation_instances(case, 1, servable=servable)[0],
-        results=results,
         rounds=a.repeats,
         force=a.force,
         problems_version=chosen.version,
@@ -167,23 +151,6 @@ def _compare(a: argparse.Namespace) -> int:
     return 0 if found.same else 1
 
 
-def _score_waiting(place: str, results: Results, workers: int) -> None:
-    """Score what an interrupted run has solved but not scored, and say so; else it would count as failed."""
-    from ded_bench.run.scoring import save_scores, unscored
-
-    waiting = unscored(results)
-    for split in ("all", "validation"):
-        asked = [row for row in waiting if (row.split == "validation") == (split == "validation")]
-        if not asked:
-            continue
-        chosen = select_split(place, split)
-        instances = {instance.id: instance for instance, _ in chosen.instances}
-        known = [row for row in asked if row.instance in instances]
-        with Workers(workers) as pool:
-            rows = save_scores(chosen.case, known, instances, results, pool)
-        say(f"{counted(len(rows), 'row')} solved but not scored: scored now")
-
-
 def _report(a: argparse.Namespace) -> int:
     from ded_bench.results.rows import Results
 
@@ -194,7 +161,6 @@ def _report(a: argparse.Namespace) -> int:
     from ded_bench.report.report import write_report
     from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
 
-    _score_waiting(a.case, Results(folder), a.workers)
     written = write_report(case, folder, problem_folder(a.case, case))
     OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")

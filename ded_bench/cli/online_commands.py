@@ -8,23 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
-    CASE_HELP,
-    DEFAULT_CASE,
-    RESULTS_HELP,
     add_methods,
     chosen_methods,
     command,
+    counted,
+    declare,
     names,
     positive,
     positive_number,
+    say,
 )
-from ded_bench.cli.messages import counted, say
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.scenario import load_scenarios
-from ded_bench.results.reference_run import default_results, search_folders
+from ded_bench.results.folder import default_results, search_folders
 
 if TYPE_CHECKING:
     from ded_bench.results.online_results import OnlineRow
@@ -35,25 +34,15 @@ def add_commands(commands: Any) -> None:
     """Declare this command and its options."""
     p = command(commands, "online", "operate scenarios with a method's plans, one row each")
     add_methods(p)
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    declare(p, "--case", "--workers", "--out")
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--scenarios", type=positive, metavar="N", help="only the first N of the case")
     chosen.add_argument("--scenario", type=Path, nargs="+", metavar="FILE", help="instead of the case's")
     p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans")
-    p.add_argument(
-        "--latency",
-        type=names,
-        default=("timing",),
-        metavar="L[,L]",
-        help="timing, zero, or seconds",
-    )
-    p.add_argument(
-        "--forecast",
-        type=_qualities,
-        default=QUALITIES[:1],
-        metavar="F[,F]",
-        help=", ".join(QUALITIES),
-    )
+    latency = "timing, zero, or seconds"
+    p.add_argument("--latency", type=names, default=("timing",), metavar="L[,L]", help=latency)
+    qualities = ", ".join(QUALITIES)
+    p.add_argument("--forecast", type=_qualities, default=QUALITIES[:1], metavar="F[,F]", help=qualities)
     p.add_argument(
         "--state",
         choices=("predicted", "present"),
@@ -63,8 +52,6 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--plant", choices=PLANTS, help="what is operated; default: the case's own")
     p.add_argument("--cold", action="store_true", help="never start a method from its last plan")
     p.add_argument("--time-limit", type=positive_number, metavar="S", help="per plan, of the clock (60 s)")
-    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
-    p.add_argument("--out", type=Path, help=RESULTS_HELP)
     p.set_defaults(run=_online)
 
 

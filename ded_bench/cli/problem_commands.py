@@ -1,18 +1,20 @@
-"""Commands that make, list and check problems."""
+"""Commands that list methods, and make, list and check problems."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ded_bench.cli.arguments import CASE_HELP, DEFAULT_CASE, command, natural, positive
-from ded_bench.cli.messages import counted, say
+from ded_bench.cli.arguments import command, counted, declare, natural, positive, say
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
+from ded_bench.methods.options import described
+from ded_bench.methods.registry import Method, get_method, registered
 from ded_bench.problem.benchmark import (
     Manifest,
     copy_case,
@@ -40,9 +42,13 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--count", type=positive, default=50, help="instances to draw and simulate")
     p.set_defaults(run=_cases)
 
+    p = command(commands, "methods", "list methods, their options and defaults")
+    p.add_argument("name", nargs="?", metavar="NAME", help="only this one; default: all")
+    p.set_defaults(run=_methods)
+
     p = command(commands, "instances", "draw the benchmark's instances (paper, Table III)")
     same = "default: as in the split that the case has, else"
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    declare(p, "--case")
     p.add_argument("--count", type=positive, help=f"how many to draw ({same} {COUNT})")
     p.add_argument("--test", type=positive, help=f"how many are for testing ({same} a fifth)")
     p.add_argument("--seed", type=natural, help=f"master seed ({same} {SEED})")
@@ -52,8 +58,7 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "scenarios", "draw minutes of operation for the closed loop")
     p.add_argument("--count", type=positive, default=SCENARIOS, help="how many to draw")
-    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    declare(p, "--case", "--seed")
     p.add_argument("--out", type=Path, help="default: scenarios in the case's own folder")
     p.add_argument("--force", action="store_true", help="replace other scenarios of a versioned case")
     p.set_defaults(run=_scenarios)
@@ -125,6 +130,24 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
             if not (folder / file).is_file() or (folder / file).read_bytes() != content:
                 write_atomically(folder / file, content)
     return drawn
+
+
+def _methods(a: argparse.Namespace) -> int:
+    chosen = [get_method(a.name)] if a.name else registered().values()
+    print("\n".join(line for method in chosen for line in lines_of(method)))
+    return 0
+
+
+def lines_of(method: Method) -> list[str]:
+    """A line for a method, and one for each of its options; what cannot be imported says why."""
+    try:
+        options = described(method.options)
+    except InputError as error:
+        return [f"{method.name:<16} cannot be used: {error}"]
+    lines = [f"{method.name:<16} {method.title}"]
+    for name, default, text in options:
+        lines += textwrap.wrap(f"  {f'{name}={default}':<20} {text}", 110, subsequent_indent=" " * 23)
+    return lines
 
 
 def _cases(a: argparse.Namespace) -> int:

@@ -12,20 +12,21 @@ from typing import TYPE_CHECKING, Any
 from ded_bench.cli.arguments import (
     CASE_HELP,
     DEFAULT_CASE,
-    RESULTS_HELP,
+    add_instances,
     add_methods,
     chosen_methods,
     command,
+    counted,
+    declare,
     names,
     positive,
     positive_number,
+    say,
 )
-from ded_bench.cli.messages import counted, say
-from ded_bench.cli.outputs import check_writable, sweep
 from ded_bench.files.errors import InputError
+from ded_bench.files.strict import check_writable, sweep
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import (
-    SPLITS,
     Selection,
     check_own_name,
     problem_folder,
@@ -35,7 +36,7 @@ from ded_bench.problem.benchmark import (
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, check_plausible
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.reference_run import default_results, search_folders
+from ded_bench.results.folder import default_results, search_folders
 from ded_bench.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -51,25 +52,20 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--sample", type=positive, default=5, metavar="N", help="rows per method and settings")
     p.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in the results")
     p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
-    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
+    declare(p, "--workers")
     p.set_defaults(run=_reproduce, instance=None)
 
 
 def _add_solve(commands: Any) -> None:
     p = command(commands, "solve", "solve instances with methods, score, one row each")
     add_methods(p)
-    chosen = p.add_mutually_exclusive_group()
-    chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances")
-    chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
-    p.add_argument("--limit", type=positive, help="only the first so many of the split")
-    p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
+    add_instances(p)
+    declare(p, "--out")
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=positive, metavar="N", help="processes here (default: 1)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
-    p.add_argument(
-        "--time-limit", type=positive_number, metavar="S", help="per solve; 60 s later it is killed"
-    )
-    p.add_argument("--out", type=Path, help=RESULTS_HELP)
+    limit = "per solve; 60 s later it is killed"
+    p.add_argument("--time-limit", type=positive_number, metavar="S", help=limit)
     p.set_defaults(run=_solve)
 
 
@@ -83,12 +79,8 @@ def _add_score(commands: Any) -> None:
     p.add_argument("--plant", choices=PLANTS, help="default: that of the rows; another: validated.csv")
     p.add_argument("--name", help="what the rows of --schedules call your method")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
-    chosen = p.add_mutually_exclusive_group()
-    chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances; not for --results")
-    chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
-    p.add_argument("--limit", type=positive, help="only the first so many of the split")
-    p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
-    p.add_argument("--workers", type=positive, default=1, metavar="N", help="processes here")
+    add_instances(p)
+    declare(p, "--workers")
     p.add_argument("--out", type=Path, help="results folder for the rows of --schedules")
     p.add_argument("--json", action="store_true", help="one JSON object per schedule")
     p.set_defaults(run=_score)
@@ -109,19 +101,17 @@ def _solve(a: argparse.Namespace) -> int:
     ]
     for line in fallbacks(tasks, results.folder):
         say(line)
-    todo, unscored = unfinished(tasks, results)
-    if unscored:
-        say(f"{counted(len(unscored), 'row')} solved already, only scored now")
+    todo = unfinished(tasks, results)
 
     def print_row(row: Row) -> None:
         if a.instance:
             _print_row(results, row)
 
-    waiting = {task.key for task in (*todo, *unscored)}
+    waiting = {task.key for task in todo}
     finished = [task.key for task in tasks if task.key not in waiting]
     for key in finished:
         print_row(results.rows[key])
-    if todo or unscored:
+    if todo:
         check_writable(results.path)
         sweep(results.folder)
     there = f", {len(finished)} there already" if finished else ""
@@ -179,12 +169,7 @@ def _score_one(a: argparse.Namespace) -> int:
 
 def _score_results(a: argparse.Namespace) -> int:
     """The schedules kept in a results folder, against its rows."""
-    from ded_bench.results.rows import Results
-
-    results = Results(a.results)
-    if not results.rows:
-        raise InputError(results.path, "", "is missing or has no rows")
-    case, instances = _instances_of(a, results)
+    results, case, instances = _rows_of(a)
     stream = sys.stderr if a.json else sys.stdout
     say(f"simulating the schedules of {counted(len(results.rows), 'row')} in {a.results}")
 
@@ -203,7 +188,6 @@ def _score_results(a: argparse.Namespace) -> int:
         f"{counted(len(check.rows), 'row')} {'scored anew' if a.update else 'checked'} in {results.path}",
         counted(len(check.differences), "difference"),
         f"{counted(check.without_schedule, 'row')} without a kept schedule",
-        *([f"{check.unscored} not scored yet"] if check.unscored else []),
         *([f"{check.unknown} of unknown instances"] if check.unknown else []),
     ]
     tell(", ".join(parts))
@@ -233,12 +217,7 @@ def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance],
 
 def _reproduce(a: argparse.Namespace) -> int:
     """Rows of a results folder, solved again."""
-    from ded_bench.results.rows import Results
-
-    results = Results(a.results)
-    if not results.rows:
-        raise InputError(results.path, "", "is missing or has no rows")
-    case, instances = _instances_of(a, results)
+    results, case, instances = _rows_of(a)
     say(f"solving up to {a.sample} rows of each method, settings, model and regime in {a.results} again")
     from ded_bench.analysis.reproduce import reproduce, table_of
 
@@ -249,11 +228,16 @@ def _reproduce(a: argparse.Namespace) -> int:
     return 1 if differ else 0
 
 
-def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[str, Instance]]:
-    """The case of a results folder and its instances by id, wherever they come from."""
+def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]:
+    """The rows of a results folder, their case, and its instances by id, wherever they come from."""
+    from ded_bench.results.rows import Results
+
+    results = Results(a.results)
+    if not results.rows:
+        raise InputError(results.path, "", "is missing or has no rows")
     if a.instance:
         chosen = _chosen(a)
-        return chosen.case, {instance.id: instance for instance, _ in chosen.instances}
+        return results, chosen.case, {instance.id: instance for instance, _ in chosen.instances}
     named = {row.case for row in results.rows.values()}
     if not a.case and len(named) != 1:
         raise InputError(results.path, "case", f"rows of {len(named)} cases: choose one by --case")
@@ -262,7 +246,7 @@ def _instances_of(a: argparse.Namespace, results: Results) -> tuple[Case, dict[s
     needed = ["all", *(["validation"] if "validation" in splits else [])]
     selections = [select_split(place, split) for split in needed]
     found = {instance.id: instance for chosen in selections for instance, _ in chosen.instances}
-    return selections[0].case, found
+    return results, selections[0].case, found
 
 
 def _score_folder(a: argparse.Namespace) -> int:

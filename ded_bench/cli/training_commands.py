@@ -9,22 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from ded_bench.cli.arguments import (
-    CASE_HELP,
-    DEFAULT_CASE,
     MODEL_HELP,
     command,
+    counted,
+    declare,
     names,
-    natural,
     positive,
     positive_number,
+    say,
 )
-from ded_bench.cli.messages import counted, say
-from ded_bench.cli.outputs import check_writable
 from ded_bench.files.errors import InputError
+from ded_bench.files.strict import check_writable
 from ded_bench.methods.registry import trainable
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
-from ded_bench.results.reference_run import default_results, search_folders
+from ded_bench.results.folder import default_results, search_folders
 from ded_bench.surrogates.find import TRAINED
 
 
@@ -32,20 +31,16 @@ def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "train-ko", "identify the Koopman model from simulated trajectories")
     p.add_argument("--kind", choices=TRAINED, default=TRAINED[0], help="ours, or the paper's recipe")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
-    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
+    declare(p, "--case", "--seed", "--results")
     p.add_argument("--count", type=positive, metavar="N", help="trajectories; default: by the case's size")
-    p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--out", type=Path, help="model file; default: in the results folder")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.set_defaults(run=_train_ko)
 
     p = command(commands, "train-dpc", "train policies, by default all")
     p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
-    p.add_argument("--regime", type=names, metavar="R[,R]", help="default: all of the case")
-    p.add_argument("--case", default=DEFAULT_CASE, help=CASE_HELP)
+    declare(p, "--regime", "--case", "--seed", "--results")
     p.add_argument("--model", default="", help=f"to train on: {MODEL_HELP}; default: {TRAINED[0]}")
-    p.add_argument("--seed", type=natural, default=0, help="of what is drawn")
     budget = p.add_mutually_exclusive_group()
     budget.add_argument("--seconds", type=positive_number, metavar="S", help="train for so long")
     budget.add_argument("--epochs", type=positive, metavar="N", help="train for so many")
@@ -54,7 +49,6 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train")
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
-    p.add_argument("--results", type=Path, help="results folder that keeps models and policies")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
     p.add_argument("--out", type=Path, help="policy file; default: in the results folder")
     p.set_defaults(run=_train_dpc)

@@ -38,12 +38,9 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None
     except (safetensors.SafetensorError, *_UNREADABLE) as error:
-        raise InputError(path, "", f"is not a model or policy file ({_one_line(error)})") from None
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(path, "", f"is not a model or policy file ({reason})") from None
     for name, array in arrays.items():
         if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
             raise InputError(path, name, "must hold finite numbers")
     return arrays, header
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:100]

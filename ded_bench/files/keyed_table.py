@@ -28,7 +28,7 @@ _TAIL = 256
 
 
 class Keyed(Protocol):
-    """A row that knows its place in the table and what it was made from."""
+    """A row that knows its place in the table and what it was made from and by."""
 
     @property
     def key(self) -> Any:
@@ -37,6 +37,10 @@ class Keyed(Protocol):
     @property
     def fingerprint(self) -> str:
         """Changes with all that decides on the row."""
+
+    @property
+    def method_version(self) -> int:
+        """Version of the method that made it."""
 
 
 class _Seen(NamedTuple):
@@ -64,10 +68,10 @@ class KeyedTable(Generic[K, T]):
         self._seen: _Seen | None = None
         self.reload()
 
-    def made_from(self, key: K, fingerprint: str) -> bool:
-        """Whether there is a row of this key, made from the same input."""
+    def made_from(self, key: K, fingerprint: str, version: int = 0) -> bool:
+        """Whether there is a row of this key, from the same input and by no older version of the method."""
         row = self.rows.get(key)
-        return row is not None and row.fingerprint == fingerprint
+        return row is not None and row.fingerprint == fingerprint and row.method_version >= version
 
     def reload(self) -> None:
         """Read what other processes have added; InputError if the file is wrong."""
@@ -117,7 +121,8 @@ class KeyedTable(Generic[K, T]):
             data = read()
             if data.startswith(seen.tail):
                 if new := whole_lines(data[len(seen.tail) :]):
-                    self._take(self._parse(new))
+                    found = records(self._text(new), self.path)
+                    self._take(self._table.rows(found, self._header, self.path))
                     self._seen = _Seen(inode, seen.end + len(new), (seen.tail + new)[-_TAIL:])
                 return
             seek(0)  # another file that happens to have the same number, or one changed by hand
@@ -127,9 +132,6 @@ class KeyedTable(Generic[K, T]):
         self._header = self._table.check_header(found[0][1] if found else [], self.path)
         self._take(self._table.rows(found[1:], self._header, self.path))
         self._seen = _Seen(inode, len(data), data[-_TAIL:])
-
-    def _parse(self, data: bytes) -> Iterator[tuple[T, dict[str, str]]]:
-        return self._table.rows(records(self._text(data), self.path), self._header, self.path)
 
     def _text(self, data: bytes) -> str:
         try:

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.cli.outputs import sweep
+from ded_bench.files.strict import sweep
 from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE
 from tests.conftest import CASE_FILES
@@ -81,20 +81,6 @@ def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None
     for key, row in finished.items():  # not solved a second time
         assert (after[key].solve_s, after[key].date) == (row.solve_s, row.date)
     assert not list(out.glob(".results.csv.*"))
-
-
-@pytest.mark.usefixtures("inline")
-def test_a_report_first_scores_what_an_interruption_left(problem: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "out"
-    assert main(["solve", "--method", "ed", "--regime", "NO", "--case", str(problem), "--out", str(out)]) == 0
-    results = Results(out)
-    rows = list(results.rows.values())
-    results.add([dataclasses.replace(row, objective=None, feasible=None, error="stopped") for row in rows])
-    capsys.readouterr()
-    assert main(["report", "--case", str(problem), "--results", str(out), "--workers", "1"]) == 0
-    assert len(rows) == 1
-    assert "ded-bench: 1 row solved but not scored: scored now" in capsys.readouterr().err
-    assert [row.objective for row in Results(out).rows.values()] == [row.objective for row in rows]
 
 
 def test_paths_are_those_of_the_working_directory(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -15,56 +15,45 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ded_bench.files.errors import InputError
-    from ded_bench.methods.solution import Settings, Solution, Solver
-    from ded_bench.plants.plant import Plant, SimulationError
-    from ded_bench.plants.score import Score
+    from ded_bench.files.errors import InputError as InputError
+    from ded_bench.methods.solution import Settings as Settings
+    from ded_bench.methods.solution import Solution as Solution
+    from ded_bench.methods.solution import Solver
+    from ded_bench.plants.plant import Plant
+    from ded_bench.plants.plant import SimulationError as SimulationError
+    from ded_bench.plants.score import Score as Score
     from ded_bench.problem.benchmark import SplitName
-    from ded_bench.problem.case import Case
-    from ded_bench.problem.instance import Instance
-    from ded_bench.problem.schedule import Schedule
-    from ded_bench.problem.trajectory import Trajectory
-    from ded_bench.solvers.status import Status
+    from ded_bench.problem.case import Case as Case
+    from ded_bench.problem.instance import Instance as Instance
+    from ded_bench.problem.instance import instances_frame as instances_frame
+    from ded_bench.problem.schedule import Schedule as Schedule
+    from ded_bench.problem.trajectory import Trajectory as Trajectory
+    from ded_bench.solvers.status import Status as Status
 
-__all__ = [
-    "Case",
-    "InputError",
-    "Instance",
-    "Schedule",
-    "Score",
-    "Settings",
-    "SimulationError",
-    "Solution",
-    "Status",
-    "Trajectory",
-    "instances_frame",
-    "load_instances",
-    "score",
-    "simulate",
-    "solve",
-]
-
+#: Where each name is from that is imported when it is first asked for.
 _HOMES = {
-    "Case": "ded_bench.problem.case",
-    "InputError": "ded_bench.files.errors",
-    "Instance": "ded_bench.problem.instance",
-    "Schedule": "ded_bench.problem.schedule",
-    "Score": "ded_bench.plants.score",
-    "Settings": "ded_bench.methods.solution",
-    "SimulationError": "ded_bench.plants.plant",
-    "Solution": "ded_bench.methods.solution",
-    "Status": "ded_bench.solvers.status",
-    "Trajectory": "ded_bench.problem.trajectory",
+    "Case": "problem.case",
+    "InputError": "files.errors",
+    "Instance": "problem.instance",
+    "Schedule": "problem.schedule",
+    "Score": "plants.score",
+    "Settings": "methods.solution",
+    "SimulationError": "plants.plant",
+    "Solution": "methods.solution",
+    "Status": "solvers.status",
+    "Trajectory": "problem.trajectory",
+    "instances_frame": "problem.instance",
 }
+__all__ = [*_HOMES, "load_instances", "score", "simulate", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a class when it is first asked for, and look up the version."""
+    """Import a name when it is first asked for, and look up the version."""
     if name == "__version__":
         return importlib.import_module("importlib.metadata").version("ded-bench")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    return getattr(importlib.import_module(f"ded_bench.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
@@ -91,13 +80,6 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
     return [instance for instance, _ in select_split(case, split, limit, servable).instances]
 
 
-def instances_frame(instances: list[Instance]) -> pd.DataFrame:
-    """One row per instance with all its parameters; see `problem.instance.instances_frame`."""
-    from ded_bench.problem import instance
-
-    return instance.instances_frame(instances)
-
-
 def solve(
     instance: Instance,
     method: str,
@@ -120,7 +102,7 @@ def solve(
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
     from ded_bench.methods.solution import Settings
-    from ded_bench.results.reference_run import search_folders
+    from ded_bench.results.folder import search_folders
 
     own = _case_of(instance, case)
     own.check_regimes([regime])

@@ -77,7 +77,7 @@ def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path)
     package = tmp_path / "site" / "ded_bench" / "_reference_runs" / "9bus-reference"
     assert f"from {package / 'policies' / 'ded-dpc-TO.safetensors'}" in said
     assert f"from {package / 'koopman' / 'koopman.safetensors'}" in said
-    run("report", "--workers", "1")
+    run("report")
     summary = pd.read_csv(place / "results" / "9bus" / "tables" / "summary.csv").set_index("method")
     for method in methods.split(","):
         assert summary.loc[method, "n"] == int(limit)

@@ -31,7 +31,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -60,17 +60,14 @@ class ForeignSolver:
 
     case: Case
     function: Callable[..., Any]
-    arguments: tuple[Any, ...] = ()  # after the instance
-    named: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, instance: Instance, **more: Any) -> Solution:
         """Solve one instance."""
         started = time.perf_counter()
-        answer = self.function(instance, *self.arguments, **self.named, **more)
+        answer = self.function(instance, **more)
         return accept(answer, self.case, instance, time.perf_counter() - started)
 
 
-@dataclass(frozen=True)
 class ForeignWarmSolver(ForeignSolver):
     """Someone's `solve(instance, last=None)`."""
 
@@ -101,7 +98,7 @@ class Foreign:
         """
         if not self._prepares:
             extra = {"case": case} if "case" in _parameters(self.function) else {}
-            return ForeignSolver(case, self.function, (regime,), extra)
+            return ForeignSolver(case, lambda instance: self.function(instance, regime, **extra))
         inner = self.function(case, regime, settings)
         if callable(getattr(inner, "solve", None)):
             return ForeignWarmSolver(case, inner.solve)

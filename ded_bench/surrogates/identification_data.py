@@ -27,7 +27,6 @@ Span = tuple[float, float]
 class Trajectories:
     """Simulated trajectories side by side, time first."""
 
-    instances: tuple[Instance, ...]
     kinds: tuple[str, ...]
     inputs: Array  # (n_points, batch, n_gen + n_load), pu
     theta_initial: Array  # (batch, n_bus), rad
@@ -48,12 +47,6 @@ def _signals(run: Trajectory) -> tuple[Array, ...]:
     return np.hstack([run.p_gen, run.p_load]), initial, theta, run.omega, run.p_slack
 
 
-def _stacked(instances: list[Instance], kinds: list[str], runs: list[tuple[Array, ...]]) -> Trajectories:
-    inputs, initial, *signals = zip(*runs, strict=True)
-    stacked = (np.stack(signal, axis=1) for signal in signals)
-    return Trajectories(tuple(instances), tuple(kinds), np.stack(inputs, axis=1), np.stack(initial), *stacked)
-
-
 def sample_trajectories(
     case: Case, seed: int, count: int, first: int = 0, mix: Sequence[str] | None = None
 ) -> Trajectories:
@@ -65,19 +58,20 @@ def sample_trajectories(
         InputError: it cannot follow most of them.
     """
     mix = mix or list(KINDS)
-    instances, kinds, runs = [], [], []
+    kinds, runs = [], []
     for i, instance in enumerate(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable)):
         kind = mix[i % len(mix)]
         rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
         schedule = Schedule(instance.grid, KINDS[kind](case, instance, rng))
         with contextlib.suppress(SimulationError):
             runs.append(_signals(simulate(case, instance, schedule)))
-            instances.append(instance)
             kinds.append(kind)
     if 2 * len(runs) < count:
         lost = f"the system cannot follow {count - len(runs)} of {count} drawn schedules"
         raise InputError(f"case {case.id}", "", f"{lost}: the power flow has no solution")
-    return _stacked(instances, kinds, runs)
+    inputs, initial, *signals = zip(*runs, strict=True)
+    stacked = (np.stack(signal, axis=1) for signal in signals)
+    return Trajectories(tuple(kinds), np.stack(inputs, axis=1), np.stack(initial), *stacked)
 
 
 def tracking(

@@ -15,9 +15,15 @@ from scipy.optimize import least_squares
 
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.energy_form import EnergyForm, energy_form, injection_lift, steady_state
 from ded_bench.surrogates.identification_data import Trajectories, sample_trajectories
 from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.linear import (
+    EnergyForm,
+    discretised,
+    energy_form,
+    injection_lift,
+    steady_state,
+)
 
 TRAIN, HELD_OUT = 120, 60
 #: The whole energy form is fitted if it has at most so many parameters: each costs a rollout of all
@@ -67,7 +73,7 @@ def held_out(case: Case, seed: int = 0, count: int = HELD_OUT) -> Trajectories:
 def make_model(case: Case, form: EnergyForm, training: dict[str, int | float] | None = None) -> Koopman:
     """The Koopman model with the parameters of an energy form."""
     b = steady_state(case)
-    k, g = form.discretise(b, case.sampling.dt_s)
+    k, g = discretised(form.generator(), b, form.feedthrough, case.sampling.dt_s)
     return Koopman(
         kind="koopman",
         case_id=case.id,

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.energy_form import EPSILON
 from ded_bench.surrogates.identification_data import Trajectories, sample_trajectories
 from ded_bench.surrogates.identify import TRAIN_MIX, n_training
 from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.linear import EPSILON
 
 #: Observables of the MLP, enough for two for each generator, and units of its hidden layer for each of them.
 OBSERVABLES_BY_GENERATOR, MORE_OBSERVABLES, HIDDEN_BY_OBSERVABLE = 2, 4, 4

@@ -1,21 +1,97 @@
-"""The linearisation at the nominal point, the surrogate made of it."""
+"""The swing equations linearised: the surrogate `linear`, and the energy form where identification starts.
+
+The energy form is a parametrisation that is stable for every parameter value. Coordinates are
+ψ = (ω, P_s, N) with N = f at all generators but the last; with load injections given, (P_s, N) and the
+generators' f determine each other.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm
 
 from ded_bench.plants.lossless.network import Network
-from ded_bench.problem.case import Case
-from ded_bench.surrogates.energy_form import (
-    energy_form,
-    injection_lift,
-    injections_from_generators,
-    steady_state,
-)
+from ded_bench.problem.case import Array, Case
 from ded_bench.surrogates.koopman import Koopman
+
+#: Floor of dissipation R and of energy Q, so that every parameter value is strictly stable.
+EPSILON = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyForm:
+    """Parameters of a stable continuous-time model dψ/dt = A (ψ - B P) + F dP/dt.
+
+    A = (J - R) Q with J skew, R = L Lᵀ + εI, Q = U Uᵀ + εI (the swing equation's energy form): A is
+    Hurwitz and exp(A Δt) has spectral radius below one whatever the parameters are.
+    """
+
+    skew: Array  # (n, n); its antisymmetric part is J
+    dissipation: Array  # L, (n, n)
+    energy: Array  # U, (n, n)
+    feedthrough: Array  # F, (n, n_in)
+
+    def generator(self) -> Array:
+        """A, shape (n, n), 1/s."""
+        eye = EPSILON * np.eye(len(self.skew))
+        r = self.dissipation @ self.dissipation.T + eye
+        q = self.energy @ self.energy.T + eye
+        return np.asarray((self.skew - self.skew.T - r) @ q)
+
+
+def discretised(a: Array, b: Array, feedthrough: Array, dt: float) -> tuple[Array, Array]:
+    """K and G of dψ/dt = A (ψ - B P) + F dP/dt, exact for inputs linear in between (first-order hold)."""
+    n = len(a)
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n] = a * dt
+    block[:n, n:] = np.eye(n)
+    result = expm(block)
+    return result[:n, :n], b + result[:n, n:] @ (feedthrough - b)
+
+
+def injections_from_generators(n_gen: int) -> Array:
+    """The matrix of (P_s, N) = matrix @ f_gen - (Σ loads, 0), shape (n_gen, n_gen)."""
+    return np.vstack([-np.ones((1, n_gen)), np.eye(n_gen)[:-1]])
+
+
+def steady_state(case: Case) -> Array:
+    """B, shape (2 n_gen, n_in): ω* = 0, P_s* = -Σ P, N* = the generators' own power."""
+    n_gen, n_in = len(case.generators), len(case.generators) + len(case.loads)
+    b = np.zeros((2 * n_gen, n_in))
+    b[n_gen] = -1.0
+    b[np.arange(n_gen + 1, 2 * n_gen), np.arange(n_gen - 1)] = 1.0
+    return b
+
+
+def energy_form(case: Case, theta: Array) -> EnergyForm:
+    """The energy form of the linearisation at angles `theta`, shape (n_bus,), up to ε."""
+    network = Network(case)
+    linear = network.linearise(theta)
+    n = len(case.generators)
+    mix = injections_from_generators(n)
+    hessian = np.linalg.inv(mix @ linear.stiffness @ mix.T)
+    skew = np.zeros((2 * n, 2 * n))
+    skew[n:, :n] = (mix @ linear.stiffness) / linear.m
+    energy = np.zeros((2 * n, 2 * n))
+    energy[:n, :n] = np.diag(np.sqrt(linear.m - EPSILON))
+    energy[n:, n:] = np.linalg.cholesky(hessian - EPSILON * np.eye(n))
+    dissipation = np.zeros((2 * n, 2 * n))
+    dissipation[:n, :n] = np.diag(np.sqrt(np.maximum(linear.d / linear.m**2 - EPSILON, 0.0)))
+    feedthrough = np.zeros((2 * n, n + len(case.loads)))
+    feedthrough[n, n:] = linear.slack_share
+    feedthrough[n + 1 :, n:] = linear.share[:-1]
+    return EnergyForm(skew, dissipation, energy, feedthrough)
+
+
+def injection_lift(case: Case) -> Array:
+    """The lift ψ = (ω, P_s, N) that makes equilibria of the nonlinear system exact."""
+    network, n = Network(case), len(case.generators)
+    lift = np.zeros((2 * n, 2 * network.n_bus + n + len(case.loads) + 1))
+    lift[:n, 2 * network.n_bus : 2 * network.n_bus + n] = np.eye(n)
+    lift[np.arange(n, 2 * n), [network.slack, *network.generators[:-1]]] = 1.0
+    return lift
 
 
 def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
@@ -38,12 +114,7 @@ def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
     a[:n, n:] = -np.linalg.inv(mix) / linear.m[:, None]
     a[n:, :n] = mix @ linear.stiffness
     b = steady_state(case)
-    form = energy_form(case, theta)
-    block = np.zeros((4 * n, 4 * n))
-    block[: 2 * n, : 2 * n] = a * dt_s
-    block[: 2 * n, 2 * n :] = np.eye(2 * n)
-    exact = expm(block)
-    k, phi = exact[: 2 * n, : 2 * n], exact[: 2 * n, 2 * n :]
+    k, g = discretised(a, b, energy_form(case, theta).feedthrough, dt_s)
     # f_gen ≈ f* + S (θ_gen - θ*) + T (P_load - L*); P_s = -Σ f_gen - Σ P_load.
     angle = np.zeros((n, n_bus))
     angle[:, network.generators] = linear.stiffness
@@ -62,7 +133,7 @@ def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
         dt_s=dt_s,
         k=k,
         b=b,
-        g=b + phi @ (form.feedthrough - b),
+        g=g,
         lift=lift,
         training={"source": "linearisation at the nominal point"},
     )

@@ -15,7 +15,7 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.reference_run import search_folders
+from ded_bench.results.folder import search_folders
 from ded_bench.surrogates.linear import linear_model
 
 #: Bounds so wide, or so tight, that no schedule exceeds them, or every one does.

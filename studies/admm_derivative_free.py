@@ -31,7 +31,7 @@ from ded_bench.plants.score import score
 from ded_bench.problem.benchmark import select_split, validation_instances
 from ded_bench.problem.case import Array
 from ded_bench.problem.sampling import POLICY_SEED
-from ded_bench.results.reference_run import reference_run
+from ded_bench.results.folder import reference_run
 
 SHAPE = weight_shapes()["nodes"]
 #: Problems of a generation, candidates, first standard deviation, generations between looks.

@@ -220,7 +220,7 @@ def test_model_files_are_checked(ninebus: Case, threebus: Case, tmp_path: Path) 
 def test_paper_identification_is_stable_exact_at_equilibria_and_learns(case: Case) -> None:
     from ded_bench.surrogates.koopman_paper import PaperKoopman, identify_paper
 
-    model = identify_paper(case, seed=1, count=4, steps=300)
+    model = identify_paper(case, seed=1, count=4, steps=100)
     assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0
     n_gen = len(case.generators)
     assert (model.b[:n_gen] == 0).all()

@@ -1,8 +1,9 @@
-"""The wheel by itself, without torch, in an empty folder: methods answer, and a report shows their gaps."""
+"""The wheel by itself, without torch, in an empty folder: README's first results, and gaps in the report."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -65,22 +66,30 @@ def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path)
     place.mkdir()
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "OMP_NUM_THREADS": "1"}
 
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    def run(arguments: str) -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
-            [*command, *arguments], cwd=place, env=environment, capture_output=True, text=True, check=False
+            [*command, *arguments.split()],
+            cwd=place,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         return done
 
-    methods, limit = "ded-dpc,ded-ko-knots", "3"
-    said = run("solve", "--method", methods, "--regime", "TO", "--limit", limit, "--workers", "1").stderr
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    solve, report, *_ = re.findall(r"^ded-bench (.*)$", readme, re.MULTILINE)
+    assert solve == "solve --method ded-dpc,ded-ko-knots --regime TO --limit 2"
+    said = run(solve).stderr
     package = tmp_path / "site" / "ded_bench" / "_reference_runs" / "9bus-reference"
     assert f"from {package / 'policies' / 'ded-dpc-TO.safetensors'}" in said
     assert f"from {package / 'koopman' / 'koopman.safetensors'}" in said
-    run("report")
+    run(report)
+    assert (place / "results" / "9bus" / "report.html").is_file()
     summary = pd.read_csv(place / "results" / "9bus" / "tables" / "summary.csv").set_index("method")
-    for method in methods.split(","):
-        assert summary.loc[method, "n"] == int(limit)
+    for method in ("ded-dpc", "ded-ko-knots"):
+        assert summary.loc[method, "n"] == 2
         assert -0.1 < summary.loc[method, "gap_percent_mean"] < 1.0
     assert [path.name for path in place.iterdir()] == ["results"]
 

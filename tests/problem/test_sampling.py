@@ -13,8 +13,10 @@ from scipy.optimize import linprog
 from scipy.stats import binom, kstest
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.plant import plant_of, servable
 from ded_bench.problem.benchmark import draw_split, load_manifest, load_split, write_benchmark
-from ded_bench.problem.case import SHIPPED_CASES
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.grid_files import GRID_FILES
 from ded_bench.problem.instance import load_instances
 from ded_bench.problem.sampling import (
     CERTIFICATE_SEED,
@@ -194,6 +196,10 @@ SIZES = {
     "39bus": (400, 100),
     "68bus": (150, 50),
     "140bus": (80, 20),
+    "two-area-agc": (400, 100),
+    "39bus-agc": (400, 100),
+    "68bus-agc": (150, 50),
+    "140bus-agc": (80, 20),
 }
 
 
@@ -205,13 +211,29 @@ def test_committed_manifest_holds_the_checksums(name):
     assert (len(split.train), len(split.test)) == SIZES[name]
     assert manifest is not None
     files = {f"instances/{p.name}" for p in (committed / "instances").iterdir()}
-    assert files | {"case.json", "split.json"} == manifest.files.keys()
+    own = {"case.json", "split.json"} | (set(GRID_FILES) if name.endswith("-agc") else set())
+    assert files | own == manifest.files.keys()
     assert len(files) == sum(SIZES[name])
     for file, digest in manifest.files.items():
         assert hashlib.sha256((committed / file).read_bytes()).hexdigest() == digest, file
 
 
-@pytest.mark.parametrize("name", [name for name in SIZES if name != "9bus"])
+@pytest.mark.parametrize("name", ["two-area-agc", "39bus-agc"])
+def test_committed_islands_are_drawn_as_their_plant_can_serve_them(name: str) -> None:
+    """Balanced to what rounding leaves, at rest, within limits and transfers; a few are drawn here again."""
+    folder, case = SHIPPED_CASES / name, Case.load(name)
+    instances, _ = load_instances(sorted((folder / "instances").iterdir()), case)
+    assert instances[:3] == list(sample_instances(case, SEED, 3, servable=servable))
+    dispatcher = plant_of(case).dispatcher
+    for instance in instances[::10]:
+        power, load = instance.p_initial(case), instance.p_load(case, np.zeros(1))[0]
+        assert abs(dispatcher.weigh(power, load).short) < 1e-9 * len(power)
+        assert ((case.p_min <= power) & (power <= case.p_max)).all()
+        assert (case.transfer_excess(power, load) < 1e-8).all()
+        assert not instance.omega_initial(case).any()
+
+
+@pytest.mark.parametrize("name", [name for name in SIZES if name != "9bus" and not name.endswith("-agc")])
 def test_committed_instances_are_drawn_and_keep_the_sign_of_loads(name):
     """Those that were drawn once are what the sampler draws; in all of them loads stay loads."""
     folder = SHIPPED_CASES / name

@@ -119,9 +119,12 @@ class Initial(Extended):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the generators are at an instant, as a planner is told; it need not be an equilibrium."""
+    """Where the generators are at an instant, as a planner is told; it need not be an equilibrium.
 
-    theta: Array  # (n_gen,), rad, relative to the slack; on an island to the inertia-weighted mean
+    Without angles it is the equilibrium of its powers, but for the frequencies.
+    """
+
+    theta: Array | None  # (n_gen,), rad, relative to the slack; on an island to the inertia-weighted mean
     omega: Array  # (n_gen,), rad/s, deviation from nominal
     p_gen: Array  # (n_gen,), pu: set-points
     mechanical: Array | None = None  # (n_gen,), pu: turbines' powers, where they are not the set-points
@@ -129,10 +132,17 @@ class State:
 
     def initial(self, case: Case) -> Initial:
         """The state at t = 0 of an instance that starts here (instance/2)."""
-        arrays = {"power": self.p_gen, "omega": self.omega, "theta": self.theta}
-        if self.mechanical is not None:
-            arrays["mechanical"] = self.mechanical
-        by_name = {n: dict(zip(case.generators, a.tolist(), strict=True)) for n, a in arrays.items()}
+        arrays = {
+            "power": self.p_gen,
+            "omega": self.omega,
+            "theta": self.theta,
+            "mechanical": self.mechanical,
+        }
+        by_name = {
+            name: dict(zip(case.generators, values.tolist(), strict=True))
+            for name, values in arrays.items()
+            if values is not None
+        }
         return Initial(**by_name, agc=self.agc)
 
 

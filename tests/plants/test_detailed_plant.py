@@ -257,6 +257,18 @@ def test_secondary_control_between_points_is_refused(mixed, plant, quiet_instanc
         simulate(mixed, instance, constant(instance, mixed.p_nominal), plant)
 
 
+def test_behind_an_infinite_slack_angles_are_not_told(quiet_instance, constant, alter):
+    """A planner starts from its own equilibrium, and angles of another plant are refused."""
+    case = Case.load("two-area")
+    plant, instance = plant_of(case, "detailed"), quiet_instance(case, horizon_s=1.0)
+    seen = plant.observed(plant.initial(instance)).initial(case)
+    assert seen == instance.initial
+    angles = json.loads(seen.model_dump_json()) | {"theta": dict.fromkeys(case.generators, 0.1)}
+    told = alter(instance, schema="ded-bench/instance/2", initial=angles)
+    with pytest.raises(InputError, match=r"initial\.theta: angles behind an infinite slack"):
+        plant.initial(told)
+
+
 def test_a_lossless_case_is_judged_on_its_machines(quiet_instance, constant):
     """Generators are the machines of their names; the slack's machine stands still and takes the losses."""
     case = Case.load("two-area")

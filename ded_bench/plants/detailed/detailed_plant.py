@@ -147,17 +147,20 @@ class DetailedPlant:
         return linearised(self.equations, trajectory, points)
 
     def observed(self, state: DetailedState) -> State:
-        """Rotor angles relative to the slack's or their mean, frequencies, set-points; more on islands."""
+        """On islands everything that instance/2 can hold; else set-points and frequencies.
+
+        Behind an infinite slack angles would be worse than none: turbines' powers, which are not told, or a
+        planner's own network, hold others, and what it plans from would be far from any equilibrium.
+        """
         data, machines = self.equations.system.data, self.equations.scheduled
-        theta = (state.x[DELTA] - data.inertia @ state.x[DELTA])[machines]
         omega = (state.x[SPEED] * data.omega_0)[machines]
         if self.case.slack is not None:
-            return State(theta, omega, state.p_set)
-        agc = None
+            return State(None, omega, state.p_set)
+        agc, mean = None, float(data.inertia @ state.x[DELTA])
         if self.case.agc is not None:
-            mean = float(data.inertia @ state.x[DELTA])
             agc = AgcState(held_pu=state.held, integral_rad=mean, next_s=state.next_s)
-        return State(theta, omega, state.p_set, self.equations.turbines(state.x)[machines], agc)
+        theta, p_gen = (state.x[DELTA] - mean)[machines], self.equations.turbines(state.x)[machines]
+        return State(theta, omega, state.p_set, p_gen, agc)
 
     def columns(self, states: DetailedRun) -> Mapping[str, Array]:
         """Voltages of all buses, rotor angles, secondary control.

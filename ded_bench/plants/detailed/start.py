@@ -61,7 +61,7 @@ def start(equations: CaseSystem, instance: Instance) -> DetailedState:
     secondary control; fluxes, exciters and stabilisers are stationary.
 
     Raises:
-        InputError: see `initial_point`.
+        InputError: see `initial_point`; or there are angles, and no island.
         SimulationError: there is no equilibrium.
     """
     case, system, machines = equations.case, equations.system, equations.scheduled
@@ -80,6 +80,9 @@ def start(equations: CaseSystem, instance: Instance) -> DetailedState:
         return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
     offset[machines] = 0.0
     if (theta := instance.theta_initial(case)) is not None:
+        if not system.island:
+            problem = "angles behind an infinite slack are those of another plant than this"
+            raise InputError(f"instance {instance.id}", "initial.theta", problem)
         x[DELTA, machines] = theta
         x[DELTA] -= data.inertia @ x[DELTA]
         v = _stationary(system, x, v, point.p_drawn, v_ref)

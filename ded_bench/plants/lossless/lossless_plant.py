@@ -47,6 +47,10 @@ class LosslessPlant:
     case: Case
     name: str = "lossless"
 
+    def __post_init__(self) -> None:
+        """Raise InputError unless the case's network is lossless."""
+        lossless(self.case)
+
     @functools.cached_property
     def network(self) -> Network:
         """Its equations."""

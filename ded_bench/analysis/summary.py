@@ -25,6 +25,13 @@ LIMITS = dict(zip(VIOLATIONS, ("frequency", "ramp", "bounds", "initial power"), 
 SMALLEST_GAP = 1e-3
 #: The scorer's limits on each of them for `feasible` (see `plants.score`).
 FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
+#: Means over rows of islands: column of the rows, and its unit in theirs.
+ISLAND = {
+    "mean_peak_mhz": ("mean_freq_max_hz", 1e3),
+    "mean_rms_mhz": ("mean_freq_rms_hz", 1e3),
+    "swing_peak_mhz": ("swing_max_hz", 1e3),
+    "agc_travel_pu": ("agc_travel_pu", 1.0),
+}
 SPREAD = ("mean", "median", "p95", "max")
 
 
@@ -57,6 +64,15 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
     """
     rows = [head(regime, key) | statistics(group) for regime, key, group in groups(frame)]
     return line_table(rows, [*HEAD, *statistics(frame[:0])])
+
+
+def island_summary(frame: pd.DataFrame) -> pd.DataFrame:
+    """Every line's `statistics`, and means of what rows of islands say of frequencies (mHz) and AGC (pu)."""
+    rows = []
+    for regime, key, group in groups(frame):
+        means = {name: scale * group[column].mean() for name, (column, scale) in ISLAND.items()}
+        rows.append(head(regime, key) | statistics(group) | means)
+    return line_table(rows, [*HEAD, *statistics(frame[:0]), *ISLAND])
 
 
 def statistics(group: pd.DataFrame) -> dict[str, Any]:

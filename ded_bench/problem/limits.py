@@ -61,6 +61,11 @@ class Regime(Record):
         """Largest deviation of a machine that the regime allows, Hz."""
         return self.omega_hz
 
+    @property
+    def sentence(self) -> str:
+        """What is bounded, in words."""
+        return f"|ω| ≤ {self.omega_hz:g} Hz"
+
     def bounds(self, inertia: Array) -> Bounds:
         """Its bounds on the frequencies of machines with this inertia, shape (n_gen,)."""
         n = len(inertia)
@@ -79,6 +84,12 @@ class IslandRegime(Record):
     def largest_hz(self) -> float:
         """Largest deviation of a machine that the regime allows, Hz."""
         return self.mean_hz + self.relative_hz
+
+    @property
+    def sentence(self) -> str:
+        """What is bounded, in words."""
+        mean, swings, end = (f"{1e3 * hz:g}" for hz in (self.mean_hz, self.relative_hz, self.end_hz))
+        return f"mean frequency ≤ {mean} mHz, at the end {end} mHz, swings about it ≤ {swings} mHz"
 
     def bounds(self, inertia: Array) -> Bounds:
         """See `Regime.bounds`."""

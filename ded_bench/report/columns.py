@@ -119,6 +119,20 @@ TABLE_VI = (
 )
 
 
+#: On islands, of `summary.island_summary`.
+ISLAND = (
+    *_HEAD,
+    Column("mean_peak_mhz", "peak of the mean frequency", "mHz", ".2f"),
+    Column("mean_rms_mhz", "its rms", "mHz", ".2f"),
+    Column("swing_peak_mhz", "largest swing", "mHz", ".2f"),
+    Column("agc_travel_pu", "AGC travel", "pu", ".2f"),
+    Column("gap_percent_mean", "cost over the reference", "%", ".3f"),
+    Column("correct_rate", "feasible (verified)", form=".1%"),
+    N,
+    FAILURES,
+)
+
+
 def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ...]:
     """Columns of Table V or VI where there is no paper to stand beside; `reference` is what gaps are to."""
     kept = [column for column in columns if "paper" not in column.name]

@@ -12,6 +12,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.report.report import write_report
 from ded_bench.results.rows import Results, Row
+from tests.detailed_cases import MIXED
 
 
 @pytest.mark.usefixtures("sketched")
@@ -36,6 +37,35 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
     assert not [name for name in made.columns if "paper" in name]
     assert made.set_index("method").loc["ed", "increase_percent"] == pytest.approx(3.0)
     assert "% increase in obj. over DED (SLP)" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.usefixtures("sketched")
+def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
+    """Means of rows, in mHz, before the paper's tables; beside a slack there is no such table."""
+    case = Case.load(MIXED)
+    facts = {"objective": 1.0, "feasible": True, "swing_max_hz": 0.001, "case": case.id, "plant": "detailed"}
+    rows = [
+        Row(
+            name,
+            "test",
+            "TO",
+            "ded-slp",
+            "default",
+            "Optimal",
+            mean_freq_max_hz=peak,
+            agc_travel_pu=2.0,
+            **facts,
+        )
+        for name, peak in (("x", 0.004), ("y", 0.006))
+    ]
+    Results(tmp_path).add(rows)
+    write_report(case, tmp_path, tmp_path / "no-problems")
+    made = pd.read_csv(tmp_path / "tables" / "island.csv").iloc[0]
+    assert made[["mean_peak_mhz", "swing_peak_mhz", "agc_travel_pu"]].tolist() == pytest.approx(
+        [5.0, 1.0, 2.0]
+    )
+    text = (tmp_path / "report.md").read_text()
+    assert 0 < text.index("peak of the mean frequency") < text.index("Table V:")
 
 
 def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_path: Path) -> None:

@@ -8,17 +8,18 @@ import pandas as pd
 
 from ded_bench.analysis.lines import GROUP, groups, on_usual_model, title
 from ded_bench.analysis.paper_numbers import result_lines
+from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
-from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, STRICT_HZ, STRICT_PU
-from ded_bench.report.columns import TABLE_V, TABLE_VI, tabulate, without_paper
+from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
+from ded_bench.report.columns import ISLAND, TABLE_V, TABLE_VI, tabulate, without_paper
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
 
 #: How the tables are to be read.
 EXPLANATION = (
-    "**Objective and violations are re-simulated**: every schedule is integrated on the true swing "
-    "equations, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_ref − 1) over "
+    "**Objective and violations are re-simulated**: every schedule is simulated on the plant of "
+    "the case, whatever its solver claimed. The increase is the mean of the signed 100·(J / J_ref − 1) over "
     "the `n` instances where both have a score; violations are means of each instance's maximum over time "
     "and generators.",
     "**Failures** are rows without a schedule or a score. They enter no mean, and a method with failures is "
@@ -28,8 +29,8 @@ EXPLANATION = (
     "**DED's optima are local**: the problem is not convex, so a method may come out below zero; DED also "
     "breaks the tight frequency bound slightly, since backward Euler is not exact.",
     "**Success** is what a method claims, **feasible** what the scorer found: frequency within "
-    f"{FEASIBLE_HZ:g} Hz, power limits within {FEASIBLE_PU:g} pu (strictly: {STRICT_HZ:g} Hz and "
-    f"{STRICT_PU:g} pu).",
+    f"{FEASIBLE_HZ:g} Hz (islands: {ISLAND_HZ:g} Hz), power limits within {FEASIBLE_PU:g} pu (strictly: "
+    f"{STRICT_HZ:g} Hz and {STRICT_PU:g} pu).",
     "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly instances weigh more "
     "in it than in the mean of the gaps.",
     "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
@@ -41,10 +42,11 @@ EXPLANATION = (
 def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """The first screen, and all methods folded away."""
     case, reference, paper = sources.case, sources.reference, sources.paper
-    regimes = ", ".join(f"{name} |ω| ≤ {limit.largest_hz:g} Hz" for name, limit in case.regimes.items())
+    regimes = "; ".join(f"{name} {limit.sentence}" for name, limit in case.regimes.items())
+    slack = "on an island, all scheduled" if case.slack is None else "besides the slack bus"
     what = (
-        f"{case.n_bus} buses, {len(case.generators)} generators besides the slack bus, "
-        f"{len(case.loads)} loads; {rows_caption(sources)}; regimes: {regimes}. "
+        f"{case.n_bus} buses, {len(case.generators)} generators {slack}, "
+        f"{len(case.loads)} loads; {rows_caption(sources)}. Regimes: {regimes}. "
         f"Every objective and violation is re-simulated; gaps are to {reference.title}."
     )
     # Beside the paper's numbers, methods stand on their usual surrogates alone.
@@ -60,6 +62,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
         *(Text(text, note=True) for text in alarms(sources)),
+        *_on_island(sources),
         *usual_first(five, shown),
         *usual_first(six, shown),
         Items(tuple(said)),
@@ -69,6 +72,16 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         Heading("Schedules and frequencies"),
         *pictures["schedules"],
     ]
+
+
+def _on_island(sources: Sources) -> Iterator[PageTable]:
+    """What dispatch does to frequencies, secondary control and cost, where rows have it."""
+    if sources.case.slack is None and len(sources.judged):
+        caption = (
+            "What each dispatch does to an island's frequency, secondary control (AGC) and cost: means over "
+            f"{rows_caption(sources)}; feasible: within {ISLAND_HZ:g} Hz of every bound"
+        )
+        yield PageTable(tabulate(ISLAND, island_summary(sources.judged)), ISLAND, caption, "island")
 
 
 def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:

@@ -116,6 +116,9 @@ class LaggedPlant:
     def columns(self, states: Any) -> Mapping[str, Array]:
         return self.network.columns(states)
 
+    def static_dispatch(self, instance: Instance, times: Array) -> Array:
+        return self.network.static_dispatch(instance, times)
+
     def balanced(self, instance: Instance) -> Instance:
         return instance
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from ded_bench.methods import ed
-from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import SimulationError, servable
+from ded_bench.plants.plant import NominalPoint, SimulationError, plant_of, servable
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -22,45 +22,44 @@ KNOT_PERIODS = 2 / 3
 class CaseCheck:
     """Nominal operating point, modes around it, and what becomes of drawn instances."""
 
-    p_slack: float  # pu, at nominal powers
-    angle_deg: float  # largest angle across a line at nominal powers
-    frequency_hz: Array  # natural frequencies |λ|/2π of the modes, ascending
+    nominal: NominalPoint
+    frequency_hz: Array  # natural frequencies |λ|/2π of the modes, ascending; on islands those that oscillate
     damping: Array  # their damping ratios -Re λ/|λ|
-    knots: int  # suggested number, see `suggested_knots`
+    knots: int | None  # suggested number, see `suggested_knots`; None on islands, whose knots are AGC's
     drawn: int  # instances
     served: int  # of these at the first draw
-    redrawn_loads: int  # because their sign changed; case/2 only
-    peak_hz: Array  # ascending largest |ω| of those served under static dispatch; ∞ where it collapses
-
-    def violating(self, bound_hz: float) -> float:
-        """Share of the served instances that static dispatch takes beyond a bound."""
-        return float((self.peak_hz > bound_hz).mean())
+    redrawn_loads: int  # because their sign changed; not in case/1
+    peak_hz: dict[str, Array]  # by kind of bound: largest values under static dispatch, ascending
+    violating: dict[str, float]  # by regime: share that static dispatch takes beyond a bound
 
 
 def check_case(case: Case, count: int) -> CaseCheck:
     """Examine a case on validation instances 0 to count - 1.
 
     Raises:
-        PowerFlowError: the power flow of the nominal powers has no stable solution.
+        SimulationError: the nominal powers have no equilibrium.
     """
-    network = Network(case)
-    theta = network.power_flow(case.p_nominal, case.load_nominal)
-    modes = network.linearise(theta).modes()
-    modes = modes[modes.imag >= 0]
+    nominal = plant_of(case).nominal()
+    modes = nominal.modes[nominal.modes.imag >= (0.0 if case.slack else 1e-6)]
     modes = modes[np.argsort(np.abs(modes))]
     drawn = list(drawn_with_redraws(case, VALIDATION_SEED, count))
     served = [found for instance, _ in drawn if (found := servable(case, instance))]
     frequency = np.abs(modes) / (2 * np.pi)
+    runs = [_static(case, instance) for instance in served]
+    beyond = {
+        regime: [omega is None or max(case.bounds(regime).excess_hz(omega).values()) > 0 for omega in runs]
+        for regime in case.regimes
+    }
     return CaseCheck(
-        p_slack=float(-case.p_nominal.sum() - case.load_nominal.sum()),
-        angle_deg=float(np.degrees(np.abs(theta @ network.incidence.T).max())),
+        nominal=nominal,
         frequency_hz=frequency,
         damping=-modes.real / np.abs(modes),
-        knots=suggested_knots(case, float(frequency[-1])),
+        knots=suggested_knots(case, float(frequency[-1])) if case.slack else None,
         drawn=count,
         served=len(served),
         redrawn_loads=sum(redraws for _, redraws in drawn),
-        peak_hz=np.sort([_peak(case, instance) for instance in served]),
+        peak_hz=_peaks(case, runs),
+        violating={regime: float(np.mean(found)) if found else 0.0 for regime, found in beyond.items()},
     )
 
 
@@ -75,11 +74,17 @@ def suggested_knots(case: Case, fastest_hz: float) -> int:
     return 1 + next(steps // apart for apart in range(min(most, steps), 0, -1) if steps % apart == 0)
 
 
-def _peak(case: Case, instance: Instance) -> float:
-    """Largest |ω| in Hz under static dispatch; ∞ where the system collapses."""
-    schedule = ed.dispatch(case, instance)
+def _static(case: Case, instance: Instance) -> Array | None:
+    """Frequency deviations under static dispatch, (n, n_gen), rad/s; None where the system collapses."""
     try:
-        run = simulate(case, instance, schedule)
+        return simulate(case, instance, ed.dispatch(case, instance)).omega
     except SimulationError:
-        return np.inf
-    return float(np.abs(run.omega).max() / (2 * np.pi))
+        return None
+
+
+def _peaks(case: Case, runs: list[Array | None]) -> dict[str, Array]:
+    """Largest values of what the case bounds, Hz, ascending over runs; ∞ for those that collapse."""
+    bounds = case.bounds(next(iter(case.regimes)))
+    free = dataclasses.replace(bounds, limit=np.zeros_like(bounds.limit))
+    found = [dict.fromkeys(bounds.kinds, np.inf) if run is None else free.excess_hz(run) for run in runs]
+    return {kind: np.sort([peaks[kind] for peaks in found]) for kind in dict.fromkeys(bounds.kinds)}

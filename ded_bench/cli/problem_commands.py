@@ -171,15 +171,15 @@ def _list() -> int:
 
 def _check(case: Case, count: int) -> int:
     from ded_bench.analysis.inspect_case import check_case
-    from ded_bench.plants.lossless.network import PowerFlowError
+    from ded_bench.plants.plant import SimulationError
 
     sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
     print(f"case {case.id}: {sizes}", flush=True)
     say(f"drawing and simulating {counted(count, 'instance')}")
     try:
         found = check_case(case, count)
-    except PowerFlowError as error:
-        print(f"ded-bench: case {case.id}: nominal powers: {error}", file=sys.stderr)
+    except SimulationError as error:
+        print(f"ded-bench: case {case.id}: {error}", file=sys.stderr)
         return 1
     _print_check(case, found)
     if not found.served:
@@ -191,9 +191,11 @@ def _check(case: Case, count: int) -> int:
 def _print_check(case: Case, found: CaseCheck) -> None:
     import numpy as np
 
-    angle = f"largest angle across a line {found.angle_deg:.1f} degrees"
-    print(f"power flow   slack {found.p_slack:.4g} pu, {angle}")
-    print(f"modes        {len(found.frequency_hz)}; knots {case.n_knots}, suggested {found.knots}")
+    nominal, slack = found.nominal, found.nominal.p_slack
+    angle = f"largest angle across a line {nominal.angle_deg:.1f} degrees"
+    print(f"power flow   {'island' if slack is None else f'slack {slack:.4g} pu'}, {angle}")
+    knots = "" if found.knots is None else f", suggested {found.knots}"
+    print(f"modes        {len(found.frequency_hz)}; knots {case.n_knots}{knots}")
     print("             Hz        damping %")
     for frequency, damping in zip(found.frequency_hz, found.damping, strict=True):
         print(f"             {frequency:<8.3f}  {100 * damping:.1f}")
@@ -201,14 +203,15 @@ def _print_check(case: Case, found: CaseCheck) -> None:
     print(f"draws        {found.served} of {found.drawn} servable at once; {again}")
     if not found.served:
         return
-    print("static dispatch: largest |omega| in Hz of an instance")
+    print("static dispatch: largest of an instance, Hz")
+    print("                       " + "".join(f"{kind:<10}" for kind in found.peak_hz))
     for percent in (0, 10, 25, 50, 75, 90, 100):
-        peak = np.quantile(found.peak_hz, percent / 100, method="higher")
-        print(f"             {percent:>3} %     {peak:.4g}")
+        peaks = [np.quantile(of, percent / 100, method="higher") for of in found.peak_hz.values()]
+        print(f"             {percent:>3} %     " + "".join(f"{peak:<10.4g}" for peak in peaks).rstrip())
     print("static dispatch violates")
     for regime, limits in case.regimes.items():
-        share = found.violating(limits.largest_hz)
-        print(f"             {regime}: {100 * share:.0f} % of the instances beyond {limits.largest_hz:g} Hz")
+        bounds = ", ".join(f"{name} {value:g}" for name, value in limits)
+        print(f"             {regime}: {100 * found.violating[regime]:.0f} % of the instances ({bounds})")
 
 
 def _scenarios(a: argparse.Namespace) -> int:

@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ded_bench.files.errors import InputError
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
@@ -35,6 +38,15 @@ class Piece:
     p_slack: Array  # (n,), pu
     states: Any  # at all points, for the plant's own use
     end: PlantState
+
+
+@dataclass(frozen=True, eq=False)
+class NominalPoint:
+    """The equilibrium of a case's nominal powers and loads."""
+
+    p_slack: float | None  # pu; None on an island
+    angle_deg: float  # largest angle across a line
+    modes: NDArray[np.complex128]  # eigenvalues at it, 1/s
 
 
 class Plant(Protocol):
@@ -91,6 +103,13 @@ class Plant(Protocol):
 
     def check_servable(self, instance: Instance, source: str) -> None:
         """Raise InputError, which names source and field, unless static dispatch can serve it throughout."""
+
+    def nominal(self) -> NominalPoint:
+        """The equilibrium of nominal powers and loads.
+
+        Raises:
+            SimulationError: there is none.
+        """
 
     def static_dispatch(self, instance: Instance, times: Array) -> Array:
         """Cheapest powers that serve the loads at some times, whatever frequencies do; (n, n_gen), pu.

@@ -22,7 +22,7 @@ from ded_bench.plants.detailed.detailed_linearisation import linearised
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.start import initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
-from ded_bench.plants.plant import Piece, SimulationError
+from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import AgcState, Instance, State
@@ -180,6 +180,16 @@ class DetailedPlant:
     def balanced(self, instance: Instance) -> Instance:
         """See `Plant.balanced`: on an island all machines take what powers and losses differ by."""
         return instance if self.case.slack else self.dispatcher.balanced_instance(instance)
+
+    def nominal(self) -> NominalPoint:
+        """See `Plant.nominal`; phase shifts of transformers are part of angles across them."""
+        system = self.equations.system
+        point = system.network.nominal()
+        voltage = dict(zip(system.network.buses, system.network.spread @ point.voltage, strict=True))
+        lines = self.case.detailed.network.lines
+        across = np.angle([voltage[line.from_bus] / voltage[line.to_bus] for line in lines])
+        slack = None if system.island else float(point.power.real[system.network.balancing])
+        return NominalPoint(slack, float(np.degrees(np.abs(across).max())), system.modes(point))
 
     def static_dispatch(self, instance: Instance, times: Array) -> Array:
         """See `Plant.static_dispatch`: losses are balanced at the least cost."""

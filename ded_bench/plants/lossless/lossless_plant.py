@@ -16,7 +16,7 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network, PowerFlowError
-from ded_bench.plants.plant import Piece, SimulationError
+from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, series_step
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -130,6 +130,17 @@ class LosslessPlant:
         return {
             f"theta_{bus.id}": column for bus, column in zip(lossless(self.case).buses, states.T, strict=True)
         }
+
+    def nominal(self) -> NominalPoint:
+        """See `Plant.nominal`."""
+        case, network = self.case, self.network
+        try:
+            theta = network.power_flow(case.p_nominal, case.load_nominal)
+        except PowerFlowError as error:
+            raise SimulationError(f"nominal powers: {error}") from None
+        across = np.abs(theta @ network.incidence.T).max()
+        p_slack = float(-case.p_nominal.sum() - case.load_nominal.sum())
+        return NominalPoint(p_slack, float(np.degrees(across)), network.linearise(theta).modes())
 
     def static_dispatch(self, instance: Instance, times: Array) -> Array:
         """See `Plant.static_dispatch`: the merit order; the slack takes what is missing."""

@@ -1,4 +1,4 @@
-"""Commands that make schedules, judge them and solve rows again: solve, score, reproduce."""
+"""Commands that make schedules, judge them and solve rows again: solve, score, reproduce, referee."""
 
 from __future__ import annotations
 
@@ -54,6 +54,16 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
     declare(p, "--workers")
     p.set_defaults(run=_reproduce, instance=None)
+    p = command(commands, "referee", "ANDES, the field's simulator, judges kept schedules: referee.csv")
+    p.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose schedules are judged")
+    p.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in the results")
+    p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
+    p.add_argument(
+        "--limit", type=positive, metavar="N", help="of instances, those with most schedules first"
+    )
+    p.add_argument("--python", default=sys.executable, metavar="PATH", help="one that has ANDES")
+    declare(p, "--workers")
+    p.set_defaults(run=_referee, instance=None)
 
 
 def _add_solve(commands: Any) -> None:
@@ -226,6 +236,21 @@ def _reproduce(a: argparse.Namespace) -> int:
     differ = sum(len(line.differences) for line in lines)
     print(f"{counted(sum(line.rows for line in lines), 'row')} solved again, {differ} differ")
     return 1 if differ else 0
+
+
+def _referee(a: argparse.Namespace) -> int:
+    """Kept schedules of a results folder through ANDES."""
+    from ded_bench.analysis.referee import referee
+
+    results, case, instances = _rows_of(a)
+    rows = referee(case, instances, results, a.method, a.limit, a.python, a.workers)
+    verified = [row for row in rows if results.rows[row.key].feasible and not row.error]
+    print(
+        f"{counted(len(rows), 'row')} in {results.paths.referee}, {sum(bool(row.error) for row in rows)} "
+        f"without an answer; {sum(bool(row.confirmed) for row in verified)} of {len(verified)} feasible rows "
+        "are confirmed"
+    )
+    return 1 if any(row.error for row in rows) else 0
 
 
 def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]:

@@ -55,6 +55,11 @@ class ResultsFolder:
         return self.path / "validated.csv"
 
     @property
+    def referee(self) -> Path:
+        """What the field's simulator says of kept schedules."""
+        return self.path / "referee.csv"
+
+    @property
     def koopman(self) -> Path:
         """Folder of identified models."""
         return self.path / "koopman"

@@ -1,0 +1,319 @@
+"""The field's simulator as the last judge: kept schedules through ANDES, in a process of its own.
+
+ANDES is under the GPL and an optional tool. This package writes plain files and starts a script
+(`andes_run`) with a Python that has ANDES; nothing else passes between them. A schedule is confirmed if
+its peaks there keep the bounds of its regime, with an allowance for what two simulators may differ by.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import queue
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ded_bench.files.errors import InputError
+from ded_bench.files.keyed_table import KeyedTable
+from ded_bench.files.table import Table
+from ded_bench.plants.plant import SimulationError, plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
+from ded_bench.problem.quantities import Array
+from ded_bench.problem.schedule import Schedule
+from ded_bench.results.rows import Key, Results, Row
+
+SCRIPT = Path(__file__).with_name("andes_run.py")
+#: What ANDES models here.
+PLANT = "detailed"
+#: What a peak may exceed its bound by and still be confirmed: the larger of a part of it and so many Hz.
+RELATIVE, ABSOLUTE_HZ = 0.02, 5e-5
+
+
+@dataclass(frozen=True)
+class RefereeRow:
+    """What ANDES says of the kept schedule of one row.
+
+    Peaks are largest sizes over time of what the bounds of each kind are about, in Hz, of those kinds that
+    the regime has. `difference_hz` is the largest difference of a machine's frequency from that of our own
+    detailed plant, at any time.
+    """
+
+    case: str
+    instance: str
+    regime: str
+    method: str
+    settings: str
+    plant: str
+    model: str = ""
+    policy: str = ""
+    time_limit_s: float | None = None
+    peak_omega_hz: float | None = None
+    peak_mean_hz: float | None = None
+    peak_relative_hz: float | None = None
+    peak_end_hz: float | None = None
+    confirmed: bool | None = None
+    difference_hz: float | None = None
+    error: str = ""
+    andes: str = ""
+    fingerprint: str = ""
+    method_version: int = 0
+
+    @property
+    def key(self) -> Key:
+        """The place of the row in the table, that of the results' row."""
+        return Key(*(getattr(self, name) for name in Key._fields))
+
+
+REFEREE = Table(RefereeRow)
+
+
+def verdict(bounds: Bounds, omega: Array) -> dict[str, Any]:
+    """Peaks by kind in Hz, and whether all keep their bounds within the allowance.
+
+    Args:
+        bounds: of a regime.
+        omega: deviations of the generators, shape (n, n_gen), rad/s.
+    """
+    still = dataclasses.replace(bounds, limit=np.zeros_like(bounds.limit))
+    allowance = np.maximum(RELATIVE * bounds.limit, 2 * np.pi * ABSOLUTE_HZ)
+    allowed = dataclasses.replace(bounds, limit=bounds.limit + allowance)
+    peaks = {f"peak_{kind}_hz": peak for kind, peak in still.excess_hz(omega).items()}
+    return peaks | {"confirmed": not any(allowed.excess_hz(omega).values())}
+
+
+def grid_data(case: Case) -> dict[str, Any]:
+    """What the script needs to know of a grid.
+
+    Raises:
+        InputError: the case has no full machine models.
+    """
+    grid, agc = case.detailed, case.agc
+    return {
+        "network": grid.network.model_dump(mode="json", by_alias=True),
+        "machines": grid.data.model_dump(mode="json", by_alias=True),
+        "infinite": None if case.slack is None else case.machine_of(case.slack),
+        "agc": None if agc is None else agc.model_dump(mode="json"),
+    }
+
+
+def run_data(case: Case, instance: Instance, schedule: Schedule) -> dict[str, Any]:
+    """What the script needs to know of one run: start, loads drawn and set-points over time, in pu.
+
+    Raises:
+        SimulationError: the instance starts from a measured state.
+    """
+    if (field := instance.initial.measured) is not None:
+        raise SimulationError(f"initial.{field}: ANDES starts from equilibria only")
+    names = [case.machine_of(name) for name in case.generators]
+    loads = {}
+    for bus in case.loads:
+        load = instance.load[bus]
+        times = np.unique([0.0, instance.horizon_s, *(t for t in load.kinks if t < instance.horizon_s)])
+        loads[bus] = {"t": times.tolist(), "p": (-load.at(times)).tolist()}
+    return {
+        "dt_s": instance.dt_s,
+        "horizon_s": instance.horizon_s,
+        "power": dict(zip(names, instance.p_initial(case).tolist(), strict=True)),
+        "omega": dict(zip(names, instance.omega_initial(case).tolist(), strict=True)),
+        "t": schedule.t.tolist(),
+        "set_points": dict(zip(names, schedule.p.T.tolist(), strict=True)),
+        "loads": loads,
+    }
+
+
+class Andes:
+    """A process that runs ANDES on one grid; ends with its `with` block.
+
+    Attributes:
+        version: of ANDES.
+    """
+
+    def __init__(self, python: str, grid: Mapping[str, Any]) -> None:
+        """Start it.
+
+        Raises:
+            InputError: there is no such interpreter, or it has no ANDES.
+        """
+        self._python, self._count = python, 0
+        with ExitStack() as stack:
+            self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ded-bench-")))
+            place = self._folder / "grid.json"
+            place.write_text(json.dumps(grid), encoding="utf-8")
+            self._said = stack.enter_context((self._folder / "said.txt").open("w+", encoding="utf-8"))
+            told, pipe = [python, str(SCRIPT), str(place)], subprocess.PIPE
+            try:
+                self._process = subprocess.Popen(told, stdin=pipe, stdout=pipe, stderr=self._said, text=True)
+            except OSError as error:
+                raise InputError(python, "", f"cannot be started ({error.strerror or error})") from None
+            stack.callback(self._end)
+            self.version = str(self._answer()["andes"])
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Andes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def speeds(self, run: Mapping[str, Any]) -> Array:
+        """Deviations of all machines, in the order of the grid's file, (n, n_machine), rad/s.
+
+        Points are equidistant from 0 to the horizon.
+
+        Raises:
+            SimulationError: ANDES finds no equilibrium, or no solution later.
+        """
+        self._count += 1
+        place = self._folder / f"{self._count}.json"
+        place.write_text(json.dumps(run), encoding="utf-8")
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{place}\n")
+        self._process.stdin.flush()
+        answer = self._answer()
+        place.unlink()
+        if answer["error"]:
+            raise SimulationError(answer["error"])
+        found = place.with_suffix(".npy")
+        speeds: Array = np.load(found, allow_pickle=False)
+        found.unlink()
+        return speeds
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        if line := self._process.stdout.readline():
+            answer: dict[str, Any] = json.loads(line)
+            return answer
+        self._said.seek(0)
+        last = (self._said.read().strip().splitlines() or ["it said nothing"])[-1]
+        if last.startswith("ModuleNotFoundError"):
+            problem = (
+                f"has no ANDES ({last}): skipped; `pip install andes` there, or name another by --python"
+            )
+            raise InputError(self._python, "", problem)
+        raise InputError(self._python, "", f"ANDES ended without an answer ({last})")
+
+
+def referee(
+    case: Case,
+    instances: Mapping[str, Instance],
+    results: Results,
+    methods: Sequence[str] = (),
+    limit: int | None = None,
+    python: str = sys.executable,
+    workers: int = 1,
+) -> list[RefereeRow]:
+    """Run kept schedules of a results folder through ANDES; each is saved in `referee.csv` at once.
+
+    What stands there already, of the same schedule on the same grid, is not run again.
+
+    Args:
+        case: of the rows.
+        instances: by id; rows of others are passed over.
+        results: whose schedules are judged.
+        methods: only rows of these; none: of all.
+        limit: of instances; those with most schedules come first, so that methods meet on the same.
+        python: an interpreter that has ANDES.
+        workers: processes.
+
+    Returns:
+        The rows asked for, those that were there included.
+
+    Raises:
+        InputError: there is no schedule or no ANDES, or the case has no full machine models.
+    """
+    grid = grid_data(case)
+    table: KeyedTable[Key, RefereeRow] = KeyedTable(results.paths.referee, REFEREE)
+    kept = [row for row in results.kept(instances) if not methods or row.method in methods]
+    count = Counter(row.instance for row in kept)
+    first = sorted(count, key=lambda name: (-count[name], name))[:limit]
+    found, todo = [], []
+    for row in (row for row in kept if row.instance in first):
+        schedule = results.schedule(row, case, instances[row.instance])
+        facts = f"{row.fingerprint} {case.detailed.fingerprint}".encode()
+        judged_on = facts + schedule.t.tobytes() + schedule.p.tobytes()
+        name = hashlib.sha256(judged_on).hexdigest()[:12]
+        if table.made_from(row.key, name):
+            found.append(table.rows[row.key])
+        else:
+            todo.append((row, name))
+    with tqdm(total=len(todo), unit="row", disable=None, desc="referee") as bar:
+        for new in _judged(case, instances, results, todo, grid, python, min(workers, len(todo))):
+            table.add([new])
+            found.append(new)
+            bar.update()
+    table.compact()
+    return found
+
+
+def _judged(
+    case: Case,
+    instances: Mapping[str, Instance],
+    results: Results,
+    todo: Sequence[tuple[Row, str]],
+    grid: Mapping[str, Any],
+    python: str,
+    workers: int,
+) -> Iterator[RefereeRow]:
+    """Rows as they are judged, by so many processes at a time."""
+    idle: queue.SimpleQueue[Andes] = queue.SimpleQueue()
+
+    def judge(row: Row, name: str) -> RefereeRow:
+        instance = instances[row.instance]
+        schedule = results.schedule(row, case, instance)
+        made = RefereeRow(
+            **row.key._asdict(), plant=PLANT, fingerprint=name, method_version=row.method_version
+        )
+        andes = idle.get()
+        try:
+            cells = judged(case, instance, schedule, row.regime, andes)
+        finally:
+            idle.put(andes)
+        return dataclasses.replace(made, **cells, andes=andes.version)
+
+    with ExitStack() as stack:
+        for _ in range(workers):
+            idle.put(stack.enter_context(Andes(python, grid)))
+        pool = stack.enter_context(ThreadPoolExecutor(max(workers, 1)))
+        waiting = [pool.submit(judge, *asked) for asked in todo]
+        try:
+            for done in as_completed(waiting):
+                yield done.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def judged(case: Case, instance: Instance, schedule: Schedule, regime: str, andes: Andes) -> dict[str, Any]:
+    """The cells that ANDES's run of a schedule fills: `verdict`, and the difference from our plant."""
+    order = list(case.detailed.machines)
+    columns = [order.index(case.machine_of(name)) for name in case.generators]
+    try:
+        omega = andes.speeds(run_data(case, instance, schedule))[:, columns]
+    except SimulationError as error:
+        return {"error": str(error)}
+    cells = verdict(case.bounds(regime), omega)
+    try:
+        ours = simulate(case, instance, schedule, plant_of(case, PLANT)).omega
+    except SimulationError:
+        return cells
+    theirs = omega[:: max((len(omega) - 1) // (len(ours) - 1), 1)]
+    ours = ours[:: max((len(ours) - 1) // (len(omega) - 1), 1)]
+    return cells | {"difference_hz": float(np.abs(theirs - ours).max() / (2 * np.pi))}

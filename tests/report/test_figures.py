@@ -14,11 +14,11 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.figures.panels import (
     FEW,
     Shown,
+    balance_panel,
     busiest,
     frequency_panels,
     load_panel,
     power_panels,
-    slack_panel,
     time_figure,
 )
 from ded_bench.report.figures.profile import profile_figure
@@ -48,7 +48,7 @@ def test_trajectories_in_panels(name: str, tmp_path: Path) -> None:
         Shown(method, title(method), place, t, scale * waves, 1e-3 * scale * waves, loads, waves[:, 0])
         for place, (method, scale) in enumerate((("ded-radau", 1.0), ("$\\frac{$", 0.5)))
     ]
-    panels = [*power_panels(case, shown), load_panel(case, shown[0]), slack_panel(case, shown)]
+    panels = [*power_panels(case, shown), load_panel(case, shown[0]), balance_panel(case, "TO", shown)]
     figure = time_figure("heading", panels, 2)
     chosen = busiest([waves], FEW)
     assert len(chosen) == min(n_gen, FEW)

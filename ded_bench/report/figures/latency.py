@@ -13,10 +13,10 @@ from ded_bench.analysis.lines import titled, where
 from ded_bench.analysis.online_summary import STATIC, own_latency
 from ded_bench.report.figures.panels import (
     Shown,
+    balance_panel,
     frequency_panels,
     load_panel,
     power_panels,
-    slack_panel,
     time_figure,
 )
 from ded_bench.report.figures.style import Drawn, colour, legend_below, marker, new_figure, plain
@@ -47,7 +47,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         caption = f"Scenario {heading}: loads, powers, frequencies and slack power under {names}."
         panels = [load_panel(case, shown[0]), *power_panels(case, shown, GENERATORS_SHOWN)]
         panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
-        panels.append(slack_panel(case, shown))
+        panels.append(balance_panel(case, sources.tightest, shown))
         yield Drawn("online_scenario", caption, time_figure(heading, panels, 1))
 
 

@@ -59,6 +59,11 @@ class Shown:
         return Curve(self.t, values, self.label, style)
 
 
+#: Labels of frequencies by what is bounded, of a generator or of all.
+LABELS = {"omega": "$\\omega_{%s}$ (mHz)", "relative": "$\\omega_{%s}$ - mean (mHz)"}
+MEAN = "mean $\\omega$ (mHz)"
+
+
 def power_panels(case: Case, shown: Sequence[Shown], count: int = FEW) -> list[Panel]:
     """Powers with their bounds of the generators that move most, pu."""
     return [
@@ -72,16 +77,21 @@ def power_panels(case: Case, shown: Sequence[Shown], count: int = FEW) -> list[P
 
 
 def frequency_panels(case: Case, regime: str, shown: Sequence[Shown], count: int = FEW) -> list[Panel]:
-    """Frequency deviations with the regime's bounds of the generators that move most, mHz."""
-    limit = 1e3 * case.regimes[regime].largest_hz
-    return [
-        Panel(
-            f"$\\omega_{{{case.generators[j]}}}$ (mHz)",
-            [one.curve(1e3 * RAD_TO_HZ * one.omega[:, j]) for one in shown],
-            (limit, -limit),
-        )
-        for j in busiest([one.omega for one in shown], count)
-    ]
+    """What the regime bounds of frequency deviations, those that move most, mHz.
+
+    Every generator's; on an island their mean, and each one's difference from it.
+    """
+    bounds = case.bounds(regime)
+    whole = np.flatnonzero(~bounds.at_end)
+    outputs = [1e3 * RAD_TO_HZ * one.omega @ bounds.matrix[whole].T for one in shown]
+    names = iter(case.generators)
+    labels = [MEAN if bounds.kinds[j] == "mean" else LABELS[bounds.kinds[j]] % next(names) for j in whole]
+    panels = []
+    for j in busiest(outputs, count):
+        limit = 1e3 * RAD_TO_HZ * float(bounds.limit[whole[j]])
+        curves = [one.curve(values[:, j]) for one, values in zip(shown, outputs, strict=True)]
+        panels.append(Panel(labels[j], curves, (limit, -limit)))
+    return panels
 
 
 def load_panel(case: Case, one: Shown) -> Panel:
@@ -93,8 +103,12 @@ def load_panel(case: Case, one: Shown) -> Panel:
     return Panel("loads (pu)", curves)
 
 
-def slack_panel(case: Case, shown: Sequence[Shown]) -> Panel:
-    """Slack power, pu."""
+def balance_panel(case: Case, regime: str, shown: Sequence[Shown]) -> Panel:
+    """What takes up imbalances: slack power, pu; on an island the mean frequency, mHz."""
+    if case.slack is None:
+        mean = case.inertia / case.inertia.sum()
+        limit = 1e3 * RAD_TO_HZ * float(case.bounds(regime).limit[0])
+        return Panel(MEAN, [one.curve(1e3 * RAD_TO_HZ * one.omega @ mean) for one in shown], (limit, -limit))
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
 
 

@@ -11,10 +11,10 @@ from ded_bench.analysis.lines import main_lines, records, titled, where
 from ded_bench.methods.registry import METHODS
 from ded_bench.report.figures.panels import (
     Shown,
+    balance_panel,
     frequency_panels,
     load_panel,
     power_panels,
-    slack_panel,
     time_figure,
 )
 from ded_bench.report.figures.style import Drawn
@@ -31,12 +31,13 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         if not shown:
             continue
         heading = f"{chosen['instance'].iloc[0]}, {regime}"
+        last = "mean frequency" if case.slack is None else "slack power"
         names = " and ".join(one.label for one in reversed(shown))
         caption = (
-            f"{names} on {heading}: generator powers with bounds, loads, slack power. The instance's gap is "
-            "nearest to the median of those whose schedules are kept."
+            f"{names} on {heading}: set-points with bounds, loads, {last}. The instance's gap is nearest to "
+            "the median of those whose schedules are kept."
         )
-        panels = [*power_panels(case, shown), load_panel(case, shown[0]), slack_panel(case, shown)]
+        panels = [*power_panels(case, shown), load_panel(case, shown[0]), balance_panel(case, regime, shown)]
         yield Drawn(f"schedule_{regime}", caption, time_figure(heading, panels, 2))
         if regime == sources.tightest:
             caption = f"Frequencies under {names} on {heading}; dotted: the regime's bounds."
@@ -47,7 +48,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
 def shown_run(sources: Sources, row: dict[Any, Any], place: int = 0) -> Shown | None:
     """What figures show of a row; None if it cannot be simulated."""
     run = sources.trajectory(row["key"])
-    arrays = (run.t, run.p_gen, run.omega, run.p_load, run.p_slack) if run else ()
+    arrays = (run.t, run.p_set, run.omega, run.p_load, run.p_slack) if run else ()
     return Shown(row["method"], row["title"], place, *arrays) if run else None
 
 

@@ -119,6 +119,9 @@ class LaggedPlant:
     def static_dispatch(self, instance: Instance, times: Array) -> Array:
         return self.network.static_dispatch(instance, times)
 
+    def check_followed(self, instance: Instance) -> None:
+        self.network.check_followed(instance)
+
     def balanced(self, instance: Instance) -> Instance:
         return instance
 

@@ -131,6 +131,9 @@ class Plant(Protocol):
             dt_s: its step, s.
         """
 
+    def check_followed(self, instance: Instance) -> None:
+        """Raise SimulationError unless a servable instance that was drawn can follow static dispatch."""
+
     def balanced(self, instance: Instance) -> Instance:
         """A drawn instance with powers at t = 0 that are balanced, where no slack does that.
 
@@ -171,6 +174,7 @@ def servable(case: Case, instance: Instance) -> Instance | None:
     try:
         instance = plant.balanced(instance)
         plant.check_servable(instance, "")
+        plant.check_followed(instance)
     except (InputError, SimulationError):
         return None
     return instance

@@ -212,11 +212,19 @@ class DetailedPlant:
             lagging[k + 1] = mean + kept * (lagging[k] - mean)
         return np.asarray(gate * (t3 / t2) + lagging * (1.0 - t3 / t2))
 
+    def check_followed(self, instance: Instance) -> None:
+        """See `Plant.check_followed`: on an island from kink to kink, simulated."""
+        if self.case.slack is None:
+            point = initial_point(self.equations, instance)
+            schedule = self.dispatcher.followed(instance, self.equations.system.equilibrium(point).v_ref)
+            inputs = schedule.at(instance.grid), instance.p_load(self.case)
+            self.advance(self.initial(instance), *inputs, instance.dt_s, exact=False)
+
     def check_servable(self, instance: Instance, source: str) -> None:
         """See `Plant.check_servable`.
 
-        Powers and loads at t = 0 must have a stable equilibrium; with the exciters' references of it, the
-        static dispatch must have one at 0, at each kink of a load and, a stable one, at the horizon.
+        Powers and loads at t = 0 must have a stable equilibrium, the static dispatch at 0, at each kink of a
+        load and at the horizon a power flow.
         """
         equations = self.equations
         try:
@@ -229,6 +237,6 @@ class DetailedPlant:
             problem = f"initial loads and power cannot be served: {error}"
             raise InputError(source, "load, initial.power", problem) from None
         try:
-            self.dispatcher.check_kinks(instance, equations.system.equilibrium(point).v_ref)
+            self.dispatcher.check_kinks(instance)
         except SimulationError as error:
             raise InputError(source, "load", str(error)) from None

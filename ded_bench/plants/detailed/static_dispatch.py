@@ -19,6 +19,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import rounded
+from ded_bench.problem.schedule import Schedule
 
 #: Balanced is what is short of less than this, pu; powers that move by less in a program stay.
 BALANCED, STAYS = 1e-9, 1e-6
@@ -240,33 +241,42 @@ class StaticDispatch:
             point = network.power_flow(machines, drawn, point.voltage, sizes)
         raise SimulationError("exciters find no voltages")
 
-    def check_kinks(self, instance: Instance, v_ref: Array) -> None:
-        """Check that it can serve the loads at 0, at every kink and, stably, at the horizon.
+    def check_kinks(self, instance: Instance) -> None:
+        """Raise SimulationError unless it can serve the loads at 0, at every kink and at the horizon."""
+        p_load = instance.p_load(self.case, instance.kinks)
+        found = self.weigh(instance.p_initial(self.case), p_load[0])
+        for t, load in zip(instance.kinks.tolist(), p_load, strict=True):
+            try:
+                found = self._unhurried(instance, load, found)
+            except SimulationError as error:
+                raise SimulationError(f"loads at t = {t:g} s cannot be served: {error}") from None
 
-        On an island powers within the ramp limits must balance the loads from kink to kink, too.
+    def followed(self, instance: Instance, v_ref: Array) -> Schedule:
+        """Dispatch from kink to kink within ramp limits on an island, by the rule of draws.
+
+        With the exciters' references at t = 0 the unhurried dispatch must have an equilibrium at every kink
+        and a stable one at the horizon.
 
         Args:
             instance: of the case.
             v_ref: exciters' references, (n_machine,), pu.
 
         Raises:
-            SimulationError: it cannot.
+            SimulationError: it cannot serve the loads so.
         """
-        times, before = instance.kinks, 0.0
+        times, cost = instance.kinks, instance.cost_gen(self.case)
         p_load = instance.p_load(self.case, times)
         found = following = self.weigh(instance.p_initial(self.case), p_load[0])
-        for t, load in zip(times.tolist(), p_load, strict=True):
-            try:
-                found = self._unhurried(instance, load, found)
-                point = self.regulated(found, load, v_ref)
-                if t == times[-1] and not self.equations.system.stable(point):
-                    raise SimulationError("the equilibrium is not stable")
-                if self.case.slack is None and t > 0.0:  # at 0 the balancing machine takes a remainder
-                    reach = self.case.ramp * max(t - before, SHORTEST_S)
-                    following = self.cheapest(instance.cost_gen(self.case), load, following, reach, True)
-            except SimulationError as error:
-                raise SimulationError(f"loads at t = {t:g} s cannot be served: {error}") from None
-            before = t
+        powers = [found.power]
+        for before, t, load in zip(times, times[1:], p_load[1:], strict=False):
+            found = self._unhurried(instance, load, found)
+            point = self.regulated(found, load, v_ref)
+            reach = self.case.ramp * max(t - before, SHORTEST_S)
+            following = self.cheapest(cost, load, following, reach, True)
+            powers.append(following.power)
+        if not self.equations.system.stable(point):
+            raise SimulationError("the equilibrium at the horizon is not stable")
+        return Schedule(times, np.array(powers))
 
     def _unhurried(self, instance: Instance, p_load: Array, near: Balance) -> Balance:
         """Dispatch without ramp limits."""

@@ -151,6 +151,9 @@ class LosslessPlant:
         """See `Plant.set_points_delivering`: set-points are delivered."""
         return p_gen
 
+    def check_followed(self, instance: Instance) -> None:
+        """See `Plant.check_followed`: its slack follows."""
+
     def balanced(self, instance: Instance) -> Instance:
         """The instance: its slack balances it."""
         return instance

@@ -268,12 +268,13 @@ class StaticDispatch:
         p_load = instance.p_load(self.case, times)
         found = following = self.weigh(instance.p_initial(self.case), p_load[0])
         powers = [found.power]
-        for before, t, load in zip(times, times[1:], p_load[1:], strict=False):
+        for number, load in enumerate(p_load):
             found = self._unhurried(instance, load, found)
             point = self.regulated(found, load, v_ref)
-            reach = self.case.ramp * max(t - before, SHORTEST_S)
-            following = self.cheapest(cost, load, following, reach, True)
-            powers.append(following.power)
+            if number:
+                reach = self.case.ramp * max(times[number] - times[number - 1], SHORTEST_S)
+                following = self.cheapest(cost, load, following, reach, True)
+                powers.append(following.power)
         if not self.equations.system.stable(point):
             raise SimulationError("the equilibrium at the horizon is not stable")
         return Schedule(times, np.array(powers))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ded_bench.files.strict import Record
@@ -22,7 +23,7 @@ class Bounds:
 
     matrix: Array  # (n_out, n_gen)
     limit: Array  # (n_out,), rad/s
-    at_end: Array  # (n_out,), bool
+    at_end: NDArray[np.bool_]  # (n_out,)
     kinds: tuple[str, ...]  # (n_out,): `omega`, `mean`, `relative` or `end`
 
     def tightened(self, by: float = 0.0, part: float = 0.0) -> Bounds:

@@ -184,7 +184,9 @@ class _OnPlant:
         if attempt.wanted is not None:
             self.steps.append(float(np.abs(attempt.wanted - around.at).max()))
             # Where steps do not shrink, programs jump between vertices of nearly the same cost.
-            if len(self.steps) >= FREE_STEPS and self.steps[-1] > self.steps[-2] / 2:
+            if np.isfinite(self.radius):
+                self.radius /= 2
+            elif len(self.steps) >= FREE_STEPS and self.steps[-1] > self.steps[-2] / 2:
                 self.radius = self.steps[-1] / 2
         return attempt
 

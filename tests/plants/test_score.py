@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from ded_bench.plants.score import Score, judge, score
+from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.sampling import sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
 
@@ -208,3 +210,48 @@ def test_feasible_and_feasible_strict_have_their_thresholds(name):
 
 
 # Refusals.
+
+
+# Islands.
+
+
+def test_an_island_is_judged_by_its_mean_frequency_swings_and_end() -> None:
+    """Known excess over each bound, peaks, rms and AGC travel; a transfer counts among the limits."""
+    case = Case.load("two-area-agc")
+    instance = next(sample_instances(case, 1, 1))
+    n, weight = instance.steps + 1, case.inertia / case.inertia.sum()
+    swing = np.array([1.0, 1.0, -weight[:2].sum() / weight[2], 0.0])  # with a mean of zero
+    mean = np.where(np.arange(n) < n - 1, 0.04, 0.01)
+    omega = 2 * np.pi * (mean[:, None] + 1e-3 * swing)
+    p_set = np.tile(instance.p_initial(case), (n, 1))
+    load = instance.p_load(case)
+    p_set[:, 0] += 5.5 - case.transfer_excess(p_set, load)[0, 0] - 5.0
+    agc = np.repeat([0.0, 0.1, -0.2], [n - 2000, 1000, 1000])
+    run = Trajectory(
+        t=instance.grid,
+        omega=omega,
+        p_set=p_set,
+        p_gen=p_set + 0.25,
+        p_load=load,
+        p_slack=np.zeros(n),
+        case=case,
+        columns={"agc": agc},
+    )
+    found, limits = judge(case, instance, run, "NO"), case.regimes["NO"]
+    largest = 1e-3 * np.abs(swing).max()
+    assert found.objective == pytest.approx(((p_set + 0.25) @ instance.cost_gen(case)).sum(), rel=1e-12)
+    assert found.excess_mean_hz == found.freq_violation_hz == pytest.approx(0.04 - limits.mean_hz)
+    assert found.excess_relative_hz == pytest.approx(max(largest - limits.relative_hz, 0.0), abs=1e-15)
+    assert found.excess_end_hz == pytest.approx(0.01 - limits.end_hz)
+    assert found.mean_freq_max_hz == pytest.approx(0.04)
+    assert found.mean_freq_rms_hz == pytest.approx(0.04, rel=1e-4)
+    assert found.swing_max_hz == pytest.approx(largest)
+    assert found.swing_rms_hz == pytest.approx(1e-3 * np.sqrt(np.mean(swing**2)))
+    assert found.agc_travel_pu == pytest.approx(0.4)
+    assert found.bound_violation >= np.max(case.transfer_excess(p_set, load)) > 0.0
+
+
+@pytest.mark.parametrize(("excess", "feasible"), [(1e-5, True), (np.nextafter(1e-5, 1), False)])
+def test_an_island_is_feasible_within_a_tenth_of_the_tolerance(excess: float, feasible: bool) -> None:
+    verdict = Score(1.0, float(excess), 0.0, 0.0, 0.0, excess_mean_hz=float(excess))
+    assert verdict.feasible == feasible

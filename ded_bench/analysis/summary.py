@@ -7,6 +7,7 @@ counts as solved in a performance profile.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pandas as pd
 
 from ded_bench.analysis.lines import GROUP, HEAD, groups, head, line_table, records
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU
+from ded_bench.results.rows import Key
 from ded_bench.solvers.status import Status
 
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
@@ -32,7 +34,25 @@ ISLAND = {
     "swing_peak_mhz": ("swing_max_hz", 1e3),
     "agc_travel_pu": ("agc_travel_pu", 1.0),
 }
+#: Who judges kept schedules beside the scorer: full machine models, and ANDES.
+OTHER_JUDGES = ("validated", "confirmed")
 SPREAD = ("mean", "median", "p95", "max")
+
+
+def judged_elsewhere(
+    frame: pd.DataFrame, judgements: Mapping[str, Mapping[Key, bool | None]]
+) -> pd.DataFrame:
+    """Rows with a column for each of OTHER_JUDGES.
+
+    Args:
+        frame: rows of a results table; `key` is each one's there.
+        judgements: by judge and key; None where a schedule was given and could not be judged.
+
+    Returns:
+        The frame with judgements, empty texts where there are none.
+    """
+    columns = {name: [judgements[name].get(key, "") for key in frame["key"]] for name in OTHER_JUDGES}
+    return frame.assign(**{name: pd.Series(c, frame.index, dtype=object) for name, c in columns.items()})
 
 
 def gaps(frame: pd.DataFrame, objectives: pd.Series[float]) -> pd.DataFrame:
@@ -61,6 +81,8 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
     `n` rows have a gap, `failures` have no schedule or no score, `unpaired` have a score but no reference
     to compare with. `success_rate` is what solvers claim, `correct_rate` and
     `strict_rate` what the scorer found (`feasible`, `feasible_strict`); all three are shares of all rows.
+    `validated_rate` and `confirmed_rate` are shares of the `validated_n` and `confirmed_n` rows that another
+    judge could judge, of `validated_asked` and `confirmed_asked` whose schedules it was given.
     """
     rows = [head(regime, key) | statistics(group) for regime, key, group in groups(frame)]
     return line_table(rows, [*HEAD, *statistics(frame[:0])])
@@ -93,6 +115,11 @@ def statistics(group: pd.DataFrame) -> dict[str, Any]:
     found["cost_ratio"] = cost / theirs if theirs > 0 else np.nan
     for name in VIOLATIONS:
         found |= _spread(name, group[name].dropna())
+    for name in OTHER_JUDGES:
+        asked = [judgement for judgement in group.get(name, ()) if judgement != ""]
+        said = [judgement for judgement in asked if judgement is not None]
+        found |= {f"{name}_asked": len(asked), f"{name}_n": len(said)}
+        found[f"{name}_rate"] = float(np.mean(said)) if said else np.nan
     return found
 
 

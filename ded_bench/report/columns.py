@@ -155,6 +155,13 @@ RATES = (
     Column("correct_rate", "feasible (verified)", form=".1%"),
     Column("strict_rate", "strictly feasible (verified)", form=".1%"),
 )
+#: Beside them, where full machine models or ANDES have judged schedules.
+OTHER_RATES = (
+    Column("validated_rate", "feasible (validated)", form=".1%"),
+    Column("carried", "carried", value=lambda x: f"{x['validated_n']} of {x['validated_asked']}"),
+    Column("confirmed_rate", "confirmed by ANDES", form=".1%"),
+    Column("refereed", "answered", value=lambda x: f"{x['confirmed_n']} of {x['confirmed_asked']}"),
+)
 VIOLATIONS = (
     *_HEAD,
     *_FREQUENCY,

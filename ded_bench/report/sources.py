@@ -14,8 +14,9 @@ from ded_bench.analysis.certificate import Certificate, read_certificates
 from ded_bench.analysis.lines import judged_rows, named, newest
 from ded_bench.analysis.online_summary import online_rows
 from ded_bench.analysis.paper_numbers import Paper, read_paper
+from ded_bench.analysis.referee import REFEREE
 from ded_bench.analysis.reference import Reference, choose_reference
-from ded_bench.analysis.summary import gaps, summary
+from ded_bench.analysis.summary import gaps, judged_elsewhere, summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import SimulationError
@@ -27,7 +28,7 @@ from ded_bench.problem.trajectory import Trajectory
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
-from ded_bench.results.rows import Key, Results
+from ded_bench.results.rows import VALIDATED, Key, Results
 from ded_bench.results.timing import TIMING, WARM_UP, read_timing, timing_summary
 
 
@@ -135,7 +136,7 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     rows, left_out = newest(ours)
     notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
-    rows = gaps(rows, reference.objectives)
+    rows = judged_elsewhere(gaps(rows, reference.objectives), _other_judgements(paths))
     calls = [call for call in read_timing(paths.timing) if call.case == case.id]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
@@ -154,6 +155,16 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         certificates=read_certificates(folder),
         notes=notes,
     )
+
+
+def _other_judgements(paths: ResultsFolder) -> dict[str, dict[Key, bool | None]]:
+    """What full machine models and ANDES say of kept schedules."""
+    validated = VALIDATED.read(paths.validated) if paths.validated.is_file() else []
+    confirmed = REFEREE.read(paths.referee) if paths.referee.is_file() else []
+    return {
+        "validated": {row.key[0]: row.feasible for row in validated},
+        "confirmed": {row.key: row.confirmed for row in confirmed},
+    }
 
 
 def _benchmark(case: Case, problems: Path, notes: list[str]) -> tuple[dict[str, Instance], int, str]:

@@ -11,6 +11,7 @@ import pytest
 from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
     gaps,
+    judged_elsewhere,
     performance_profile,
     summary,
     timed_rows,
@@ -152,3 +153,16 @@ def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
     assert points.loc["ded-ko", "alone"]
     assert points.loc["ded", "seconds"] == 1.0
     assert not points.loc["ded", "alone"]
+
+
+def test_other_judges_count_what_they_could_judge() -> None:
+    """Three schedules kept, of which full models carry two; what nobody was given counts nowhere."""
+    rows = [row(name, "ded", 1.0) for name in "abcd"]
+    frame = with_gaps(frame_of(*rows)).assign(key=[r.key for r in rows])
+    said = {"validated": dict(zip((r.key for r in rows), (True, False, None), strict=False)), "confirmed": {}}
+    (line,) = summary(judged_elsewhere(frame, said)).to_dict("records")
+    assert [line[f"validated_{part}"] for part in ("asked", "n", "rate")] == [3, 2, 0.5]
+    assert line["confirmed_asked"] == 0
+    assert math.isnan(line["confirmed_rate"])
+    (line,) = summary(frame).to_dict("records")
+    assert line["validated_asked"] == 0

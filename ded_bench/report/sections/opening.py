@@ -12,6 +12,7 @@ from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
+from ded_bench.problem.case import Case
 from ded_bench.report.columns import ISLAND, TABLE_V, TABLE_VI, tabulate, without_paper
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
@@ -47,7 +48,8 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     what = (
         f"{case.n_bus} buses, {len(case.generators)} generators {slack}, "
         f"{len(case.loads)} loads; {rows_caption(sources)}. Regimes: {regimes}. "
-        f"Every objective and violation is re-simulated; gaps are to {reference.title}."
+        f"Every objective and violation is re-simulated on {idealisation(case)}; "
+        f"gaps are to {reference.title}."
     )
     # Beside the paper's numbers, methods stand on their usual surrogates alone.
     rows = on_usual_model(sources.judged) if paper else sources.judged
@@ -72,6 +74,13 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         Heading("Schedules and frequencies"),
         *pictures["schedules"],
     ]
+
+
+def idealisation(case: Case) -> str:
+    """What a case's own plant is, in words."""
+    if case.plant_name == "lossless":
+        return "a lossless network with classical machines and an infinite slack"
+    return f"full machine models, {'an island' if case.slack is None else 'with an infinite slack'}"
 
 
 def _on_island(sources: Sources) -> Iterator[PageTable]:

@@ -114,28 +114,28 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     source = MODULE.replace("    power", "    if regime == 'TO':\n        return None\n    power", 1)
-    Path("my_dispatch.py").write_text(source)
+    Path("own_function.py").write_text(source)
     file = problem / "instances" / f"{load_split(problem).test[0]}.json"  # the one that `bench` times
     chosen = ("--regime", "NO,TO", "--instance", file, "--out", "out")
-    code, out, _ = command("solve", "--method", "my_dispatch:solve", *chosen)
+    code, out, _ = command("solve", "--method", "own_function:solve", *chosen)
     assert code == 1
     rows = {row["regime"]: row for row in map(json.loads, out.splitlines())}
-    assert {row["method"] for row in rows.values()} == {"my_dispatch.solve"}
+    assert {row["method"] for row in rows.values()} == {"own_function.solve"}
     assert rows["NO"]["status"] == "Feasible"
     assert Path(rows["NO"]["schedule"]).is_file()
     assert (rows["TO"]["status"], rows["TO"]["error"]) == (
         "Failed",
         "returned nothing, not a Schedule or a Solution",
     )
-    for wrong in ("my_dispatch:absent", "absent_module:solve", "my_dispatch:", "/etc:solve"):
+    for wrong in ("own_function:absent", "absent_module:solve", "own_function:", "/etc:solve"):
         code, out, err = command("solve", "--method", wrong, *chosen)
         assert (code, out, err.count("\n")) == (2, "", 1), err
     # Names in a results table start nobody's code: `bench` times what is registered or asked for.
     code, _, err = command("bench", "--case", problem, "--results", "out")
     assert code == 2
-    assert "my_dispatch.solve: not timed, since no method has this name\n" in err
+    assert "own_function.solve: not timed, since no method has this name\n" in err
     bench = ("bench", "--case", problem, "--results", "out", "--instances", "1", "--repeats", "1")
-    assert command(*bench, "--method", "my_dispatch:solve")[0] == 1  # its TO has nothing to time
+    assert command(*bench, "--method", "own_function:solve")[0] == 1  # its TO has nothing to time
     times = {(row.regime, row.round): row for row in read_timing(Path("out/timing.csv"))}
     assert sorted(times) == [("NO", 0), ("NO", 1), ("TO", 0), ("TO", 1)]
     assert times["NO", 1].solve_s > 0

@@ -75,7 +75,7 @@ def test_the_command_describes_one_method(capsys: pytest.CaptureFixture[str]) ->
     assert main(["methods", "ed"]) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].split() == ["ed", "ED"]
-    assert told[1].split()[0] == "every=60"
+    assert told[1].split()[0] == "every=none"
     assert main(["methods", "magic"]) == 2
 
 

@@ -32,6 +32,8 @@ from ded_bench.solvers.status import Status
 VERSION = 1
 #: From one dispatch to the next beside an infinite slack, s.
 INTERVAL_S = 60.0
+#: Distance of points of what is led, s: governors are slower.
+LEAD_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ def _on_island(case: Case, instance: Instance, interval_s: float | None, lead: b
     wanted = plant.set_points_delivering(base.at(instance.grid), dt_s)
     within = np.clip(wanted, case.p_min, case.p_max)[None, 1:]
     power = follow(within, instance.p_initial(case)[None], case.ramp * dt_s)[0]
-    return Schedule(instance.grid, power)
+    points = np.append(np.arange(0, instance.steps, max(round(LEAD_S / dt_s), 1)), instance.steps)
+    return Schedule(instance.grid[points], power[points])
 
 
 def follow_set_points(case: Case, instance: Instance, targets: Array, interval_s: float) -> Schedule:

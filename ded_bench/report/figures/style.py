@@ -16,6 +16,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image  # matplotlib brings it
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
@@ -37,6 +38,8 @@ DASHES: tuple[tuple[float | None, ...], ...] = (
 MARKERS = "osD^vP*Xph<>"
 #: Width of a figure, inches, and its resolution.
 WIDTH, DPI = 7.2, 130
+#: Colours of a picture, shades of anti-aliasing included.
+COLOURS = 64
 STYLE: dict[Any, Any] = {
     "font.size": 8.5,
     "axes.spines.top": False,
@@ -76,7 +79,7 @@ def new_figure(height: float) -> Iterator[Figure]:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG; equal figures are equal files."""
+    """Write a PNG with a palette, a third of the size; equal figures are equal files."""
     with mpl.rc_context(STYLE):
         if layout := figure.get_layout_engine():  # once; `savefig` would find it for every drawing
             figure.set_dpi(DPI)
@@ -84,7 +87,9 @@ def save_figure(figure: Figure, path: Path) -> None:
             figure.set_layout_engine(None)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    write_atomically(path, buffer.getvalue())
+    small = io.BytesIO()
+    Image.open(buffer).convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
+    write_atomically(path, small.getvalue())
 
 
 def plain(text: str) -> str:

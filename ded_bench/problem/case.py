@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 import importlib
 import json
@@ -140,44 +141,44 @@ class Case(Fingerprinted, Extended):
         return self._grid
 
     @property
+    @abc.abstractmethod
     def plant_name(self) -> str:
         """Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`)."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def slack(self) -> str | None:
         """Name of what takes up every imbalance; None on an island."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def generators(self) -> tuple[str, ...]:
         """What a schedule gives set-points to (the paper's 𝒢, without the slack)."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def loads(self) -> tuple[str, ...]:
         """Buses of the loads (the paper's ℒ)."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def load_nominal(self) -> Array:
         """Nominal load injections, shape (n_load,), pu (negative, but for feed-ins of lossless cases)."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def inertia(self) -> Array:
         """Weights of the generators in the mean frequency, shape (n_gen,)."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def n_bus(self) -> int:
         """Number of buses."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def n_knots(self) -> int:
         """Number of knots of policies and knot methods (`knots` of the file)."""
-        raise NotImplementedError
 
     def machine_of(self, name: str) -> str:
         """Name in `machines.json` of a generator, or of the slack."""

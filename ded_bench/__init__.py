@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas as pd
 
     from ded_bench.files.errors import InputError as InputError
@@ -44,7 +46,7 @@ _HOMES = {
     "Trajectory": "problem.trajectory",
     "instances_frame": "problem.instance",
 }
-__all__ = [*_HOMES, "load_instances", "score", "simulate", "solve"]
+__all__ = [*_HOMES, "load_instances", "score", "simulate", "simulate_many", "solve"]
 
 
 def __getattr__(name: str) -> Any:
@@ -136,6 +138,45 @@ def simulate(
 
     own = _case_of(instance, case)
     return simulate.simulate(own, instance, as_schedule(schedule, own), _plant_of(own, plant))
+
+
+def simulate_many(
+    instances: Instance | Sequence[Instance],
+    schedules: Sequence[Schedule | pd.DataFrame],
+    case: Case | None = None,
+    plant: str | Plant | None = None,
+    threads: int | None = None,
+) -> list[Trajectory | InputError | SimulationError]:
+    """Simulate many schedules in threads of this process, each as `simulate` does it.
+
+    A trajectory holds the plant's states at all points: what would fill the memory is given in portions.
+
+    Args:
+        instances: one for each schedule, or one for all.
+        schedules: as for `simulate`.
+        case: needed if the instances' case is not a shipped one.
+        plant: as for `simulate`.
+        threads: how many work at once; None: as many as there are cores.
+
+    Returns:
+        In the order of the schedules; in the place of one that cannot be simulated stands its error.
+
+    Raises:
+        InputError: there are not as many instances as schedules, or the case or plant is unknown.
+    """
+    from ded_bench.files.errors import InputError
+    from ded_bench.plants.plant import plant_of
+    from ded_bench.plants.simulate import in_threads
+    from ded_bench.problem.instance import Instance
+
+    many = [instances] * len(schedules) if isinstance(instances, Instance) else list(instances)
+    if len(many) != len(schedules):
+        raise InputError("schedules", "", f"there are {len(schedules)} for {len(many)} instances")
+    if not many:
+        return []
+    own = _case_of(many[0], case)
+    chosen = _plant_of(own, plant) or plant_of(own)
+    return in_threads(lambda pair: simulate(*pair, own, chosen), zip(many, schedules, strict=True), threads)
 
 
 def score(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -13,9 +14,13 @@ import ded_bench
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.plants import score, simulate
+from ded_bench.plants.detailed.detailed_stepper import integrate_plant
+from ded_bench.plants.lossless.stepper import integrate
 from ded_bench.problem.benchmark import write_benchmark
 from ded_bench.problem.case import Case
 from ded_bench.solvers.status import Status
+from tests.conftest import CASE_FILES
+from tests.detailed_cases import MIXED
 
 HEAVY = ("casadi", "matplotlib", "numba", "pandas", "pyomo", "scipy", "torch")
 
@@ -166,3 +171,34 @@ def test_instances_are_a_frame(case: Case, quiet_instance) -> None:
     ].to_list() == [*(-1.0, 0.5, 2.0, -0.01)]
     assert frame[f"P0_{case.generators[0]}"].to_list() == [case.p_nominal[0]] * 2
     assert len(ded_bench.instances_frame([])) == 0
+
+
+@pytest.mark.parametrize("folder", [CASE_FILES["fivemachine"].parent, MIXED], ids=["lossless", "detailed"])
+def test_many_simulations_are_those_of_one_after_the_other(folder, quiet_instance, constant) -> None:
+    """To the last bit; what fails stands as its error among the others, which are not lost."""
+    case = Case.load(folder)
+    instances = [quiet_instance(case, horizon_s=0.5, id=f"mine-{i}") for i in range(5)]
+    schedules = [constant(i, case.p_nominal * (1 + 0.01 * k)) for k, i in enumerate(instances)]
+    schedules[1] = constant(instances[1], case.p_nominal + 1e3)
+    schedules[3] = constant(quiet_instance(case, horizon_s=0.4), case.p_nominal)
+    found = ded_bench.simulate_many(instances, schedules, case, threads=3)
+    assert [type(f).__name__ for f in found] == [
+        *("Trajectory", "SimulationError", "Trajectory", "InputError", "Trajectory")
+    ]
+    for k in (0, 2, 4):
+        alone = ded_bench.simulate(instances[k], schedules[k], case)
+        assert np.array_equal(found[k].omega, alone.omega)
+        assert np.array_equal(found[k].p_gen, alone.p_gen)
+    [of_one, _] = ded_bench.simulate_many(instances[0], schedules[:2], case, plant=case.plant_name)
+    assert np.array_equal(of_one.omega, found[0].omega)
+    with pytest.raises(InputError, match="schedules: there are 5 for 4 instances"):
+        ded_bench.simulate_many(instances[:4], schedules, case)
+    assert ded_bench.simulate_many([], []) == []
+
+
+def test_threads_work_at_once() -> None:
+    """Each of two waits until the other is there; and compiled plants let go of the interpreter."""
+    together = threading.Barrier(2)
+    assert sorted(simulate.in_threads(lambda _: together.wait(20), range(2), 2)) == [0, 1]
+    for compiled in (integrate, integrate_plant):
+        assert compiled.targetoptions["nogil"]

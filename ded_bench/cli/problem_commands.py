@@ -42,6 +42,10 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--count", type=positive, default=50, help="instances to draw and simulate")
     p.set_defaults(run=_cases)
 
+    p = command(commands, "path", "print the folder of a shipped case")
+    p.add_argument("case", help="its name")
+    p.set_defaults(run=_path)
+
     p = command(commands, "methods", "list methods, their options and defaults")
     p.add_argument("name", nargs="?", metavar="NAME", help="only this one; default: all")
     p.set_defaults(run=_methods)
@@ -130,6 +134,12 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
             if not (folder / file).is_file() or (folder / file).read_bytes() != content:
                 write_atomically(folder / file, content)
     return drawn
+
+
+def _path(a: argparse.Namespace) -> int:
+    Case.load(a.case)
+    print(case_file(a.case).resolve().parent)
+    return 0
 
 
 def _methods(a: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.files.strict import sweep
 from ded_bench.results.rows import Results, Row
-from tests.cli.command_line import SOLVE
+from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
 
@@ -182,3 +182,14 @@ def test_only_policies_that_need_a_koopman_model_ask_for_one(
     assert "not there yet" in capsys.readouterr().err
     assert main(["train-dpc", "--method", "ded-admm", *where, str(tmp_path)]) == 0
     assert (tmp_path / "policies" / "ded-admm-TO.safetensors").is_file()
+
+
+def test_path_says_where_a_case_lies(problem: Path, capsys, monkeypatch, tmp_path: Path) -> None:
+    """Shipped ones by name, from any folder; what is no case is refused with the names of those that are."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("9bus", problem):
+        assert main(["path", str(name)]) == 0
+        folder = Path(capsys.readouterr().out.rstrip("\n"))
+        assert folder.is_absolute()
+        assert (folder / "case.json").is_file()
+    assert "no such case (shipped: 140bus" in refused(capsys, "path", "10bus")

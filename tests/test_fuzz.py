@@ -268,7 +268,7 @@ def test_pickles_are_not_opened(folder: Path, tmp_path: Path, kind: str) -> None
 def test_a_checkpoint_is_not_unpickled_either(folder: Path, tmp_path: Path) -> None:
     """Resuming from a file that is no checkpoint of this training is refused; nothing runs."""
     out, trace = tmp_path / "p.safetensors", tmp_path / "trace"
-    path = out.with_suffix(".checkpoint.pt")
+    path = out.with_suffix(".checkpoint")
     arguments = [
         "train-dpc",
         "--method",

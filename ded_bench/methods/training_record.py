@@ -1,6 +1,6 @@
 """What a trained method offers and leaves behind: its `train`, facts, the history of its loss.
 
-Beside a policy `p.safetensors` lie `p.history.csv` and `p.checkpoint.pt`, the state to go on from. The
+Beside a policy `p.safetensors` lie `p.history.csv` and `p.checkpoint`, the state to go on from. The
 history has one row per look at the loss, and columns
 
 * `epoch`, counted from 1, and `seconds`, the training time until then;
@@ -86,7 +86,7 @@ class Trainer(Protocol):
 
 def checkpoint_file(policy: Path) -> Path:
     """Where the state of a policy's training lies."""
-    return policy.with_suffix(".checkpoint.pt")
+    return policy.with_suffix(".checkpoint")
 
 
 def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:

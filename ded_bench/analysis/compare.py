@@ -1,8 +1,7 @@
 """What changed between two results folders: a benchmark's regression test.
 
 Rows are compared that answer the same question: by instance, regime, method, settings and the name of the
-surrogate, the newest of each. Status, feasibility, objective and violations decide; gaps and times
-are printed for information.
+surrogate, the newest of each. Status, feasibility, objective and violations decide.
 """
 
 from __future__ import annotations
@@ -13,16 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import pandas as pd
-
-from ded_bench.analysis.lines import GROUP, groups, head, line_table, named, title
-from ded_bench.analysis.paper_numbers import read_paper
-from ded_bench.analysis.reference import choose_reference
-from ded_bench.analysis.summary import gaps
+from ded_bench.analysis.lines import title
 from ded_bench.files.errors import InputError
-from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.results.rows import Results, Row
-from ded_bench.results.timing import model_name, read_timing, timing_summary
+from ded_bench.results.timing import model_name
 
 
 class Asked(NamedTuple):
@@ -68,7 +61,6 @@ class Comparison:
     only_a: tuple[Asked, ...]
     only_b: tuple[Asked, ...]
     changes: tuple[Change, ...]
-    summary: pd.DataFrame  # SUMMARY_COLUMNS, for information
 
     @property
     def same(self) -> bool:
@@ -92,13 +84,13 @@ def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: b
     shared = [key for key in before if key in after]
     facts = (a, b, (_head(before), _head(after)), len(shared))
     if reason := _incomparable(before, after, shared):
-        return Comparison(*facts, reason, (), (), (), line_table([], SUMMARY_COLUMNS))
+        return Comparison(*facts, reason, (), (), ())
     only_a = () if common_only else tuple(key for key in before if key not in after)
     only_b = () if common_only else tuple(key for key in after if key not in before)
     limits = tolerance or Tolerance()
     changes = [change for key in shared for change in _changes(before[key], after[key], limits)]
     changes.sort(key=lambda change: (list(_limits(limits)).index(change.column), -change.size, change.key))
-    return Comparison(*facts, "", only_a, only_b, tuple(changes), _summary(a, b))
+    return Comparison(*facts, "", only_a, only_b, tuple(changes))
 
 
 def _read(folder: Path) -> dict[Asked, Row]:
@@ -167,47 +159,7 @@ def _distance(x: object, y: object, relative: bool) -> float:
     return abs(y - x) / max(abs(x), abs(y)) if relative else abs(y - x)
 
 
-def _summary(a: Path, b: Path) -> pd.DataFrame:
-    """Mean gap and time per method over the common rows that have one in both folders."""
-    frames, timings = [], []
-    for folder in (a, b):
-        frame = named(Results(folder).frame()).sort_values("date", kind="stable")
-        frame = _with_gaps(frame.drop_duplicates(list(Asked._fields), keep="last"))
-        frames.append(frame[[*Asked._fields, "gap_percent", "solve_s"]])
-        timings.append(timing_summary(read_timing(folder / "timing.csv")).set_index(GROUP)["solve_s"])
-    both = frames[0].merge(frames[1], on=list(Asked._fields), suffixes=("_a", "_b"))
-    rows = []
-    for regime, key, part in groups(both):
-        known = part.dropna(subset=["gap_percent_a", "gap_percent_b"])
-        ratios = (part["solve_s_b"] / part["solve_s_a"].where(part["solve_s_a"] > 0)).dropna()
-        alone = [timing.get((regime, *key), math.nan) for timing in timings]
-        facts = {
-            "common": len(part),
-            "gap_percent_a": float(known["gap_percent_a"].mean()),
-            "gap_percent_b": float(known["gap_percent_b"].mean()),
-            "time_ratio": float(ratios.median()) if len(ratios) else math.nan,
-            "time_ratio_alone": alone[1] / alone[0] if alone[0] > 0 else math.nan,
-        }
-        rows.append(head(regime, key) | facts)
-    return line_table(rows, SUMMARY_COLUMNS)
-
-
-def _with_gaps(frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows with their gaps, each case's to its own reference."""
-    parts = [
-        gaps(rows, choose_reference(rows, read_paper(SHIPPED_CASES / str(case))).objectives)
-        for case, rows in frame.groupby("case", sort=False)
-    ]
-    return pd.concat(parts) if parts else gaps(frame, pd.Series(dtype=float))
-
-
 def name_of(key: Asked) -> str:
     """What a row answers as a reader sees it; the usual settings and surrogate go without saying."""
     unusual = title(key.method, key.settings, key.model).removeprefix(title(key.method))
     return f"{key.instance} {key.regime} {key.method}{unusual}"
-
-
-SUMMARY_COLUMNS = [
-    *("regime", "title", "method", "settings", "model", "common"),
-    *("gap_percent_a", "gap_percent_b", "time_ratio", "time_ratio_alone"),
-]

@@ -1,8 +1,7 @@
-"""Summaries of rows: gaps, violations, rates, times, worst instances, performance profiles.
+"""Summaries of rows: gaps, violations, rates, times, worst instances.
 
 Pure functions of `Results.frame()` and of the timing table. What a failure costs is decided here:
-a row without a score counts in `failures` and enters no mean; one that is not feasible never
-counts as solved in a performance profile.
+a row without a score counts in `failures` and enters no mean.
 """
 
 from __future__ import annotations
@@ -150,44 +149,6 @@ def worst(frame: pd.DataFrame, count: int = 3) -> pd.DataFrame:
                 row["broken"] = row["broken"] if row["excess"] > 1 else ""
                 rows.append(head(regime, key) | {"worst_by": reason} | row)
     return line_table(rows, [*HEAD, "worst_by", *names])
-
-
-def performance_profile(frame: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Dolan-Moré profile of one column per regime.
-
-    The ratio of a row is its value over the best of all methods on the same instance. Only rows that
-    the scorer calls feasible take part; any other counts as never solved.
-
-    Args:
-        frame: rows of several lines.
-        column: `solve_s` or `objective`.
-
-    Returns:
-        Columns regime, method, settings, model, title, ratio, fraction: `fraction` of the instances that a
-        method was asked have a ratio up to `ratio`; one step per row.
-    """
-    usable = frame[(frame["feasible"] == True) & (frame[column] > 0)]  # noqa: E712
-    ratio = usable[column] / usable.groupby(["instance", "regime"])[column].transform("min")
-    asked = frame.groupby(GROUP)["instance"].nunique()
-    rows = []
-    for regime, key, group in groups(usable.assign(ratio=ratio)):
-        for i, value in enumerate(np.sort(group["ratio"].to_numpy(dtype=float)), start=1):
-            steps = {"ratio": float(value), "fraction": i / int(asked[(regime, *key)])}
-            rows.append(head(regime, key) | steps)
-    return line_table(rows, [*HEAD, "ratio", "fraction"])
-
-
-def timed_rows(frame: pd.DataFrame, calls: pd.DataFrame) -> pd.DataFrame:
-    """The rows that were timed alone on a machine, with the median of those times as their `solve_s`.
-
-    Args:
-        frame: rows of the results table.
-        calls: of the timing table: instance, GROUP and solve_s (s, missing where a call failed).
-    """
-    seconds = calls.groupby(["instance", *GROUP])["solve_s"].median()
-    found = seconds.reindex(pd.MultiIndex.from_frame(frame[["instance", *GROUP]])).to_numpy(dtype=float)
-    timed: pd.DataFrame = frame.assign(solve_s=found)[np.isfinite(found)]
-    return timed
 
 
 def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:

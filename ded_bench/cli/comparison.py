@@ -7,24 +7,13 @@ import math
 from collections.abc import Iterable
 
 from ded_bench.analysis.compare import Change, Comparison, name_of
-from ded_bench.report.columns import Column
-from ded_bench.report.page import PageTable, to_markdown
 
 #: Rows that a section of the printed comparison names; the rest are counted.
 SHOWN = 10
-PRINTED = (
-    Column("regime", "Regime"),
-    Column("title", "Method"),
-    Column("common", "rows"),
-    Column("gap_percent_a", "mean gap A, %"),
-    Column("gap_percent_b", "mean gap B, %"),
-    Column("time_ratio", "time B/A, under load"),
-    Column("time_ratio_alone", "time B/A, alone"),
-)
 
 
 def to_text(comparison: Comparison) -> str:
-    """The comparison for a terminal: a few lines for each kind of change, a table, one verdict."""
+    """The comparison for a terminal: a few lines for each kind of change, one verdict."""
     c = comparison
     lines = [f"A  {c.a}: {c.heads[0]}", f"B  {c.b}: {c.heads[1]}"]
     if c.incomparable:
@@ -39,8 +28,6 @@ def to_text(comparison: Comparison) -> str:
         counts.append(f"{len(found)} × {column}")
         said = (f"{name_of(change.key)}: {_arrow(change)}" for change in found)
         lines += _section(f"{column}: {len(found)} of {c.common} common rows", said)
-    if len(c.summary):
-        lines += ["", to_markdown(PageTable(c.summary, PRINTED))]
     verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
     return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
 
@@ -56,8 +43,7 @@ def to_json(comparison: Comparison) -> str:
     ]
     made = {name: getattr(c, name) for name in ("a", "b", "same", "incomparable", "common")}
     made |= {name: [key._asdict() for key in getattr(c, name)] for name in ("only_a", "only_b")}
-    rows = c.summary.astype(object).where(c.summary.notna(), None).to_dict("records")
-    return json.dumps(made | {"changes": changes, "summary": rows}, default=str)
+    return json.dumps(made | {"changes": changes}, default=str)
 
 
 def _section(heading: str, items: Iterable[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ded_bench.cli.arguments import (
     command,
@@ -22,9 +22,6 @@ from ded_bench.problem.benchmark import problem_folder, select_split, validation
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
 from ded_bench.solvers.status import Status
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_commands(commands: Any) -> None:

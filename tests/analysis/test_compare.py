@@ -1,4 +1,4 @@
-"""Two results folders side by side: what counts as a change, and what is for information."""
+"""Two results folders side by side: what counts as a change."""
 
 from __future__ import annotations
 
@@ -50,8 +50,6 @@ def test_equal_folders_agree_whatever_the_times(folders) -> None:
     assert found.same
     assert found.common == 4
     assert to_text(found).splitlines()[-1] == "A and B agree on 4 common rows"
-    assert found.summary["time_ratio"].to_list() == pytest.approx([3.0, 3.0])
-    assert found.summary["gap_percent_a"].to_list() == pytest.approx([0.0, 2.0])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Gaps, rates and profiles, on small tables with answers worked out by hand."""
+"""Gaps and rates, on small tables with answers worked out by hand."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
     gaps,
     judged_elsewhere,
-    performance_profile,
     summary,
-    timed_rows,
     tradeoff,
     worst,
 )
@@ -114,35 +112,6 @@ def test_excess_takes_the_limit_broken_most() -> None:
     frame = frame_of(row("a", "ded", 1.0, freq_violation_hz=1e-5, ramp_violation=3e-6, bound_violation=1e-7))
     assert worst(with_gaps(frame))[["excess", "broken"]].to_numpy().tolist() == [[pytest.approx(3.0), "ramp"]]
     assert not len(worst(with_gaps(frame_of(row("a", "ded", 100.0), row("a", "ed", 100.0005)))))  # rounding
-
-
-def test_performance_profile_by_hand() -> None:
-    frame = frame_of(
-        row("a", "ded", 1.0, solve_s=10.0),
-        row("b", "ded", 1.0, solve_s=8.0),
-        row("a", "ded-ko", 1.0, solve_s=5.0),
-        row("b", "ded-ko", 1.0, solve_s=16.0),
-        row("a", "ed", 1.0, solve_s=0.001, feasible=False),
-        row("b", "ed", solve_s=0.001),
-        row("b", "ded-radau", 1.0, solve_s=32.0),
-    )
-    profile = performance_profile(frame, "solve_s")
-    steps = {m: p[["ratio", "fraction"]].to_numpy().tolist() for m, p in profile.groupby("method")}
-    assert steps == {
-        "ded": [[1.0, 0.5], [2.0, 1.0]],
-        "ded-ko": [[1.0, 0.5], [2.0, 1.0]],
-        "ded-radau": [[4.0, 1.0]],  # asked one instance only
-    }  # ed: never feasible
-
-
-def test_rows_take_the_median_of_their_times_alone() -> None:
-    frame = frame_of(row("a", "ded", 1.0, solve_s=99.0), row("b", "ded", 1.0), row("a", "ed", 2.0))
-    cells = [("a", "ded", 1.0), ("a", "ded", 3.0), ("a", "ded", 2.0), ("b", "ded", np.nan), ("x", "ed", 1.0)]
-    calls = pd.DataFrame(cells, columns=["instance", "method", "solve_s"])
-    calls = calls.assign(regime="TO", settings="default", model="")
-    timed = timed_rows(frame, calls)
-    assert timed[["instance", "method", "solve_s"]].to_numpy().tolist() == [["a", "ded", 2.0]]
-    assert timed_rows(frame, calls[:0]).empty
 
 
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:

@@ -21,7 +21,6 @@ from ded_bench.report.figures.panels import (
     power_panels,
     time_figure,
 )
-from ded_bench.report.figures.profile import profile_figure
 from ded_bench.report.figures.style import save_figure
 from ded_bench.report.figures.tradeoff import tradeoff_figure
 
@@ -88,18 +87,3 @@ def test_tradeoff_draws_a_point_per_line_hollow_if_infeasible(tmp_path: Path) ->
     assert [[18.8, 0.3]] in [line.get_xydata().tolist() for line in second.get_lines()]
     assert "every=1 *" in [text.get_text() for text in first.texts]
     save_figure(figure, tmp_path / "figure.png")
-
-
-def test_profiles_end_at_the_share_of_instances_solved(tmp_path: Path) -> None:
-    columns = [*GROUP, "title", "ratio", "fraction"]
-    rows = [("TO", "ded", "default", "", "DED", 1.0, 0.5), ("TO", "ded", "default", "", "DED", 4.0, 1.0)]
-    rows += [("TO", "ed", "default", "", "ED", 1.0, 0.25)]
-    profile = pd.DataFrame(rows, columns=columns)
-    figure = profile_figure(profile, profile)
-    times, objectives = figure.axes
-    for ax, xs in ((times, [1.0, 1.0, 4.0, 8.0]), (objectives, [1e-4, 1e-4, 300.0, 600.0])):
-        line = ax.get_lines()[0]
-        assert line.get_xdata() == pytest.approx(xs)
-        assert list(line.get_ydata()) == [0.0, 0.5, 1.0, 1.0]
-        assert ax.get_lines()[1].get_ydata()[-1] == 0.25
-    save_figure(profile_figure(profile, profile[:0]), tmp_path / "figure.png")

@@ -112,7 +112,7 @@ def test_every_file_is_written(report: list[Path], finished: Path) -> None:
     names = {str(path.relative_to(finished)) for path in report}
     tables = ("table_v", "table_vi", "summary", "worst", "training", "provenance")
     assert {f"tables/{name}.csv" for name in tables} <= names
-    figures = ("schedule_NO", "schedule_TO", "frequencies_TO", "tradeoff", "profile", "training_ded-dpc")
+    figures = ("schedule_NO", "schedule_TO", "frequencies_TO", "tradeoff", "training_ded-dpc")
     assert {f"figures/{name}.png" for name in figures} <= names
     assert {"report.md", "report.html"} <= names
 

@@ -83,14 +83,14 @@ def _worst(frame: pd.DataFrame) -> list[Block]:
     return [Heading("Worst instances"), Text(said), *folded("Which instances", *instances)]
 
 
-def solve_times(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
-    """Default settings in sight, all others folded away; performance profiles."""
+def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
+    """Default settings in sight, all others folded away."""
     made: list[Block] = [Text("No method was timed alone yet; run `ded-bench bench`.")]
     if len(sources.timing):
         timing = titled(pd.concat([rows for *_, rows in groups(sources.timing)]))
         caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
         made = usual_first(PageTable(timing, TIMING, caption), timing["settings"] == DEFAULT)
-    return [Heading("Times"), *made, *pictures["profile"]]
+    return [Heading("Times"), *made]
 
 
 def trained(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:

@@ -1,4 +1,4 @@
-"""The program of `ded-slp` written again in Pyomo, to check its arrays with another solver."""
+"""The programs of knots written again in Pyomo, to check their arrays with another solver."""
 
 from __future__ import annotations
 
@@ -93,3 +93,11 @@ def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVar
         return generation + price * pyo.quicksum(m.p_slack_up[k] + m.p_slack_down[k] for k in m.point)
 
     return m
+
+
+def optimum(model: pyo.ConcreteModel) -> float:
+    """The least objective of a linear model, by HiGHS."""
+    solver = pyo.SolverFactory("appsi_highs")
+    solver.options = {"small_matrix_value": 1e-12, "primal_feasibility_tolerance": 1e-9}
+    solver.solve(model)  # raises where there is none
+    return float(pyo.value(model.cost_total))

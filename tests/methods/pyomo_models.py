@@ -6,12 +6,18 @@ from typing import Any
 
 import numpy as np
 import pyomo.environ as pyo
+import scipy.sparse as sp
+from pyomo.repn.plugins.standard_form import LinearStandardFormCompiler
 
 from ded_bench.methods.knots import power_limits as knot_limits
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
+from ded_bench.solvers.highs import solve_form
+from ded_bench.solvers.ipopt import bounds as bounds_of
+from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.solvers.status import Status
 
 
 def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVarying) -> pyo.ConcreteModel:
@@ -97,7 +103,20 @@ def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVar
 
 def optimum(model: pyo.ConcreteModel) -> float:
     """The least objective of a linear model, by HiGHS."""
-    solver = pyo.SolverFactory("appsi_highs")
-    solver.options = {"small_matrix_value": 1e-12, "primal_feasibility_tolerance": 1e-9}
-    solver.solve(model)  # raises where there is none
-    return float(pyo.value(model.cost_total))
+    found = LinearStandardFormCompiler().write(model, mixed_form=True)
+    kind = np.array([row.bound_type for row in found.rows])  # 1: at most, -1: at least, 0: equal
+    a, right, inequality = found.A.tocsr(), np.array(found.rhs), kind != 0
+    lower, upper = bounds_of(found.columns)
+    form = FreeForm(
+        cost=found.c.toarray().ravel(),
+        equal=sp.csc_matrix(a[~inequality]),
+        right=right[~inequality],
+        between=sp.csc_matrix(a[inequality]),
+        low=np.where(kind < 0, right, -np.inf)[inequality],
+        high=np.where(kind > 0, right, np.inf)[inequality],
+        lower=lower,
+        upper=upper,
+    )
+    answer = solve_form(form)
+    assert answer.status == Status.OPTIMAL
+    return float(form.cost @ answer.x + found.c_offset[0])

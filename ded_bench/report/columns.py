@@ -141,7 +141,6 @@ def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ..
     )
 
 
-_GAPS = _spread("gap_percent", "gap", "%")
 _FREQUENCY = _spread("freq_violation_hz", "frequency", "Hz")
 GAPS = (
     *(*_HEAD, ROWS, N, FAILURES, Column("unpaired", "without reference")),

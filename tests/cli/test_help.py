@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -11,7 +10,6 @@ import pytest
 
 import ded_bench
 from ded_bench.cli import main
-from ded_bench.cli.commands import parser
 from ded_bench.methods import plugin
 from ded_bench.methods.options import described
 from ded_bench.methods.registry import METHODS
@@ -25,33 +23,6 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert ded_bench.__version__.count(".") == 2
 
 
-def test_every_command_has_help() -> None:
-    command = [sys.executable, "-m", "ded_bench", "--help"]
-    overview = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
-    listed = [line.split()[0] for line in overview.splitlines() if line.startswith("    ") and line[4] != " "]
-    assert listed == list(commands)
-
-
-def shown_help(command: str, capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    return " ".join(capsys.readouterr().out.split())
-
-
-def test_help_tells_every_option_its_default(capsys: pytest.CaptureFixture[str]) -> None:
-    commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
-    for name, command in commands.items():
-        text = shown_help(name, capsys)
-        for action in command._actions:
-            assert action.help, (name, action.dest)
-            default = action.default
-            if action.option_strings and default not in (None, argparse.SUPPRESS) and default is not False:
-                told = ",".join(default) if isinstance(default, tuple) else default
-                assert f"default: {told}" in text, (name, action.dest)
-
-
 def test_methods_are_listed_with_their_options(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Those of other packages too; one that cannot be imported says so, and the list goes on."""
     targets = {"flat": "tests.strange_methods:prepare", "gone": "no.such.module:solve"}
@@ -63,16 +34,6 @@ def test_methods_are_listed_with_their_options(monkeypatch, capsys: pytest.Captu
     for method in METHODS.values():
         assert all(option in text for option, _, _ in described(method.options))
     assert "cannot be used" in text
-
-
-def test_people_hear_at_once_what_a_command_does(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Before the imports of the command itself; a pipe hears nothing but the answer."""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    assert main(["cases"]) == 0
-    assert capsys.readouterr().err.startswith("ded-bench: list the shipped cases")
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
-    assert main(["cases"]) == 0
-    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("arguments", [("online", "--help"), ("cases",)])

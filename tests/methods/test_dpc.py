@@ -1,21 +1,16 @@
-"""Our policy: what its network reads, its compiled twin, its loss."""
+"""Our policy: what its network reads, and its compiled twin."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from ded_bench.methods.dpc.channels import Channels, Response, n_channels
+from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
-from ded_bench.methods.dpc.refinement import coarse_free_response, coarse_stride
-from ded_bench.methods.dpc.training import SPACING_S
-from ded_bench.methods.ramp_follower import follow
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, LoadPoints
-from ded_bench.surrogates.condensed import free_response
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.policies import short_instances, staged_network
 
@@ -32,40 +27,6 @@ def response_of(case: Case) -> Response:
 
 def channels_of(case: Case, inputs: StackedInstances) -> Channels:
     return Channels.of(case, inputs, response_of(case))
-
-
-def test_static_dispatch_of_the_knots_is_the_merit_order(case: Case) -> None:
-    knots = case.knot_times(HORIZON)
-    inputs = StackedInstances.of(case, some_instances(case, 30))
-    inputs.cost[:10] = np.round(inputs.cost[:10])  # ties, and costs of zero
-    channels = channels_of(case, inputs)
-    expected = merit_order(case, inputs.cost[:, None, 1:], inputs.cost[:, :1], inputs.p_load(knots))
-    static = channels.sequence[..., 2 * len(case.loads) : -1]
-    np.testing.assert_allclose(static, expected, atol=1e-12)
-    step = case.ramp * knots[1]
-    followed = follow(static[:, 1:], inputs.p_initial, step)
-    np.testing.assert_allclose(channels.start, followed, atol=1e-15)
-    p_slack = -inputs.p_load(knots).sum(axis=2) - expected.sum(axis=2)
-    total = (expected * inputs.cost[:, None, 1:]).sum(axis=2) + inputs.cost[:, :1] * np.abs(p_slack)
-    np.testing.assert_allclose(channels.static_cost(inputs), total.mean(axis=1), atol=1e-12)
-    assert (channels.sequence.shape[2], channels.constants.shape[1]) == n_channels(case)
-
-
-def test_bends_say_what_loads_do_between_knots(case: Case) -> None:
-    knots = case.knot_times(HORIZON)
-    instances = some_instances(case, 5)
-    channels = channels_of(case, StackedInstances.of(case, instances))
-    n_load, spacing = len(case.loads), knots[1]
-    for b, instance in enumerate(instances):
-        fine = np.linspace(0.0, HORIZON, (case.n_knots - 1) * 400 + 1)
-        values = instance.p_load(case, fine)
-        halves = 0.5 * (values[1:] + values[:-1]) * (fine[1] - fine[0])
-        mean = halves.reshape(case.n_knots - 1, 400, n_load).sum(axis=1) / spacing
-        at = instance.p_load(case, knots)
-        np.testing.assert_allclose(channels.sequence[b, :, :n_load], at, atol=1e-14)
-        expected = mean - 0.5 * (at[1:] + at[:-1])
-        np.testing.assert_allclose(channels.sequence[b, 1:, n_load : 2 * n_load], expected, atol=1e-8)
-        assert np.abs(expected).max() > 1e-5
 
 
 def test_compiled_twin_equals_the_torch_network(case: Case) -> None:
@@ -133,15 +94,3 @@ def test_a_ramp_and_its_points_are_the_same_load(case: Case) -> None:
     expected = np.stack([i.p_load(case, grid) for i in ramps])
     for batch in (ramps, points):
         np.testing.assert_allclose(StackedInstances.of(case, batch).p_load(grid), expected, atol=1e-12)
-
-
-def test_coarse_rollout_is_the_fine_one(case: Case) -> None:
-    model, instances = linear_model(case), some_instances(case, 3)
-    network, grid = Network(case), instances[0].grid
-    inputs = StackedInstances.of(case, instances)
-    stride = coarse_stride(instances[0].dt_s, instances[0].steps, SPACING_S)
-    assert stride > 1
-    p_load = np.stack([i.p_load(case) for i in instances])
-    fine = free_response(model, model.initial(network, instances), p_load)
-    coarse = coarse_free_response(network, model, inputs, grid, stride)
-    np.testing.assert_allclose(coarse, fine[:, :, ::stride], atol=1e-6)

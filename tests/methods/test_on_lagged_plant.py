@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from ded_bench.methods.first_schedules import slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
-from ded_bench.methods.knots import case_knots
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.slp import Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
@@ -18,7 +15,6 @@ from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.limits import IslandRegime
-from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from tests.lagged_plant import LAG_S, lagged, lagged_case
@@ -123,23 +119,3 @@ def test_real_time_iterations_keep_the_bound(slow: Case) -> None:
     found = score(slow, instance, solution.schedule, "TO")
     assert found.freq_violation_hz < 0.05 * slow.regimes["TO"].omega_hz
     assert solution.solver_objective == pytest.approx(found.objective, rel=1e-3)
-
-
-def test_speeds_may_be_given_as_matrices(case: Case) -> None:
-    """Limits at the knots are then rows: the same optimum as with bounds of columns."""
-    instance = sample_instance(case, 77, 1).model_copy(update={"horizon_s": 8.0})
-    points, plant, bounds = case_knots(case, instance), plant_of(case), case.bounds("TO")
-    p_gen = slow_dispatch(case, instance, points)
-    model = plant.linearise_along(simulate(case, instance, Schedule(instance.grid[points], p_gen)), points)
-    n, n_gen = len(model.lengths), len(case.generators)
-    matrices = np.zeros((n, n_gen, model.slack.shape[1]))
-    matrices[:, :, model.speed] = np.eye(n_gen)
-    by_rows = dataclasses.replace(model, speed=matrices)
-    for rows in (Rows(1e-6, 1e-6), Rows(1e-4, 1e-4, soft=True)):
-        found = [
-            solve_with_rows_added(KnotProgram(case, instance, bounds, each), set(), rows, np.inf)
-            for each in (model, by_rows)
-        ]
-        assert [attempt.status for attempt in found] == 2 * [Status.OPTIMAL]
-        objectives = [attempt.solution.objective for attempt in found]
-        assert objectives[1] == pytest.approx(objectives[0], rel=1e-3 if rows.soft else 1e-7)

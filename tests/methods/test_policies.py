@@ -9,7 +9,6 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.admm import admm_training
@@ -200,20 +199,3 @@ def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path, method: 
     policy = trained(TRAINERS[method], threebus, tmp_path / "a.safetensors", epochs=100_000, seconds=0.3)
     assert 0.3 <= policy.training["seconds"] < 5.0
     assert 1 <= policy.training["epochs"] < 100_000
-
-
-@pytest.mark.usefixtures("quick")
-def test_training_would_not_round_on_a_gpu(
-    threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """TensorFloat-32, cuDNN's default, keeps ten bits: losses would differ by 1e-3 from the CPU's."""
-    rounds, look = [], TrainingRun._look
-
-    def looking(run: TrainingRun) -> float:
-        rounds.append(torch.backends.cudnn.allow_tf32)
-        return look(run)
-
-    monkeypatch.setattr(TrainingRun, "_look", looking)
-    trained(dpc_training, threebus, tmp_path / "p.safetensors", epochs=1)
-    assert rounds == [False]
-    assert torch.get_float32_matmul_precision() == "highest"

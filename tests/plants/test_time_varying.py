@@ -13,7 +13,7 @@ from ded_bench.methods import ed
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import plant_of
 from ded_bench.plants.simulate import simulate
-from ded_bench.plants.time_varying import Delivered, LocalRows, TimeVarying, series_step
+from ded_bench.plants.time_varying import Delivered, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -50,13 +50,6 @@ def increments(model: TimeVarying) -> Array:
     return u
 
 
-def test_without_increments_it_is_the_trajectory(made):
-    """Outputs are those simulated."""
-    omega, p_slack = made.model.outputs(np.zeros_like(made.model.p_gen))
-    assert np.array_equal(omega, made.trajectory.omega)
-    assert np.array_equal(p_slack, made.trajectory.p_slack)
-
-
 def test_error_is_of_second_order(case, quiet_instance, constant):
     """Along an equilibrium, against simulations: half the increments, a quarter of the error."""
     instance = quiet_instance(case, horizon_s=STEPS * case.sampling.dt_s)
@@ -70,18 +63,6 @@ def test_error_is_of_second_order(case, quiet_instance, constant):
         errors.append((np.abs(omega - moved.omega).max(), np.abs(p_slack - moved.p_slack).max()))
     ratio = np.divide(errors[:-1], errors[1:])
     assert ratio == pytest.approx(4.0, rel=0.25)
-
-
-def test_along_a_moving_trajectory_it_is_nearly_exact(case, made):
-    """One stiffness per interval: what increments change is met within 5 % of the change."""
-    u = 0.05 * increments(made.model)
-    omega, p_slack = made.model.outputs(u)
-    moved = simulate(case, made.instance, Schedule(t=made.schedule.t, p=made.schedule.p + u))
-    for linear, true, before in (
-        (omega, moved.omega, made.trajectory.omega),
-        (p_slack, moved.p_slack, made.trajectory.p_slack),
-    ):
-        assert np.abs(linear - true).max() < 0.05 * np.abs(true - before).max()
 
 
 def test_maps_are_the_matrix_exponential(case, made):
@@ -140,21 +121,6 @@ def test_rows_are_local_to_their_interval(made):
     assert value_of(model.slack_rows(first), x, u) == pytest.approx(stretches, abs=1e-10)
 
 
-def test_speeds_may_be_any_combination_of_the_state(made):
-    """C as a matrix that picks entries is the slice of these entries."""
-    model, n_gen = made.model, made.model.p_gen.shape[1]
-    pick = np.zeros((len(model.lengths), n_gen, 2 * n_gen))
-    pick[:, :, model.speed] = np.eye(n_gen)
-    other, u = dataclasses.replace(model, speed=pick), increments(model)
-    points, generators = np.array([1, 37, 38, 152, 399]), np.arange(5) % n_gen
-    for name, arguments in (
-        ("outputs", (u,)),
-        ("frequency_rows", (generators, points)),
-    ):
-        for one, same in zip(getattr(model, name)(*arguments), getattr(other, name)(*arguments), strict=True):
-            np.testing.assert_allclose(same, one, rtol=0, atol=1e-12)
-
-
 def test_cost_rows_sum_what_is_delivered(made):
     """Cost · (C_p δx + D_p u), summed point by point; the last point is the last interval's."""
     model, rng, n_gen = made.model, np.random.default_rng(7), made.model.p_gen.shape[1]
@@ -172,15 +138,3 @@ def test_cost_rows_sum_what_is_delivered(made):
     assert value_of(given.cost_rows(cost), x, u) == pytest.approx(expected, rel=1e-9, abs=1e-9)
     with pytest.raises(ValueError, match="set-points are delivered"):
         model.cost_rows(cost)
-
-
-def test_the_series_is_the_exponential():
-    """exp(A), φ_1 and φ_2 are blocks of the exponential of A beside two identities (Van Loan)."""
-    a = 0.3 * np.random.default_rng(8).normal(size=(4, 5, 5))
-    found = series_step(lambda value: a @ value, 4, 5, float(np.linalg.norm(a, axis=(1, 2)).max()))
-    for i, one in enumerate(a):
-        whole = np.zeros((15, 15))
-        whole[:5, :5], whole[:5, 5:10], whole[5:10, 10:] = one, np.eye(5), np.eye(5)
-        exact = expm(whole)[:5]
-        for part, expected in zip(found, np.split(exact, 3, axis=1), strict=True):
-            np.testing.assert_allclose(part[i], expected, rtol=0, atol=1e-14)

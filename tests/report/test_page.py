@@ -15,7 +15,6 @@ from ded_bench.report.page import (
     PageTable,
     Picture,
     Text,
-    to_markdown,
     write_page,
 )
 from tests.reading import Page
@@ -24,13 +23,6 @@ FRAME = pd.DataFrame(
     {"regime": ["NO", "NO", "TO"], "x": [1.23456e-9, np.nan, 12.0], "n": [1, 2, 3], "s": ["a|b", "&", ""]}
 )
 COLUMNS = (Column("regime", "Regime"), Column("x", "x_1 (%)"), Column("n", "n"), Column("s", "text"))
-
-
-def test_markdown_table() -> None:
-    lines = to_markdown(PageTable(FRAME, COLUMNS)).splitlines()
-    assert lines[0] == "| Regime | x_1 (%) | n | text |"
-    assert lines[1] == "| --- | ---: | ---: | --- |"
-    assert lines[2:] == ["| NO | 1.23e-09 | 1 | a\\|b |", "| NO | – | 2 | & |", "| TO | 12 | 3 |  |"]
 
 
 def test_a_page_is_written_twice_and_its_tables_too(tmp_path: Path) -> None:

@@ -28,7 +28,6 @@ from ded_bench.run.bench import (
     ROUNDS,
     Job,
     bench,
-    choose_sample,
     rounds_of,
     runs_of,
     timed,
@@ -189,15 +188,6 @@ def test_failed_calls_are_counted_and_enter_no_median(fake, run) -> None:
     assert (row["failures"], row["solve_s"], row["error"]) == (1, 2.0, "")
 
 
-@pytest.mark.parametrize("times", [["none"], [RuntimeError("broken")]])
-def test_a_method_that_only_fails_is_rows_with_its_error(fake, run, times) -> None:
-    fake.times = times
-    row = timing_summary(run([TO])).iloc[0]
-    assert np.isnan(row["solve_s"])
-    assert row["failures"] == 3
-    assert ("no way" in row["error"]) or ("broken" in row["error"])
-
-
 def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
     first = run(BOTH)
     assert read_timing(tmp_path / "timing.csv") == first
@@ -269,13 +259,6 @@ def test_full_ded_in_a_process_of_its_own(threebus: Case, tmp_path: Path) -> Non
     assert row["first_build_s"] > row["build_s"]
     assert "ipopt" in row["solver_version"]
     assert all(row.call_s > row.solve_s for row in rows)
-
-
-def test_the_sample_is_spread_and_the_same_every_time(threebus: Case) -> None:
-    many = [sample_instance(threebus, 1, i) for i in range(25)]
-    chosen = choose_sample(many, 5)
-    assert [i.id for i in chosen] == [many[k].id for k in (0, 6, 12, 18, 24)]
-    assert choose_sample(many[:3], 5) == many[:3]
 
 
 def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:

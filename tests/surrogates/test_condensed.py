@@ -35,16 +35,3 @@ def test_it_equals_the_sequential_rollout(case: Case, stride: int) -> None:
     sequential = model.rollout(psi, inputs)[::stride, :, : n_gen + 1].transpose(1, 2, 0)
     forced = np.einsum("opx,bx->bop", condensed.gamma, powers.reshape(3, -1))
     np.testing.assert_allclose(free_response(model, psi, p_load, stride) + forced, sequential, atol=1e-11)
-
-
-@pytest.mark.parametrize("stride", STRIDES)
-def test_weights_sum_over_the_whole_grid(case: Case, stride: int) -> None:
-    """Exact for functions that are linear between the knots, or between the points."""
-    condensed, rng = condensed_of(case, stride), np.random.default_rng(5)
-    grid = np.arange(round(HORIZON / case.sampling.dt_s) + 1) * case.sampling.dt_s
-    for at, weights in (
-        (condensed.knots, condensed.hat_weights),
-        (condensed.points, condensed.quadrature_weights),
-    ):
-        values = rng.normal(size=len(at))
-        assert weights @ values == pytest.approx(np.interp(grid, at, values).sum(), rel=1e-12)

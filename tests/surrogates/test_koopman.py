@@ -17,7 +17,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import find_model, model_file
-from ded_bench.surrogates.identification_data import KINDS, load_ramps, sample_trajectories
+from ded_bench.surrogates.identification_data import load_ramps, sample_trajectories
 from ded_bench.surrogates.identify import (
     held_out,
     identify,
@@ -136,18 +136,6 @@ def test_identified_model_beats_the_linearisation(case: Case) -> None:
 def test_identification_is_repeatable(threebus: Case) -> None:
     model, again, other = (identify(threebus, seed, count=8) for seed in (5, 5, 6))
     assert model.fingerprint == again.fingerprint != other.fingerprint
-
-
-def test_training_schedules_obey_the_limits(case: Case) -> None:
-    data = sample_trajectories(case, seed=1, count=2 * len(KINDS))
-    n_gen = len(case.generators)
-    p_gen = data.inputs[..., :n_gen]
-    most = case.ramp * case.sampling.dt_s
-    assert (np.abs(np.diff(p_gen, axis=0)) <= most + 1e-12).all()
-    coast = 0.5 * case.ramp  # the longest smoothing at the ramp limit: a smoothed kind may overshoot
-    assert (p_gen >= case.p_min - coast).all()
-    assert (p_gen <= case.p_max + coast).all()
-    assert set(data.kinds) == set(KINDS)
 
 
 def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkeypatch) -> None:

@@ -29,6 +29,11 @@ def compiled(function: Function) -> Function:
     return cast(Function, made)
 
 
+def inlined(function: Function) -> Function:
+    """Compile into every compiled function that calls it: a call of its own would count array references."""
+    return cast(Function, numba.njit(inline="always")(function))
+
+
 @functools.cache
 def sources_stamp(package: Path = _PACKAGE) -> str:
     """Changes with Numba, and any source below a folder that holds compiled functions."""

@@ -19,7 +19,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,14 +109,8 @@ def bench(
     case.check_regimes([job.regime for job in jobs])
     own = {job: _template(case, job, problems_version) for job in jobs}
     run = _run_id(case, instances, own, rounds)
-    there = read_timing(path)
-    if not force and there and {row.run for row in there} == {run}:
+    if (there := _complete(path, run, {row.job for row in own.values()})) and not force:
         return there
-    if others := {row.job for row in there} - {row.job for row in own.values()}:
-        regime, method, *_ = sorted(others)[0]
-        raise InputError(
-            path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
-        )
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
     kept = [] if force else [row for row in read_timing(partial) if row.run == run]
     rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
@@ -134,11 +128,9 @@ def bench(
             order = present[shift:] + present[:shift]
             for job in tqdm(order, unit="turn", disable=None, desc=f"bench, round {round_}"):
                 if (round_, *own[job].job, instances[-1].id) not in rows:
-                    calls = _ask(pools[job], case, job, warm_up, instances)
-                    for instance, call in zip([warm_up, *instances], calls, strict=True):
-                        number = WARM_UP if instance is warm_up else round_
-                        row = dataclasses.replace(own[job], run=run, round=number, instance=instance.id)
-                        rows.setdefault(row.key, _timed_row(row, call))  # the first turn's warm-up stands
+                    row = dataclasses.replace(own[job], run=run, round=round_)
+                    for made in _turn(pools[job], case, job, row, warm_up, instances):
+                        rows.setdefault(made.key, made)  # the first turn's warm-up stands
                     TIMING.write(partial, rows.values())
                 if round_ >= rounds_for(job):
                     pools[job].close()  # on large grids a process holds gigabytes
@@ -148,6 +140,27 @@ def bench(
     TIMING.write(path, rows.values())
     partial.unlink(missing_ok=True)
     return list(rows.values())
+
+
+def _complete(path: Path, run: str, jobs: set[tuple[str, str, str, str]]) -> list[TimingRow]:
+    """The rows of a table if it holds this very run; InputError if it holds other jobs, too."""
+    there = read_timing(path)
+    if others := {row.job for row in there} - jobs:
+        regime, method, *_ = sorted(others)[0]
+        raise InputError(
+            path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
+        )
+    return there if {row.run for row in there} == {run} else []
+
+
+def _turn(
+    pool: Workers, case: Case, job: Job, row: TimingRow, warm_up: Instance, instances: Sequence[Instance]
+) -> Iterator[TimingRow]:
+    """The rows of one turn of a job, made from one with its run and round: the warm-up's, then the others."""
+    calls = _ask(pool, case, job, warm_up, instances)
+    for instance, call in zip([warm_up, *instances], calls, strict=True):
+        number = WARM_UP if instance is warm_up else row.round
+        yield _timed_row(dataclasses.replace(row, round=number, instance=instance.id), call)
 
 
 def rounds_of(rows: Iterable[TimingRow]) -> int:

@@ -141,6 +141,8 @@ class NumpyPaperNetwork:
 
 def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     """What a convolution sees at each knot, zeros outside, (batch, window * width, n)."""
-    n, before = x.shape[2], (window - 1) // 2
-    padded = np.pad(x, ((0, 0), (0, 0), (before, window - 1 - before)))
+    batch, width, n = x.shape
+    before = (window - 1) // 2
+    padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
+    padded[:, :, before : before + n] = x
     return np.concatenate([padded[:, :, i : i + n] for i in range(window)], axis=1)

@@ -164,17 +164,19 @@ class LosslessPlant:
         The power flow must serve the initial loads from P_0, and the loads at 0, at each kink and at the
         horizon from the static dispatch.
         """
+        case, times = self.case, instance.kinks
+        p_load, p_gen = instance.p_load(case, times), self.static_dispatch(instance, times)
+        given = "power" if instance.initial.theta is None else "theta"
+        if given == "power":
+            both = np.vstack([instance.p_initial(case), p_gen]), np.vstack([p_load[:1], p_load])
+            with contextlib.suppress(PowerFlowError):  # at once is faster, one by one tells where it fails
+                self.network.power_flow(*both)
+                return
         try:
             self.network.initial_angles(instance)
         except PowerFlowError as error:
-            given = "power" if instance.initial.theta is None else "theta"
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
-        case, times = self.case, instance.kinks
-        p_load, p_gen = instance.p_load(case, times), self.static_dispatch(instance, times)
-        with contextlib.suppress(PowerFlowError):  # all at once is faster, one by one tells where it fails
-            self.network.power_flow(p_gen, p_load)
-            return
         for t, gen, load in zip(times, p_gen, p_load, strict=True):
             try:
                 self.network.power_flow(gen, load)

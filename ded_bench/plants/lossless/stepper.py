@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, inlined
 
 Indices = NDArray[np.int_]
 
@@ -208,7 +208,7 @@ def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> b
     return True
 
 
-@compiled
+@inlined
 def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> float:
     """Largest difference of algebraic buses' injections from those wanted, pu; infinite if one is no number.
 

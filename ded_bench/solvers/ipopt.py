@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import pyomo.environ as pyo
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.problem.case import Array
+from ded_bench.solvers.linear_program import LinearProgram, assign, bounds, read_linear
 from ded_bench.solvers.status import Options, Outcome, Status
 
 #: IPOPT's return values as CasADi spells them; everything else is a failure.
@@ -25,76 +25,59 @@ _IPOPT_STATUS = {
     "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
     "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
 }
+#: For linear programs: derivatives that never change, and bounds as they are (by default IPOPT relaxes
+#: them by 1e-8). Mehrotra's steps would save a third, but with them IPOPT never says infeasible.
+LINEAR_OPTIONS: dict[str, Any] = {
+    "bound_relax_factor": 0.0,
+    "grad_f_constant": "yes",
+    "jac_c_constant": "yes",
+    "jac_d_constant": "yes",
+    "hessian_constant": "yes",
+}
 _IPOPT_VERSION = f"ipopt (casadi {importlib.metadata.version('casadi')})"
 
 
 class CasadiIpopt:
-    """IPOPT and MUMPS on a Pyomo model, through its .nl form.
-
-    It is compiled once and solved many times: between solves only variable bounds and initial values may
-    change. What differs between instances is therefore written as variables fixed by equal bounds, which
-    IPOPT removes before it starts. Every solve starts cold: it never depends on the ones before it.
+    """IPOPT and MUMPS from the `casadi` wheel: on a linear model's arrays, else on its .nl form.
 
     Args:
-        model: the Pyomo model; its structure must not change afterwards.
+        model: the Pyomo model, or its arrays; its structure must not change afterwards.
         options: IPOPT options beyond the defaults.
     """
 
-    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
+    def __init__(self, model: pyo.ConcreteModel | LinearProgram, options: Options | None = None) -> None:
         started = time.perf_counter()
         self._options = dict(options or {})
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "model.nl")
-            with path.open("w") as stream:
-                info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
-            builder = casadi.NlpBuilder()
-            builder.import_nl(str(path))
-        self._nlp = {
-            "x": casadi.vertcat(*builder.x),
-            "f": builder.f,
-            "g": casadi.vertcat(*builder.g),
-        }
-        self._columns = tuple(info.variables)
-        self._rows = {"lbg": np.array(builder.g_lb), "ubg": np.array(builder.g_ub)}
+        try:
+            program = model if isinstance(model, LinearProgram) else read_linear(model)
+            program.numbers()
+            self._source: _Arrays | _Nl = _Arrays(program)
+        except ValueError:  # not linear, or not until its data are fixed
+            self._source = _Nl(model)
         self._solver: casadi.Function | None = None
         self._limit: float | None = None
         self._setup_s = time.perf_counter() - started
 
     def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """Solve for the current bounds and initial values; the first call also pays for derivatives."""
+        """See `Compiled`; the first call also pays for symbolic derivatives."""
         started = time.perf_counter()
+        source = self._source
         if self._solver is None or self._limit != time_limit_s:
-            # Scalar expressions must be expanded, or every evaluation takes several times as long.
-            self._solver = make_ipopt(self._nlp, self._options, time_limit_s, {"expand": True})
-            self._limit = time_limit_s
-        lower, upper = bounds(self._columns)
-        start = np.array([0.0 if v.value is None else v.value for v in self._columns])
+            self._solver, self._limit = self._make(time_limit_s), time_limit_s
+        arguments, constant = source.current()
+        start = np.array([0.0 if v.value is None else v.value for v in source.columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
-        arguments = {"x0": start, "lbx": lower, "ubx": upper, **self._rows}
-        outcome, x = run_ipopt(self._solver, arguments, 0.0, setup)
+        arguments |= {"x0": start, "lbg": source.g_lower, "ubg": source.g_upper}
+        outcome, x = run_ipopt(self._solver, arguments, constant, setup)
         if x is not None:
-            assign(self._columns, x)
+            assign(source.columns, x)
         return outcome
 
-
-def bounds(columns: Sequence[Any]) -> Array:
-    """Lower and upper bounds of Pyomo variables, shape (2, n); infinite where there are none."""
-    both = np.array([[v.lb for v in columns], [v.ub for v in columns]], dtype=float)  # None becomes NaN
-    return np.where(np.isnan(both), [[-np.inf], [np.inf]], both)
-
-
-def assign(columns: Sequence[Any], values: Array) -> None:
-    """Set the values of Pyomo variables."""
-    for variable, value in zip(columns, values.tolist(), strict=True):
-        variable.set_value(value, skip_validation=True)
-
-
-def fix(variable: pyo.Var, value: float) -> None:
-    """Make a variable data: fixed by equal bounds."""
-    variable.setlb(value)
-    variable.setub(value)
-    variable.set_value(value, skip_validation=True)
+    def _make(self, time_limit_s: float | None) -> casadi.Function:
+        # Scalar expressions must be expanded, or every evaluation takes several times as long.
+        options = {"expand": isinstance(self._source, _Nl)}
+        return make_ipopt(self._source.nlp, self._options, time_limit_s, options)
 
 
 def make_ipopt(
@@ -125,3 +108,46 @@ def run_ipopt(
         x, objective = result["x"].full().ravel(), float(result["f"]) + constant
     said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
     return Outcome(status, x is not None, *said), x
+
+
+#: What IPOPT is called with, and what its objective leaves out.
+_Current = tuple[dict[str, Array], float]
+
+
+class _Arrays:
+    """A linear program for CasADi: constant matrices, costs as parameters."""
+
+    def __init__(self, program: LinearProgram) -> None:
+        n_rows, n = program.a.shape
+        pattern = casadi.Sparsity(n_rows, n, program.a.indptr.tolist(), program.a.indices.tolist())
+        x, cost = casadi.MX.sym("x", n), casadi.MX.sym("cost", n)
+        g = casadi.mtimes(casadi.DM(pattern, program.a.data), x)
+        self.nlp: dict[str, Any] = {"x": x, "p": cost, "f": casadi.dot(cost, x), "g": g}
+        self.columns = program.columns
+        self.g_lower, self.g_upper = program.row_lower, program.row_upper
+        self._program = program
+
+    def current(self) -> _Current:
+        numbers = self._program.numbers()
+        arguments = {"lbx": numbers.lower, "ubx": numbers.upper, "p": numbers.cost}
+        return arguments, numbers.constant
+
+
+class _Nl:
+    """A Pyomo model for CasADi through its .nl form."""
+
+    def __init__(self, model: pyo.ConcreteModel) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "model.nl")
+            with path.open("w") as stream:
+                info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
+            builder = casadi.NlpBuilder()
+            builder.import_nl(str(path))
+        g = casadi.vertcat(*builder.g)
+        self.nlp: dict[str, Any] = {"x": casadi.vertcat(*builder.x), "f": builder.f, "g": g}
+        self.columns = tuple(info.variables)
+        self.g_lower, self.g_upper = np.array(builder.g_lb), np.array(builder.g_ub)
+
+    def current(self) -> _Current:
+        lower, upper = bounds(self.columns)
+        return {"lbx": lower, "ubx": upper}, 0.0

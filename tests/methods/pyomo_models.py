@@ -1,4 +1,4 @@
-"""The programs of knots written again in Pyomo, to check their arrays with another solver."""
+"""The program of `ded-slp` written again in Pyomo, to check its arrays with another solver."""
 
 from __future__ import annotations
 
@@ -6,18 +6,12 @@ from typing import Any
 
 import numpy as np
 import pyomo.environ as pyo
-import scipy.sparse as sp
-from pyomo.repn.plugins.standard_form import LinearStandardFormCompiler
 
 from ded_bench.methods.knots import power_limits as knot_limits
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
-from ded_bench.solvers.highs import solve_form
-from ded_bench.solvers.ipopt import bounds as bounds_of
-from ded_bench.solvers.linear_program import FreeForm
-from ded_bench.solvers.status import Status
 
 
 def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVarying) -> pyo.ConcreteModel:
@@ -99,24 +93,3 @@ def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVar
         return generation + price * pyo.quicksum(m.p_slack_up[k] + m.p_slack_down[k] for k in m.point)
 
     return m
-
-
-def optimum(model: pyo.ConcreteModel) -> float:
-    """The least objective of a linear model, by HiGHS."""
-    found = LinearStandardFormCompiler().write(model, mixed_form=True)
-    kind = np.array([row.bound_type for row in found.rows])  # 1: at most, -1: at least, 0: equal
-    a, right, inequality = found.A.tocsr(), np.array(found.rhs), kind != 0
-    lower, upper = bounds_of(found.columns)
-    form = FreeForm(
-        cost=found.c.toarray().ravel(),
-        equal=sp.csc_matrix(a[~inequality]),
-        right=right[~inequality],
-        between=sp.csc_matrix(a[inequality]),
-        low=np.where(kind < 0, right, -np.inf)[inequality],
-        high=np.where(kind > 0, right, np.inf)[inequality],
-        lower=lower,
-        upper=upper,
-    )
-    answer = solve_form(form)
-    assert answer.status == Status.OPTIMAL
-    return float(form.cost @ answer.x + found.c_offset[0])

@@ -9,36 +9,57 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_ko
+from ded_bench.methods.ded_ko import SOLVERS, build_ded_ko, set_instance
 from ded_bench.methods.first_schedules import slow_dispatch
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Artifact, Settings
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.compile import compile_model
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.instance_model import model_along
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
 from tests.methods.on_surrogates import METHODS, check_limits, replay, short
-from tests.methods.pyomo_models import build_ded_slp, optimum
 
 NAMES = ("ded-ko", "ded-ko-knots")
 
 
+def ways(method) -> list[str]:
+    """Options that name a solver, if the method has them."""
+    return [f"solver={name}" for name in SOLVERS] if method is ded_ko else ["default"]
+
+
 @pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_its_answer_is_the_optimum_and_replays_on_the_model(
+def test_solvers_agree_and_their_solution_replays_on_the_model(
     case: Case, koopman: Koopman, regime: str
 ) -> None:
-    """HiGHS on the program written in Pyomo finds the same one; PIQP leaves a relative gap of 1e-7."""
-    instance = short(case, 3, horizon_s=1.0)
-    solution = ded_ko.prepare_with(case, koopman, regime, Settings())(instance)
-    check_limits(case, koopman, instance, solution, regime)
-    assert solution.iterations > 0
-    assert solution.solve_s > 0
-    points = np.arange(instance.steps + 1)
-    model = model_along(case, koopman, instance, slow_dispatch(case, instance, points), points)
-    best = optimum(build_ded_slp(case, instance, case.bounds(regime), model))
-    assert solution.solver_objective == pytest.approx(best, rel=2e-7)
+    instance = short(case, 3)
+    solve = [ded_ko.prepare_with(case, koopman, regime, Settings(f"solver={slug}")) for slug in SOLVERS]
+    solutions = [each(instance) for each in solve]
+    for solution in solutions:
+        check_limits(case, koopman, instance, solution, regime)
+        assert solution.iterations > 0
+        assert solution.solve_s > 0
+        assert solution.solver_objective == pytest.approx(solutions[0].solver_objective, rel=1e-7)
+    assert len({solution.solver_version for solution in solutions}) == len(SOLVERS)
+
+
+@pytest.mark.parametrize("slug", SOLVERS)
+def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Koopman, slug: str) -> None:
+    """One built model serves all instances."""
+    first, last = (short(case, index, horizon_s=1.0) for index in range(2))
+    solve = ded_ko.prepare_with(case, koopman, "TO", Settings(f"solver={slug}"))
+    solve(first)
+    again = solve(last)
+    model = build_ded_ko(case, koopman, last.steps)
+    set_instance(model, case, koopman, last, "TO")
+    fresh = compile_model(model, slug, SOLVERS[slug]).solve()
+    # PIQP leaves a relative gap of 1e-7.
+    assert again.solver_objective == pytest.approx(fresh.objective, rel=2e-7 if slug == "piqp" else 1e-9)
+    assert again.build_s < 0.5  # built before
+    assert again.setup_s < 0.5
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -69,8 +90,8 @@ def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: 
     far = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": outside})})
     spinning = dict.fromkeys(case.generators, 2.0)
     fast = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": spinning})})
-    for bad in (far, fast):
-        solution = method.prepare_with(case, koopman, "NO", Settings())(bad)
+    for bad, options in [(bad, options) for bad in (far, fast) for options in ways(method)]:
+        solution = method.prepare_with(case, koopman, "NO", Settings(options))(bad)
         assert solution.status == Status.INFEASIBLE
         assert solution.schedule is None
         assert solution.solver_objective is None
@@ -138,6 +159,11 @@ def test_along_a_trajectory_answers_are_nearly_those_of_the_true_system(
     assert solution.solver_objective == pytest.approx(found.objective, rel=1e-3)
 
 
+def test_only_piqp_solves_what_is_made_for_each_instance(ninebus: Case) -> None:
+    with pytest.raises(InputError, match="only piqp solves"):
+        ded_ko.prepare(ninebus, "NO", Settings("solver=highs", model="trajectory"))
+
+
 def test_a_lifted_models_knots_answer_as_its_own_rollout(case: Case) -> None:
     instance, surrogate = short(case, 1), nominal_model(case)
     points = np.array([0, 40, 41, 120, 300])
@@ -148,3 +174,16 @@ def test_a_lifted_models_knots_answer_as_its_own_rollout(case: Case) -> None:
     own = replay(case, surrogate, instance, powers)
     np.testing.assert_allclose(model.outputs(u)[0], own.omega, atol=1e-10)
     np.testing.assert_allclose(model.outputs(u)[1], own.p_slack, atol=1e-9)
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_arrays_are_the_pyomo_model(regime, ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By default Pyomo holds what is small; without it the optimum is the same (PIQP's gap: 1e-7)."""
+    instance, found = short(ninebus, 1), []
+    for entries in (ded_ko.PYOMO_ENTRIES, 0):
+        monkeypatch.setattr(ded_ko, "PYOMO_ENTRIES", entries)
+        solution = ded_ko.prepare(ninebus, regime, Settings(model="linear"))(instance)
+        assert solution.status == Status.OPTIMAL
+        found.append(solution)
+    assert found[0].setup_s > found[1].setup_s == 0  # only a Pyomo model is compiled
+    assert found[0].solver_objective == pytest.approx(found[1].solver_objective, rel=2e-7)

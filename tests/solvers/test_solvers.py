@@ -9,10 +9,27 @@ import pyomo.environ as pyo
 import pytest
 import scipy.sparse as sp
 
+from ded_bench.files.errors import InputError
 from ded_bench.solvers import highs, piqp
-from ded_bench.solvers.ipopt import CasadiIpopt, fix
+from ded_bench.solvers.compile import SOLVERS, compile_model, fix
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.status import Status
+
+
+def diet(prices: tuple[float, float] = (2.0, 3.0), need: float = 4.0) -> pyo.ConcreteModel:
+    """Buy x, y >= 0 with x + 2 y >= need and x <= 3: prices and need are data."""
+    m = pyo.ConcreteModel()
+    m.price = pyo.Var([0, 1])
+    m.need = pyo.Var()
+    m.x = pyo.Var(bounds=(0, 3))
+    m.y = pyo.Var(bounds=(0, None))
+    m.enough = pyo.Constraint(expr=m.x + 2 * m.y - m.need >= 0)
+    m.total = pyo.Objective(expr=m.price[0] * m.x + m.price[1] * m.y + 1)
+    for i in (0, 1):
+        fix(m.price[i], prices[i])
+    fix(m.need, need)
+    return m
+
 
 #: Minimise 2 x + 3 y with x + 2 y = 4, 1 <= x - y and 0 <= x, y <= 3: x = 2, y = 1.
 FORM = FreeForm(
@@ -50,33 +67,90 @@ def rosenbrock() -> pyo.ConcreteModel:
     return m
 
 
-def test_ipopt_solves_pyomo_models_before_and_after_new_numbers() -> None:
-    model = rosenbrock()
-    compiled = CasadiIpopt(model)
-    outcome = compiled.solve()
-    assert outcome.status == Status.OPTIMAL
-    assert outcome.iterations > 5
-    assert outcome.version.startswith("ipopt")
-    assert outcome.setup_s >= 0 < outcome.solve_s
-    assert (model.x.value, model.y.value) == pytest.approx((1.0, 1.0))
-    model.x.setub(0.5)  # the valley's floor is y = x²
-    assert compiled.solve().objective == pytest.approx(0.25, abs=1e-6)
-    model.x.set_value(-1.2)
-    assert compiled.solve(1e-5).status == Status.TIME_LIMIT
-    fix(model.x, -1.0)
-    assert compiled.solve(60.0).objective == pytest.approx(4.0, abs=1e-6)
+def transport(size: int = 60) -> pyo.ConcreteModel:
+    """A dense linear program that takes every solver more than a moment."""
+    rng = np.random.default_rng(0)
+    m = pyo.ConcreteModel()
+    m.i = pyo.RangeSet(0, size - 1)
+    m.x = pyo.Var(m.i, m.i, bounds=(0, None))
+    cost = rng.random((size, size))
+    m.supply = pyo.Constraint(m.i, rule=lambda m, i: sum(m.x[i, j] for j in m.i) <= 1.5)
+    m.demand = pyo.Constraint(m.i, rule=lambda m, j: sum(m.x[i, j] for i in m.i) >= 1.0)
+    m.total = pyo.Objective(expr=sum(cost[i, j] * m.x[i, j] for i in m.i for j in m.i))
+    return m
 
 
-def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails() -> None:
-    model = rosenbrock()
-    model.far = pyo.Constraint(expr=model.x**2 + model.y**2 <= -1)
-    outcome = CasadiIpopt(model).solve()
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_known_optima_before_and_after_new_numbers(solver: str) -> None:
+    """Per unit of need, x costs its price and y half of it; then data and bounds change in place."""
+    model = diet()
+    compiled = compile_model(model, solver)
+    for prices, need, x, y in (((2.0, 3.0), 4.0, 0, 2), ((1.0, 3.0), 4.0, 3, 0.5), ((1.0, 3.0), 2.0, 2, 0)):
+        for i in (0, 1):
+            fix(model.price[i], prices[i])
+        fix(model.need, need)
+        outcome = compiled.solve()
+        assert outcome.status == Status.OPTIMAL
+        assert outcome.has_values
+        assert (model.x.value, model.y.value) == pytest.approx((x, y), abs=1e-6)
+        assert outcome.objective == pytest.approx(prices[0] * x + prices[1] * y + 1, abs=1e-6)
+        assert outcome.objective == pytest.approx(pyo.value(model.total), abs=1e-9)
+        assert outcome.version.startswith(solver)
+        assert outcome.setup_s >= 0 < outcome.solve_s
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails(solver: str) -> None:
+    model = diet()
+    model.y.setub(0.25)
+    outcome = compile_model(model, solver).solve()
     assert outcome.status == Status.INFEASIBLE
     assert not outcome.has_values
     assert outcome.objective is None
-    model = pyo.ConcreteModel()
-    model.x = pyo.Var(initialize=0.0)
-    model.cost = pyo.Objective(expr=-model.x)
-    outcome = CasadiIpopt(model).solve()
+    model = diet(prices=(2.0, -1.0))
+    outcome = compile_model(model, solver).solve()
     assert outcome.status == Status.FAILED
     assert outcome.message
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
+    model = transport()
+    compiled = compile_model(model, solver)
+    whole = compiled.solve()
+    assert whole.status == Status.OPTIMAL
+    assert compiled.solve(1e-4).status == Status.TIME_LIMIT
+    again = compiled.solve(60.0)
+    assert again.status == Status.OPTIMAL
+    assert again.objective == pytest.approx(whole.objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("solver", ["piqp", "highs"])
+def test_linear_solvers_refuse_what_is_not_linear(solver: str) -> None:
+    model = diet()
+    model.curved = pyo.Constraint(expr=model.x**2 + model.y <= 9)
+    with pytest.raises(ValueError, match="curved is not linear"):
+        compile_model(model, solver)
+    model = diet()
+    model.need.setub(None)
+    model.total.expr += model.need * model.x
+    with pytest.raises(ValueError, match="not linear in the free variables"):
+        compile_model(model, solver).solve()
+    with pytest.raises(ValueError, match="not linear"):
+        compile_model(rosenbrock(), solver).solve()
+
+
+def test_ipopt_solves_nonlinear_models() -> None:
+    model = rosenbrock()
+    outcome = compile_model(model, "ipopt").solve()
+    assert outcome.status == Status.OPTIMAL
+    assert outcome.iterations > 5
+    assert (model.x.value, model.y.value) == pytest.approx((1.0, 1.0))
+    model.x.setub(0.5)  # the valley's floor is y = x²
+    outcome = compile_model(model, "ipopt").solve()
+    assert outcome.objective == pytest.approx(0.25, abs=1e-6)
+
+
+def test_an_unknown_solver_is_named() -> None:
+    with pytest.raises(InputError, match="known: ipopt"):
+        compile_model(diet(), "simplex")

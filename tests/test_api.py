@@ -57,10 +57,11 @@ sys.meta_path.insert(0, NoTorch())
 
 
 def test_answers_need_no_torch() -> None:
-    """Of any method, our policies among them; only training imports it."""
+    """Of any method, our policies among them; only training imports it, and that of `ded-admm` does not."""
     code = "from ded_bench.cli import commands\n"
     code += "from ded_bench.methods.registry import METHODS\n"
     code += "[m.options for m in METHODS.values()]\n"
+    code += "import ded_bench.methods.admm.admm_training\n"
     code += "import ded_bench.run.runner, ded_bench.analysis.certificate, ded_bench.report.report\n"
     assert "torch" not in loaded_after(code)
 
@@ -73,7 +74,7 @@ def test_training_says_what_to_install(tmp_path) -> None:
         code = f"{WITHOUT_TORCH}from ded_bench.cli import main; sys.exit(main({arguments}))"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
         assert done.returncode == 2
-        assert done.stderr == "ded-bench: torch: training needs PyTorch: pip install 'ded-bench[train]'\n"
+        assert done.stderr == "ded-bench: torch: training needs it: pip install 'ded-bench[train]'\n"
         assert not list(tmp_path.iterdir())
 
 

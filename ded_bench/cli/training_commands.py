@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import contextlib
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +64,15 @@ def _train_ko(a: argparse.Namespace) -> int:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
-    if is_paper := a.kind == TRAINED[1]:
-        _find_torch()
+    is_paper = a.kind == TRAINED[1]
+    with _missing_named():
+        if is_paper:
+            from ded_bench.surrogates.koopman_paper import identify_paper
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
     from ded_bench.plants.lossless.network import Network
     from ded_bench.surrogates.identify import held_out, identify, rollout_errors
 
-    if is_paper:
-        from ded_bench.surrogates.koopman_paper import identify_paper
-
-        model = identify_paper(case, a.seed, a.count)
-    else:
-        model = identify(case, a.seed, a.count)
+    model = (identify_paper if is_paper else identify)(case, a.seed, a.count)
     model.save(out)
     omega, p_slack = rollout_errors(model, Network(case), held_out(case, a.seed))
     held = f"{omega / (2 * math.pi):.3g} Hz at most, P_s by {p_slack:.3g} pu rms, on held-out trajectories"
@@ -94,11 +92,9 @@ def _train_dpc(a: argparse.Namespace) -> int:
     jobs = [(method.name, regime) for method in methods for regime in regimes]
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method and regime with --out")
-    for method in methods:
-        if not method.trainer:
-            _ = method.train  # says that it is not trained
-    if any(method.trainer.startswith("ded_bench.") for method in methods):
-        _find_torch()
+    with _missing_named():
+        for method in methods:
+            _ = method.train  # says if it is not trained
     for method in methods if a.start else ():
         if not method.takes_start:
             raise InputError("--start", str(a.start), f"{method.name} does not start from other weights")
@@ -147,11 +143,13 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     return f"wrote {out}: {facts['epochs']} epochs in {facts['seconds']:.0f} s{''.join(losses)}"
 
 
-def _find_torch() -> None:
-    """Say what to install where PyTorch is not, without the seconds that its import takes."""
+@contextlib.contextmanager
+def _missing_named() -> Iterator[None]:
+    """Say what to install where a package is not that only training needs."""
     try:
-        missing = importlib.util.find_spec("torch") is None
-    except ModuleNotFoundError:  # a finder may say so itself
-        missing = True
-    if missing:
-        raise InputError("torch", "", "training needs PyTorch: pip install 'ded-bench[train]'")
+        yield
+    except ModuleNotFoundError as error:
+        package = str(error.name).partition(".")[0]
+        if package not in ("cma", "torch"):
+            raise
+        raise InputError(package, "", "training needs it: pip install 'ded-bench[train]'") from None

@@ -9,12 +9,7 @@ import pytest
 from scipy.optimize import linprog
 
 from ded_bench.methods.admm.modal_grid import SMALLEST_COST
-from ded_bench.methods.admm.network_kernels import (
-    MISMATCH,
-    follow_trajectory,
-    plan_elimination,
-    start_angles,
-)
+from ded_bench.methods.admm.network_kernels import MISMATCH
 from ded_bench.methods.admm.problems import POINTS, Problems, sampled
 from ded_bench.methods.stacked_instances import load_segments
 from ded_bench.plants.simulate import simulate
@@ -63,33 +58,30 @@ def test_what_is_drawn_for_training_is_of_both_kinds(case: Case) -> None:
 
 @pytest.mark.parametrize("name", GRIDS)
 def test_power_flows_and_stiffness_along_a_trajectory_are_the_networks(name: str) -> None:
-    """Angles to the mismatch that is accepted, stiffness by the network's own, dense, linearisation."""
+    """Angles to the mismatch that is accepted, stiffness by the network's own linearisation."""
     grid = modal_grid(Case.load(name))
-    (start, _), network = started(grid, 2), grid.network
+    (start, linear), network = started(grid, 2), grid.network
     problems, generators = start.problems, network.generators
-    moved = start.schedule[0, -1] - problems.p_initial[0] - start.taken[0, -1]
-    angles = start.theta[0, generators] + np.linspace(0.0, 1.0, 5)[:, None] * (moved @ grid.compliance)
-    loads = problems.load[0, np.linspace(0, len(grid.points) - 1, 5).astype(int)]
-    f, stiffness = np.empty_like(angles), np.empty((2, len(generators), len(generators)))
-    plan = plan_elimination(network.ends, network.n_bus, [network.slack, *generators.tolist()])
-    taken = np.array([0, len(angles) - 1])
-    assert follow_trajectory(grid.lines, plan, angles, loads, start.theta[0], taken, f, stiffness)
-    theta = network.power_flow(problems.p_initial[0], loads[0])
+    theta = network.power_flow(problems.p_initial[0], problems.load[0, 0])
     np.testing.assert_allclose(start.theta[0], theta, atol=10 * MISMATCH)
+    x = (start.schedule[0, -1] - problems.p_initial[0] - start.taken[0, -1]) @ grid.compliance
     last = np.zeros(network.n_bus)
-    last[generators] = angles[-1]
-    ends, injections = network.solve_loads(last, network.load_injections(loads[-1]))
-    np.testing.assert_allclose(f[-1], injections[generators], atol=10 * MISMATCH)
-    for found, angles_there in zip(stiffness, (theta, ends), strict=True):
-        np.testing.assert_allclose(found, network.linearise(angles_there).stiffness, rtol=1e-4, atol=1e-4)
+    last[generators] = theta[generators] + x
+    ends, injections = network.solve_loads(last, network.load_injections(problems.load[0, -1]))
+    for found, angles in ((linear.stiffness[0, 0], theta), (linear.stiffness[0, -1], ends)):
+        expected = network.linearise(angles).stiffness
+        np.testing.assert_allclose(grid.stiffness + found, expected, rtol=1e-4, atol=1e-4)
+    rest = np.linalg.solve(grid.gain.T, -linear.offset[0, -1])  # of the power, what stiffness does not say
+    f = rest + (grid.stiffness + linear.stiffness[0, -1]) @ x
+    np.testing.assert_allclose(f, injections[generators], atol=10 * MISMATCH)
 
 
 def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
     """Powers that no line can carry."""
     grid = modal_grid(case)
-    plan = plan_elimination(grid.network.ends, grid.network.n_bus, [grid.network.slack])
-    wanted, theta = np.full(grid.network.n_bus, 1e3), np.empty(grid.network.n_bus)
-    assert not start_angles(grid.lines, plan, grid.theta, wanted, theta)
+    problems = started(grid, 2)[0].problems
+    problems.p_initial[1] = 1e3
+    np.testing.assert_array_equal(grid.start(problems).served, [True, False])
 
 
 @pytest.mark.parametrize("name", GRIDS)

@@ -18,14 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
-from ded_bench.methods.admm.network_kernels import (
-    Lines,
-    follow_trajectory,
-    plan_elimination,
-    start_angles,
-)
+from ded_bench.methods.admm.network_kernels import CONTRACTION, MISMATCH, follow_trajectory
 from ded_bench.methods.admm.problems import POINTS, Problems, ramp_limited_schedules, time_grid
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.lossless.stepper import set_jacobian, solve_algebraic
 from ded_bench.problem.case import Array, Case
 
 #: Damping rates that differ by less than this part are the same in all but the digits of the data.
@@ -85,12 +81,13 @@ class ModalGrid:
         self.shares = np.trapezoid(self.between, self.points, axis=0) / self.points[-1]
         half = 0.5 * float(self.points[1])
         self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * POINTS)
-        network = self.network
-        self.lines = Lines(network.ends, network.coupling, network.generators, network.loads)
-        slack, machines = [network.slack], [network.slack, *network.generators.tolist()]
-        self._to_slack, self._to_machines = (
-            plan_elimination(network.ends, network.n_bus, kept) for kept in (slack, machines)
-        )
+        #: Solved for buses without machines, and for generators and these; inverses of nominal Jacobians.
+        grid = self.network.grid._replace(mismatch=MISMATCH)
+        whole = grid._replace(algebraic=np.concatenate([grid.generators, grid.algebraic]))
+        n_gen, jacobian = len(grid.generators), np.empty((len(whole.algebraic),) * 2)
+        set_jacobian(whole, self.theta, jacobian)
+        self._grids, self._whole_inverse = (grid, whole), np.linalg.inv(jacobian)
+        self._inverse_of_loads = np.linalg.inv(jacobian[n_gen:, n_gen:])
 
     def _linearise_nominal(self) -> None:
         self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)
@@ -114,12 +111,14 @@ class ModalGrid:
     def start(self, problems: Problems) -> Start:
         """Angles at t = 0 and the first schedule."""
         network, batch = self.network, len(problems)
-        theta, served = np.empty((batch, network.n_bus)), np.empty(batch, bool)
-        wanted = np.zeros((batch, network.n_bus))
-        wanted[:, network.generators] = problems.p_initial
-        wanted[:, network.loads] = problems.load[:, 0]
+        theta, served = np.tile(self.theta, (batch, 1)), np.empty(batch, bool)
+        wanted = np.hstack([problems.p_initial, network.load_injections(problems.load[:, 0])])
+        f = np.empty(network.n_bus)
         for b in range(batch):
-            served[b] = start_angles(self.lines, self._to_slack, self.theta, wanted[b], theta[b])
+            served[b] = solve_algebraic(
+                self._grids[1], wanted[b], self._whole_inverse.copy(), theta[b], f, CONTRACTION
+            )
+        served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
         mean_cost, schedule = ramp_limited_schedules(
@@ -158,14 +157,13 @@ class ModalGrid:
         batch, n_flows, n_gen = slow.shape
         f = np.empty((batch, n_flows, n_gen))
         stiffness = np.empty((batch, len(self.stiffness_knots), n_gen, n_gen))
-        loads = np.ascontiguousarray(problems.load[:, ::points])
+        wanted = self.network.load_injections(problems.load[:, ::points])
         generators, at = self.network.generators, self.stiffness_knots // self.every
-        network = self.lines, self._to_machines
         for b in range(batch):
             if start.served[b]:
-                angles = start.theta[b, generators] + slow[b]
+                given = start.theta[b, generators] + slow[b], wanted[b], self._inverse_of_loads.copy()
                 start.served[b] = follow_trajectory(
-                    *network, angles, loads[b], start.theta[b], at, f[b], stiffness[b]
+                    self._grids, *given, start.theta[b], at, f[b], stiffness[b]
                 )
         if not start.served.all():
             bad = np.logical_not(start.served)

@@ -19,7 +19,7 @@ Indices = NDArray[np.int_]
 
 #: Newton gives up after so many steps.
 NEWTON_STEPS = 30
-#: The Jacobian is renewed where a step makes the mismatch smaller by less than this factor.
+#: What a step has to leave of the mismatch at most, else the Jacobian is renewed.
 CONTRACTION = 0.02
 
 
@@ -118,11 +118,11 @@ def integrate(
                     ahead = 4.0 * (recent[0, s, i] + recent[2, s, i])
                     ahead -= 6.0 * recent[1, s, i] + recent[3, s, i]
                     angle[grid.algebraic[i]] = ahead
-                solved = _solve_algebraic(grid, wanted, inverse, angle, f)
+                solved = solve_algebraic(grid, wanted, inverse, angle, f)
                 if not solved:  # a bad guess? from the angles of the step before, then
                     for i in range(n_algebraic):
                         angle[grid.algebraic[i]] = recent[0, s, i]
-                    solved = _solve_algebraic(grid, wanted, inverse, angle, f)
+                    solved = solve_algebraic(grid, wanted, inverse, angle, f)
                 if not solved:
                     return k
                 for i in range(n_algebraic):
@@ -145,8 +145,17 @@ def integrate(
 
 
 @compiled
-def _solve_algebraic(grid: CompiledGrid, wanted: Array, inverse: Array, angle: Array, f: Array) -> bool:
+def solve_algebraic(
+    grid: CompiledGrid,
+    wanted: Array,
+    inverse: Array,
+    angle: Array,
+    f: Array,
+    contraction: float = CONTRACTION,
+) -> bool:
     """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
+
+    The inverse of the Jacobian is renewed where a step makes the mismatch smaller by less than `contraction`.
 
     Returns:
         Whether there is a solution; if there is none, angles and f mean nothing.
@@ -160,7 +169,7 @@ def _solve_algebraic(grid: CompiledGrid, wanted: Array, inverse: Array, angle: A
             return True
         if not worst < np.inf:
             return False
-        if worst > CONTRACTION * last:
+        if worst > contraction * last:
             _invert(grid, angle, inverse)
         last = worst
         correction[:] = 0.0
@@ -197,7 +206,7 @@ def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> b
             solved = worst < grid.mismatch
             if solved or not worst < np.inf:
                 break
-            _set_jacobian(grid, theta[b], jacobian)
+            set_jacobian(grid, theta[b], jacobian)
             for i in range(n):
                 off[i] = f[b, grid.algebraic[i]] - wanted[b, i]
             step = np.linalg.solve(jacobian, off)
@@ -232,12 +241,12 @@ def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> floa
 @compiled
 def _invert(grid: CompiledGrid, angle: Array, inverse: Array) -> None:
     """Set the inverse of the algebraic buses' Jacobian; LinAlgError if it is singular."""
-    _set_jacobian(grid, angle, inverse)
+    set_jacobian(grid, angle, inverse)
     inverse[:] = np.linalg.inv(inverse)
 
 
 @compiled
-def _set_jacobian(grid: CompiledGrid, angle: Array, jacobian: Array) -> None:
+def set_jacobian(grid: CompiledGrid, angle: Array, jacobian: Array) -> None:
     """Set ∂f/∂θ of the algebraic buses, (n_algebraic, n_algebraic), pu/rad."""
     place = np.full(len(angle), -1)
     for i in range(len(grid.algebraic)):

@@ -1,7 +1,7 @@
 """Compare weights of `ded-admm` that were trained in different ways.
 
-Run as `python studies/admm_derivative_free.py 39bus TO OLD.safetensors NEW.safetensors 64`: policies answer so
-many fresh validation draws, and the simulation judges; costs are relative to those of the first policy.
+Run as `python studies/admm_derivative_free.py 39bus TO OLD.safetensors NEW.safetensors 64`: policies answer
+so many fresh validation draws, and the simulation judges; costs are relative to those of the first policy.
 """
 
 import sys

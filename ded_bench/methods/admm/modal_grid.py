@@ -161,9 +161,9 @@ class ModalGrid:
         generators, at = self.network.generators, self.stiffness_knots // self.every
         for b in range(batch):
             if start.served[b]:
-                given = start.theta[b, generators] + slow[b], wanted[b], self._inverse_of_loads.copy()
+                angles, inverse = start.theta[b, generators] + slow[b], self._inverse_of_loads.copy()
                 start.served[b] = follow_trajectory(
-                    self._grids, *given, start.theta[b], at, f[b], stiffness[b]
+                    self._grids, angles, wanted[b], inverse, start.theta[b], at, f[b], stiffness[b]
                 )
         if not start.served.all():
             bad = np.logical_not(start.served)

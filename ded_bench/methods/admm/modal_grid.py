@@ -86,8 +86,8 @@ class ModalGrid:
         whole = grid._replace(algebraic=np.concatenate([grid.generators, grid.algebraic]))
         n_gen, jacobian = len(grid.generators), np.empty((len(whole.algebraic),) * 2)
         set_jacobian(whole, self.theta, jacobian)
-        self._grids, self._whole_inverse = (grid, whole), np.linalg.inv(jacobian)
-        self._inverse_of_loads = np.linalg.inv(jacobian[n_gen:, n_gen:])
+        self._grids, self._whole_inverse = (grid, whole), np.asarray(np.linalg.inv(jacobian))
+        self._inverse_of_loads = np.asarray(np.linalg.inv(jacobian[n_gen:, n_gen:]))
 
     def _linearise_nominal(self) -> None:
         self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)

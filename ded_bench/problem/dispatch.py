@@ -25,14 +25,12 @@ def merit_order(case: Case, cost_gen: Array, cost_slack: Array | float, p_load: 
     """
     demand = -np.asarray(p_load).sum(axis=-1)
     shape = np.broadcast_shapes(demand.shape, np.shape(cost_slack), np.shape(cost_gen)[:-1])
-    cost = np.broadcast_to(cost_gen, (*shape, len(case.generators)))
-    order = np.argsort(cost, axis=-1, kind="stable")
-    room = np.broadcast_to(case.p_max - case.p_min, cost.shape)
-    room = np.where(cost < np.asarray(cost_slack)[..., None], room, 0.0)
-    room = np.take_along_axis(room, order, axis=-1)
-    residual = np.broadcast_to(demand - case.p_min.sum(), shape)
-    below = np.cumsum(room, axis=-1) - room
-    raised = np.clip(residual[..., None] - below, 0.0, room)
+    cost = np.broadcast_to(cost_gen, (*shape, len(case.generators))).reshape(-1, len(case.generators))
+    slack = np.broadcast_to(cost_slack, shape).reshape(-1, 1)
+    residual = np.broadcast_to(demand - case.p_min.sum(), shape).reshape(-1, 1)
+    row, order = np.arange(len(cost))[:, None], cost.argsort(axis=1, kind="stable")
+    room = np.where(cost < slack, case.p_max - case.p_min, 0.0)[row, order]
+    below = room.cumsum(axis=1) - room
     result = np.empty(cost.shape)
-    np.put_along_axis(result, order, raised, axis=-1)
-    return result + case.p_min
+    result[row, order] = np.minimum(np.maximum(residual - below, 0.0), room)
+    return (result + case.p_min).reshape(*shape, -1)

@@ -145,4 +145,6 @@ def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     before = (window - 1) // 2
     padded = np.zeros((batch, width, n + window - 1), dtype=np.float32)
     padded[:, :, before : before + n] = x
-    return np.concatenate([padded[:, :, i : i + n] for i in range(window)], axis=1)
+    per_instance, per_channel, per_knot = padded.strides
+    strides = per_instance, per_knot, per_channel, per_knot
+    return np.ndarray((batch, window, width, n), np.float32, padded, strides=strides).reshape(batch, -1, n)

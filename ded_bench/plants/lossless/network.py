@@ -19,7 +19,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 
 if TYPE_CHECKING:
-    from ded_bench.plants.lossless.stepper import CompiledGrid, Indices
+    from ded_bench.plants.lossless.stepper import CompiledGrid
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
@@ -93,6 +93,11 @@ class Network:
         places = self.generators, self.algebraic, self.slack
         return CompiledGrid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
 
+    @functools.cached_property
+    def _whole(self) -> CompiledGrid:
+        """The same with all angles but the slack's unknown."""
+        return self.grid._replace(algebraic=self.unknown)
+
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
         flow = np.sin(theta @ self.incidence.T) * self.coupling
@@ -117,7 +122,7 @@ class Network:
         Raises:
             PowerFlowError: no solution from this guess.
         """
-        return self._newton(theta, injection, self.algebraic)
+        return self._newton(theta, injection, self.grid)
 
     def power_flow(self, p_gen: Array, p_load: Array) -> Array:
         """Equilibrium angles for given generator and load injections, shape (..., n_bus), rad.
@@ -131,7 +136,7 @@ class Network:
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
         theta = wanted @ self._first_step  # Newton's first step from θ = 0
-        theta, _ = self._newton(theta, wanted[..., self.unknown], self.unknown)
+        theta, _ = self._newton(theta, wanted[..., self.unknown], self._whole)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
             raise PowerFlowError("an angle across a line exceeds 90 degrees")
         return theta
@@ -170,14 +175,16 @@ class Network:
         slack_share = (full[[self.slack]][:, alg] @ inverse @ to_load)[0]
         return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
 
-    def _newton(self, theta: Array, wanted: Array, free: Indices) -> tuple[Array, Array]:
+    def _newton(self, theta: Array, wanted: Array, grid: CompiledGrid) -> tuple[Array, Array]:
         from ded_bench.plants.lossless.stepper import solve_angles  # here only, as in `grid`
 
         theta, f = np.array(theta), np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
-        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(free))).reshape(-1, len(free))
+        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(grid.algebraic))).reshape(
+            -1, len(grid.algebraic)
+        )
         try:
-            solved = solve_angles(self.grid._replace(algebraic=free), np.ascontiguousarray(wanted), *rows)
+            solved = solve_angles(grid, np.ascontiguousarray(wanted), *rows)
         except np.linalg.LinAlgError:
             solved = False
         if not solved:

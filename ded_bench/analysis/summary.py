@@ -1,4 +1,4 @@
-"""Summaries of rows: gaps, violations, rates, times, worst instances.
+"""Summaries of rows: gaps, violations, rates, times.
 
 Pure functions of `Results.frame()` and of the timing table. What a failure costs is decided here:
 a row without a score counts in `failures` and enters no mean.
@@ -12,20 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.lines import GROUP, HEAD, groups, head, line_table, records
-from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU
+from ded_bench.analysis.lines import GROUP, HEAD, groups, head, line_table
 from ded_bench.results.rows import Key
 from ded_bench.solvers.status import Status
 
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
 SUCCESS = [str(status) for status in (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)]
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
-#: What each of them is called.
-LIMITS = dict(zip(VIOLATIONS, ("frequency", "ramp", "bounds", "initial power"), strict=True))
-#: Gaps up to this are rounding, %: none of them is among the worst.
-SMALLEST_GAP = 1e-3
-#: The scorer's limits on each of them for `feasible` (see `plants.score`).
-FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
 #: Means over rows of islands: column of the rows, and its unit in theirs.
 ISLAND = {
     "mean_peak_mhz": ("mean_freq_max_hz", 1e3),
@@ -128,27 +121,6 @@ def _spread(name: str, values: pd.Series[float]) -> dict[str, float]:
         return dict.fromkeys((f"{name}_{part}" for part in SPREAD), np.nan)
     found = (numbers.mean(), np.median(numbers), np.quantile(numbers, 0.95), numbers.max())
     return {f"{name}_{part}": float(value) for part, value in zip(SPREAD, found, strict=True)}
-
-
-def worst(frame: pd.DataFrame, count: int = 3) -> pd.DataFrame:
-    """The worst instances of each line: largest gaps, and largest violations, of rows with their gaps.
-
-    `excess` is the largest violation in units of the scorer's tolerance, `broken` the limit that it breaks.
-    Rows within tolerance are not listed among the violations, nor gaps below SMALLEST_GAP.
-    """
-    scored = frame.dropna(subset=["objective"])
-    shares = scored[list(FEASIBLE)].astype(float) / pd.Series(FEASIBLE)
-    broken = [LIMITS[str(name)] for name in shares.fillna(-1.0).idxmax(axis=1)] if len(shares) else []
-    scored = scored.assign(excess=shares.max(axis=1), broken=broken)
-    names = ["instance", "gap_percent", *VIOLATIONS, "excess", "broken"]
-    rows = []
-    for regime, key, group in groups(scored):
-        for reason, column, least in (("gap", "gap_percent", SMALLEST_GAP), ("violation", "excess", 1.0)):
-            ranked = group[group[column] > least].sort_values([column, "instance"], ascending=[False, True])
-            for row in records(ranked.head(count)[names]):
-                row["broken"] = row["broken"] if row["excess"] > 1 else ""
-                rows.append(head(regime, key) | {"worst_by": reason} | row)
-    return line_table(rows, [*HEAD, "worst_by", *names])
 
 
 def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:

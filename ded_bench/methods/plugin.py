@@ -44,7 +44,7 @@ from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import LARGEST
-from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.schedule import Schedule, as_schedule
 from ded_bench.solvers.status import Status
 
 #: Entry points of this group are methods: `name = "module:function"`.
@@ -190,8 +190,9 @@ def accept(answer: object, case: Case, instance: Instance, seconds: float) -> So
     schedule: Schedule | None = None
     if answer.schedule is not None:
         try:
-            schedule = _sound(answer.schedule, case, instance)
-        except (InputError, TypeError, ValueError, AttributeError) as error:
+            schedule = as_schedule(answer.schedule, case)
+            schedule.check(instance.horizon_s)
+        except InputError as error:
             return _failed(f"returned a wrong schedule: {error}", seconds)
     elif status in (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY):
         return _failed(f"claims {status} but returned no schedule", seconds)
@@ -207,18 +208,6 @@ def accept(answer: object, case: Case, instance: Instance, seconds: float) -> So
         solver_version=_line(answer.solver_version),
         error=_line(answer.error),
     )
-
-
-def _sound(schedule: Schedule, case: Case, instance: Instance) -> Schedule:
-    if np.iscomplexobj(schedule.t) or np.iscomplexobj(schedule.p):
-        raise InputError("schedule", "P", "values must be real numbers")
-    t, p = np.asarray(schedule.t, dtype=np.float64), np.asarray(schedule.p, dtype=np.float64)
-    if t.ndim != 1 or p.shape != (len(t), len(case.generators)):
-        wanted = f"t of shape (n,) and p of shape (n, {len(case.generators)})"
-        raise InputError("schedule", "P", f"shapes {t.shape} and {p.shape}, wanted {wanted}")
-    sound = Schedule(t, p)
-    sound.check(instance.horizon_s)
-    return sound
 
 
 def _failed(reason: str, seconds: float) -> Solution:

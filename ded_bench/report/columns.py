@@ -188,18 +188,6 @@ TIMING = (
     Column("peak_memory_mib", "peak memory", "MiB"),
     *(Column("load_average", "load"), DATE, Column("error", "error")),
 )
-WORST = (
-    *_HEAD,
-    Column("worst_by", "by"),
-    Column("instance", "instance"),
-    Column("gap_percent", "gap", "%"),
-    Column("freq_violation_hz", "frequency", "Hz"),
-    Column("ramp_violation", "ramp", "pu"),
-    Column("bound_violation", "bounds", "pu"),
-    Column("initial_violation", "initial", "pu"),
-    Column("broken", "limit broken"),
-    Column("excess", "× tolerance"),
-)
 TRAINING = (
     *(Column("name", "Policy"), SECONDS, Column("epochs", "epochs"), INSTANCES),
     Column("held_out", "held out"),

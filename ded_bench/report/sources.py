@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,7 +28,7 @@ from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
 from ded_bench.results.rows import VALIDATED, Key, Results
-from ded_bench.results.timing import TIMING, WARM_UP, read_timing, timing_summary
+from ded_bench.results.timing import read_timing, timing_summary
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +42,10 @@ class Sources:
         reference: what gaps are measured against.
         rows: all rows of the case that count, with their gaps; `key` is each row's in the results table.
         judged: those of them that the tables are about.
-        calls: the timing table; `timing`: one row per line, see `timing_summary`.
+        timing: one row per line of the timing table, see `timing_summary`.
         instances: those of the benchmark, test instances first, by id.
         test_count: how many of them are test instances.
         problems_version: of the benchmark's files; empty if there are none.
-        histories: of trainings by method and name of the policy's file; the method is empty if the policy is
-            not there. Columns seconds and, if they were taken, training, held out, and terms of the loss.
         notes: what could not be used, in sentences; figures add theirs.
     """
 
@@ -58,12 +55,10 @@ class Sources:
     reference: Reference
     rows: pd.DataFrame
     judged: pd.DataFrame
-    calls: pd.DataFrame
     timing: pd.DataFrame
     instances: dict[str, Instance]
     test_count: int
     problems_version: str
-    histories: dict[tuple[str, str], pd.DataFrame]
     certificates: tuple[Certificate, ...]
     notes: list[str] = field(default_factory=list)
     _runs: dict[Key, Trajectory | None] = field(default_factory=dict)
@@ -146,12 +141,10 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         reference=reference,
         rows=rows,
         judged=judged_rows(rows),
-        calls=named(TIMING.frame([call for call in calls if call.round != WARM_UP])),
         timing=named(timing_summary(calls)),
         instances=instances,
         test_count=test_count,
         problems_version=version,
-        histories=dict(_history(path) for path in paths.training_histories),
         certificates=read_certificates(folder),
         notes=notes,
     )
@@ -189,20 +182,6 @@ def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
         notes.append("The paper's numbers are about another version of the case and left out.")
         return None
     return paper
-
-
-def _history(path: Path) -> tuple[tuple[str, str], pd.DataFrame]:
-    try:
-        table = pd.read_csv(path).select_dtypes("number")
-    except (OSError, ValueError, OverflowError) as error:
-        raise InputError(path, "", f"is no table of numbers ({' '.join(str(error).split())[:100]})") from None
-    if "seconds" not in table or not len(table):
-        raise InputError(path, "seconds", "a column with at least one number is needed")
-    name = path.name.removesuffix(".history.csv")
-    method = ""
-    with contextlib.suppress(InputError):  # the table of trainings says what is wrong with the policy
-        method = str(read_arrays(path.with_name(f"{name}.safetensors"))[1].get("method", ""))
-    return (method, name), table
 
 
 #: What headers of models and policies say of their training.

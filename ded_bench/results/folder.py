@@ -83,11 +83,6 @@ class ResultsFolder:
         return sorted((self.path / "policies").glob("*.safetensors"))
 
     @property
-    def training_histories(self) -> list[Path]:
-        """The loss curves of the policies that are there, by name."""
-        return sorted((self.path / "policies").glob("*.history.csv"))
-
-    @property
     def certificates(self) -> Path:
         """Certificates of policies."""
         return self.path / "certificate.json"

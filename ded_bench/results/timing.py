@@ -90,8 +90,8 @@ def read_timing(path: Path) -> list[TimingRow]:
 def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     """Median and quartiles per case and job over instances and rounds, s; `model` is the surrogate's name.
 
-    The first call of each process enters as `first_…` alone; calls that failed count in `failures` and
-    enter no median. `load_average` is the median of the calls', `peak_memory_mib` the largest.
+    The first call of each process does not count; calls that failed count in `failures` and enter no
+    median. `load_average` is the median of the calls', `peak_memory_mib` the largest.
     """
     parts: dict[tuple[str, ...], list[TimingRow]] = {}
     for row in rows:
@@ -101,9 +101,8 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
 
 
 _TIMES = tuple(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3"))
-_FIRST = tuple(f"first_{name}" for name in PARTS)
 _MORE = ("load_average", "peak_memory_mib")
-_NUMBERS = (*_TIMES, *_FIRST, *_MORE)
+_NUMBERS = (*_TIMES, *_MORE)
 _SAID = ("run", "case", "problems_version", "version", "commit", "solver_version", "host", "date", "policy")
 SUMMARY_COLUMNS = (
     *("regime", "method", "settings", "model", "instances", "repeats", "failures"),
@@ -113,7 +112,6 @@ SUMMARY_COLUMNS = (
 
 def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
     last = calls[-1]
-    first = next((row for row in calls if row.round == WARM_UP), None)
     warm = [row for row in calls if row.round != WARM_UP]
     good = [row for row in warm if row.counts]
     facts: dict[str, Any] = dict(zip(SUMMARY_COLUMNS, last.job, strict=False))
@@ -128,7 +126,6 @@ def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
     for name in PARTS:
         times = np.quantile(_values(good, name) or [math.nan], (0.5, 0.25, 0.75))
         facts |= dict(zip((name, f"{name}_q1", f"{name}_q3"), times.tolist(), strict=True))
-        facts[f"first_{name}"] = getattr(first, name, None)
     return facts | {name: getattr(last, name) for name in _SAID}
 
 

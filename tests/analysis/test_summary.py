@@ -14,7 +14,6 @@ from ded_bench.analysis.summary import (
     judged_elsewhere,
     summary,
     tradeoff,
-    worst,
 )
 from ded_bench.results.rows import ROWS, Row
 
@@ -95,23 +94,6 @@ def test_claims_and_verdicts_are_separate_rates(table: pd.DataFrame) -> None:
     assert ko["success_rate"] == pytest.approx(4 / 5)
     assert ko["correct_rate"] == pytest.approx(3 / 5)
     assert ko["strict_rate"] == pytest.approx(2 / 5)
-
-
-def test_worst_lists_largest_gaps_and_violations(table: pd.DataFrame) -> None:
-    found = worst(with_gaps(table), count=2)
-    ko = found[found["method"] == "ded-ko"]
-    assert ko[ko["worst_by"] == "gap"]["instance"].to_list() == ["c", "a"]
-    violations = ko[ko["worst_by"] == "violation"]
-    assert violations["instance"].to_list() == ["a"]  # b is within tolerance
-    assert violations["excess"].to_list() == pytest.approx([2.0])  # in units of 1e-4 Hz
-    assert violations["broken"].to_list() == ["frequency"]
-    assert not len(found[found["method"] == "ded"])  # DED has no gap to itself, and breaks no limit here
-
-
-def test_excess_takes_the_limit_broken_most() -> None:
-    frame = frame_of(row("a", "ded", 1.0, freq_violation_hz=1e-5, ramp_violation=3e-6, bound_violation=1e-7))
-    assert worst(with_gaps(frame))[["excess", "broken"]].to_numpy().tolist() == [[pytest.approx(3.0), "ramp"]]
-    assert not len(worst(with_gaps(frame_of(row("a", "ded", 100.0), row("a", "ed", 100.0005)))))  # rounding
 
 
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:

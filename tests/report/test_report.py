@@ -80,11 +80,7 @@ def finished(ninebus: Case, problems: Path, tmp_path_factory: pytest.TempPathFac
 
 @pytest.fixture(scope="module")
 def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
-    history = pd.DataFrame(
-        {"epoch": [1, 2], "seconds": [1.0, 2.0], "training": [3.0, 2.0], "held out": [3.0, 2.5]}
-    )
     (finished / "policies").mkdir()
-    history.assign(objective=[2.0, 1.0]).to_csv(finished / "policies" / "ded-dpc-TO.history.csv", index=False)
     write_arrays(
         finished / "policies" / "ded-dpc-TO.safetensors",
         {"w": np.zeros(2)},
@@ -110,9 +106,9 @@ def cells(markdown: str, heading: str) -> list[list[str]]:
 def test_every_file_is_written(report: list[Path], finished: Path) -> None:
     assert all(path.is_file() and path.stat().st_size for path in report)
     names = {str(path.relative_to(finished)) for path in report}
-    tables = ("table_v", "table_vi", "summary", "worst", "training", "provenance")
+    tables = ("table_v", "table_vi", "summary", "training", "provenance")
     assert {f"tables/{name}.csv" for name in tables} <= names
-    figures = ("schedule_NO", "schedule_TO", "frequencies_TO", "tradeoff", "training_ded-dpc")
+    figures = ("schedule_NO", "schedule_TO", "frequencies_TO", "tradeoff")
     assert {f"figures/{name}.png" for name in figures} <= names
     assert {"report.md", "report.html"} <= names
 
@@ -169,7 +165,7 @@ def test_the_page_needs_nothing_else(report, finished: Path) -> None:
     assert {str(attributes["href"]) for attributes in page.every("a")} <= {f"#{name}" for name in anchors}
     pictures = [str(attributes["src"]) for attributes in page.every("img")]
     in_markdown = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (finished / "report.md").read_text())
-    assert len(pictures) == len(in_markdown) == 5
+    assert len(pictures) == len(in_markdown) == 4
     for source, path in zip(pictures, in_markdown, strict=True):
         head, data = source.split(",", 1)
         assert head == "data:image/png;base64"

@@ -86,7 +86,7 @@ def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_pat
 @pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(
     "name",
-    ["results.csv", "timing.csv", "policies/p.history.csv", "certificate.json"],
+    ["results.csv", "timing.csv", "certificate.json"],
 )
 @pytest.mark.parametrize("text", ["", "a,b\n1,2,3,4\n1\n"])
 def test_a_wrong_table_is_bad_input(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from ded_bench.report.figures import history, latency, schedules, tradeoff
+from ded_bench.report.figures import closed_loop, schedules, tradeoff
 from ded_bench.report.figures.style import Drawn, save_figure
 from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
@@ -13,8 +13,7 @@ from ded_bench.report.sources import Sources
 FIGURES: Sequence[tuple[str, Callable[[Sources], Iterator[Drawn]]]] = (
     ("tradeoff", tradeoff.draw),
     ("schedules", schedules.draw),
-    ("training", history.draw),
-    ("online", latency.draw),
+    ("online", closed_loop.draw),
 )
 
 

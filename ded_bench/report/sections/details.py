@@ -9,7 +9,6 @@ import pandas as pd
 
 from ded_bench.analysis.lines import HEAD, groups, head, titled
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.analysis.summary import SMALLEST_GAP, worst
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.columns import (
     CERTIFICATE,
@@ -21,7 +20,6 @@ from ded_bench.report.columns import (
     TIMING,
     TRAINING,
     VIOLATIONS,
-    WORST,
     computed,
 )
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
@@ -65,22 +63,7 @@ def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
         *usual_first(PageTable(overview, GAPS, caption, "summary"), usual),
         *usual_first(shares, usual),
         *usual_first(PageTable(overview, VIOLATIONS, "Largest violation of each schedule"), usual),
-        *_worst(worst(sources.judged)),
     ]
-
-
-def _worst(frame: pd.DataFrame) -> list[Block]:
-    """Who breaks limits; the instances folded away."""
-    usual = frame["settings"] == DEFAULT
-    broken = frame[usual & (frame["worst_by"] == "violation")]
-    names = ", ".join(dict.fromkeys(f"{row.title} {row.regime}" for row in broken.itertuples()))
-    said = f"Limits are broken, beyond the tolerance, by {names}." if names else "No limit is broken."
-    caption = (
-        "The three largest gaps and violations of each method, default settings; "
-        f"gaps up to {SMALLEST_GAP:g} % and violations within tolerance are left out"
-    )
-    instances = usual_first(PageTable(frame, WORST, caption, "worst"), usual)
-    return [Heading("Worst instances"), Text(said), *folded("Which instances", *instances)]
 
 
 def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
@@ -93,7 +76,7 @@ def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
     return [Heading("Times"), *made]
 
 
-def trained(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
+def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """How policies were trained, and their certificates."""
     frame = trainings(sources.results.paths.policies)
     made: list[Block] = [Heading("Training of the policies")]
@@ -103,7 +86,7 @@ def trained(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         made.append(PageTable(frame, columns, "", "training"))
     else:
         made.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
-    made += [*pictures["training"], Heading("Certificate")]
+    made.append(Heading("Certificate"))
     if not sources.certificates:
         return [*made, Text("No certificate was made for these results; `ded-bench certify` makes one.")]
     certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in sources.certificates]))

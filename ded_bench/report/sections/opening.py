@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import pandas as pd
 
-from ded_bench.analysis.lines import GROUP, groups, on_usual_model, title
+from ded_bench.analysis.lines import groups, on_usual_model, title
 from ded_bench.analysis.paper_numbers import result_lines
 from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
@@ -157,7 +157,6 @@ def data_notes(sources: Sources) -> list[str]:
         *_problems(sources),
         *_missing(sources),
         *_makers(sources),
-        *_times(sources),
     ]
 
 
@@ -204,15 +203,3 @@ def _makers(sources: Sources) -> Iterator[str]:
     if old:
         names = ", ".join(title(method) for method in old)
         yield f"Rows come from other versions of their methods than those installed here: {names}."
-
-
-def _times(sources: Sources) -> Iterator[str]:
-    """Times of other problems or models than the rows."""
-    timing = sources.timing
-    if set(timing["problems_version"]) - set(sources.rows["problems_version"]):
-        yield f"Times were taken on problem version {_versions(timing)}."
-    rows = sources.judged.drop_duplicates(GROUP).set_index(GROUP)["made_with"]
-    timed = sources.calls.drop_duplicates(GROUP, keep="last").set_index(GROUP)["made_with"]
-    both = timed.index.intersection(rows.index)
-    if other := [title(*key[1:]) + f" {key[0]}" for key in both if rows[key] != timed[key]]:
-        yield f"Times were taken with another model or policy than the rows: {', '.join(other)}."

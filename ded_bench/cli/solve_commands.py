@@ -24,7 +24,7 @@ from ded_bench.cli.arguments import (
     say,
 )
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import check_writable, sweep
+from ded_bench.files.strict import check_writable
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import (
     Selection,
@@ -123,7 +123,6 @@ def _solve(a: argparse.Namespace) -> int:
         print_row(results.rows[key])
     if todo:
         check_writable(results.path)
-        sweep(results.folder)
     there = f", {len(finished)} there already" if finished else ""
     say(f"{counted(len(todo), 'row')} to solve{there}")
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)

@@ -10,21 +10,19 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
-from ded_bench.files.table import Table, csv_line, records
+from ded_bench.files.table import Table, records
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T", bound="Keyed")
 
 #: A table is compacted when more lines than it has rows, and than this, are superseded.
 FEW_SUPERSEDED = 100
-#: So many bytes before a known end of a file tell whether it has only grown since.
-_TAIL = 256
 
 
 class Keyed(Protocol):
@@ -44,11 +42,10 @@ class Keyed(Protocol):
 
 
 class _Seen(NamedTuple):
-    """How far a file has been read: its inode, the end of its last whole line, and what precedes it."""
+    """Which state of the file was read, and where its last whole line ends."""
 
-    inode: int
+    mark: tuple[int, int, int]
     end: int
-    tail: bytes
 
 
 class KeyedTable(Generic[K, T]):
@@ -62,7 +59,6 @@ class KeyedTable(Generic[K, T]):
         self.path = path
         self.rows: dict[K, T] = {}
         self._table = table
-        self._others: dict[K, dict[str, str]] = {}  # cells of columns that `table` does not declare
         self._header: tuple[str, ...] = table.names
         self._superseded = 0
         self._seen: _Seen | None = None
@@ -77,7 +73,9 @@ class KeyedTable(Generic[K, T]):
         """Read what other processes have added; InputError if the file is wrong."""
         try:
             with open(self.path, "rb") as file:
-                self._read(os.fstat(file.fileno()).st_ino, file.read, file.seek)
+                mark = _mark(os.fstat(file.fileno()))
+                if self._seen is None or self._seen.mark != mark:
+                    self._read(whole_lines(file.read()), mark)
         except FileNotFoundError:
             self._forget()
         except OSError as error:
@@ -89,7 +87,7 @@ class KeyedTable(Generic[K, T]):
         with self.locked():
             self.reload()
             if self._seen is None or not set(self._table.names) <= set(self._header):
-                self._take((row, {}) for row in rows)
+                self._take(rows)
                 self._write_all()
                 return
             text = "".join(self._table.format_row(row, self._header) for row in rows).encode()
@@ -99,10 +97,8 @@ class KeyedTable(Generic[K, T]):
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
-            self._take((row, {}) for row in rows)
-            self._seen = _Seen(
-                self._seen.inode, self._seen.end + len(text), (self._seen.tail + text)[-_TAIL:]
-            )
+            self._take(rows)
+            self._seen = _Seen(_mark(self.path.stat()), self._seen.end + len(text))
             if self._superseded > max(len(self.rows), FEW_SUPERSEDED):
                 self._write_all()
 
@@ -113,52 +109,34 @@ class KeyedTable(Generic[K, T]):
             if self._superseded:
                 self._write_all()
 
-    def _read(self, inode: int, read: Callable[[], bytes], seek: Callable[[int], int]) -> None:
-        seen = self._seen
-        if seen and seen.inode == inode:
-            start = seen.end - len(seen.tail)
-            seek(start)
-            data = read()
-            if data.startswith(seen.tail):
-                if new := whole_lines(data[len(seen.tail) :]):
-                    found = records(self._text(new), self.path)
-                    self._take(self._table.rows(found, self._header, self.path))
-                    self._seen = _Seen(inode, seen.end + len(new), (seen.tail + new)[-_TAIL:])
-                return
-            seek(0)  # another file that happens to have the same number, or one changed by hand
-        self._forget()
-        data = whole_lines(read())
-        found = records(self._text(data), self.path)
-        self._header = self._table.check_header(found[0][1] if found else [], self.path)
-        self._take(self._table.rows(found[1:], self._header, self.path))
-        self._seen = _Seen(inode, len(data), data[-_TAIL:])
-
-    def _text(self, data: bytes) -> str:
+    def _read(self, data: bytes, mark: tuple[int, int, int]) -> None:
         try:
-            return data.decode("utf-8")
+            found = records(data.decode("utf-8"), self.path)
         except UnicodeDecodeError:
             raise InputError(self.path, "", "is not UTF-8 text") from None
+        header = self._table.check_header(found[0][1] if found else [], self.path)
+        rows = list(self._table.rows(found[1:], header, self.path))  # all of them are right, or none is taken
+        self._forget()
+        self._header, self._seen = header, _Seen(mark, len(data))
+        self._take(rows)
 
-    def _take(self, found: Iterable[tuple[T, dict[str, str]]]) -> None:
+    def _take(self, found: Iterable[T]) -> None:
         rows = dict(self.rows)  # whoever iterates over the present ones may add rows meanwhile
-        for row, others in list(found):  # all of them are right, or none is taken
+        for row in found:
             key = row.key
             self._superseded += key in rows
             rows[key] = row
-            self._others[key] = others
         self.rows = rows
 
     def _forget(self) -> None:
-        self.rows, self._others, self._header = {}, {}, self._table.names
+        self.rows, self._header = {}, self._table.names
         self._superseded, self._seen = 0, None
 
     def _write_all(self) -> None:
-        header = (*self._table.names, *(name for name in self._header if name not in self._table.names))
-        lines = [self._table.format_row(row, header, self._others[key]) for key, row in self.rows.items()]
-        data = (csv_line(header) + "".join(lines)).encode()
+        data = self._table.format(self.rows.values()).encode()
         write_atomically(self.path, data)
-        self._header, self._superseded = header, 0
-        self._seen = _Seen(self.path.stat().st_ino, len(data), data[-_TAIL:])
+        self._header, self._superseded = self._table.names, 0
+        self._seen = _Seen(_mark(self.path.stat()), len(data))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -167,6 +145,11 @@ class KeyedTable(Generic[K, T]):
         with open(self.path.parent / ".lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield  # closing the file releases the lock
+
+
+def _mark(found: os.stat_result) -> tuple[int, int, int]:
+    """Changes whenever a file is written to."""
+    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def whole_lines(data: bytes) -> bytes:

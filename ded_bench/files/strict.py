@@ -7,20 +7,13 @@ import functools
 import hashlib
 import json
 import os
-import re
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ded_bench.files.errors import InputError
-
-#: Names of temporary files that `write_atomically` renames when they are complete.
-_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}")
-#: No write takes so long: what is older was left by a process that was killed, s.
-LEFT_BEHIND_S = 600.0
 
 
 class Record(BaseModel):
@@ -116,16 +109,6 @@ def check_writable(out: Path) -> None:
         tempfile.TemporaryFile(dir=out.parent).close()
     except OSError as error:
         raise InputError(out, "", f"cannot be written ({error.strerror})") from None
-
-
-def sweep(folder: Path) -> None:
-    """Remove half-written files that killed processes have left below a results folder."""
-    before = time.time() - LEFT_BEHIND_S
-    for place, _, names in os.walk(folder):
-        for name in names:
-            path = Path(place, name)
-            if _TEMPORARY.fullmatch(name) and path.stat().st_mtime < before:
-                path.unlink(missing_ok=True)
 
 
 def _umask() -> int:

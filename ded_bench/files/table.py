@@ -13,7 +13,7 @@ import io
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -128,7 +128,7 @@ class Table(Generic[T]):
         """
         found = records(read_text(path), path)
         header = self.check_header(found[0][1] if found else [], path)
-        return [row for row, _ in self.rows(found[1:], header, path)]
+        return list(self.rows(found[1:], header, path))
 
     def check_header(self, cells: Sequence[str], source: str | Path) -> tuple[str, ...]:
         """Return the names of a header; InputError if a required column is missing or any is there twice."""
@@ -143,8 +143,8 @@ class Table(Generic[T]):
 
     def rows(
         self, found: Iterable[tuple[int, list[str]]], header: Sequence[str], source: str | Path
-    ) -> Iterator[tuple[T, Cells]]:
-        """Yield every row, and its cells of columns that are not declared here, by name.
+    ) -> Iterator[T]:
+        """Yield every row.
 
         Args:
             found: line numbers and cells (see `records`).
@@ -168,23 +168,18 @@ class Table(Generic[T]):
                     text = texts[header.index(column.name)] if column.name in header else ""
                     where, what = f"line {line}, {column.name}", f"{text[:30]!r} is not a valid value"
                     raise InputError(source, where, what) from None
-            yield self.kind(**values), cells
+            yield self.kind(**values)
 
     def format(self, rows: Iterable[T]) -> str:
         """Rows as CSV text under a header of all columns; missing values are empty."""
         return csv_line(self.names) + "".join(self.format_row(row, self.names) for row in rows)
 
-    def format_row(self, row: T, header: Sequence[str], others: Mapping[str, str] | None = None) -> str:
+    def format_row(self, row: T, header: Sequence[str]) -> str:
         """One row as a line of CSV under a header, which may have columns that are not declared here.
 
         Line breaks within a text become spaces, so that a file that ends without one has a torn last row.
-
-        Args:
-            others: cells of those columns by name; empty where not given.
         """
-        known = set(self.names)
-        others = others or {}
-        return csv_line([_text(getattr(row, n)) if n in known else others.get(n, "") for n in header])
+        return csv_line([_text(getattr(row, name)) if name in self.names else "" for name in header])
 
     def write(self, path: Path, rows: Iterable[T]) -> None:
         """Replace a table by these rows, in one step."""

@@ -14,7 +14,7 @@ from ded_bench.analysis.lines import GROUP, groups, main_lines, records, titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.summary import summary
 from ded_bench.files.errors import InputError
-from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, TRAININGS, Column
 from ded_bench.report.figures.growth import growth_figure
@@ -125,8 +125,7 @@ def sizes(grids: Sequence[Sources]) -> pd.DataFrame:
     """One row per grid: how large it is, how it oscillates, what its results are about."""
     rows = []
     for grid in grids:
-        case, network = grid.case, Network(grid.case)
-        modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
+        case, modes = grid.case, plant_of(grid.case).nominal().modes
         modes = modes[modes.imag > 0]
         hertz = np.abs(modes) / (2 * np.pi)
         rows.append(

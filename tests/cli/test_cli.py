@@ -16,7 +16,6 @@ import psutil
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.files.strict import sweep
 from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
@@ -119,19 +118,6 @@ def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys
     capsys.readouterr()
     assert main(again) == 0  # a scored row is finished, though its schedule is not kept
     assert "5 there already" in capsys.readouterr().err
-
-
-def test_half_written_files_do_not_stay(tmp_path: Path) -> None:
-    """Those that a killed process left, not those that another one is writing now, nor anything else."""
-    kept = [tmp_path / ".lock", tmp_path / "results.csv", tmp_path / "schedules" / ".x.csv.gz.abcd1234"]
-    left = [tmp_path / ".results.csv.a_b1c2d3", tmp_path / "schedules" / "ded" / ".a.csv.gz.12345678"]
-    for path in (*kept, *left):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    for path in (*kept[:2], *left):
-        os.utime(path, (0, 0))
-    sweep(tmp_path)
-    assert [path.exists() for path in (*kept, *left)] == [True, True, True, False, False]
 
 
 @pytest.mark.parametrize(

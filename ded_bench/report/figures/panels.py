@@ -36,8 +36,6 @@ class Panel:
     label: str
     curves: list[Curve]
     limits: Sequence[float] = ()
-    title: str = ""
-    log: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +110,7 @@ def balance_panel(case: Case, regime: str, shown: Sequence[Shown]) -> Panel:
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
 
 
-def time_figure(heading: str, panels: Sequence[Panel], columns: int, time: str = "time (s)") -> Figure:
+def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:
     """All panels, and one legend below."""
     rows = -(-len(panels) // columns)
     with new_figure(0.7 + (1.35 if columns == 1 else 1.8) * rows) as figure:
@@ -124,11 +122,9 @@ def time_figure(heading: str, panels: Sequence[Panel], columns: int, time: str =
             for level in panel.limits:
                 ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
             ax.margins(x=0.0)
-            ax.set_yscale("log" if panel.log and panel.curves else "linear")
             ax.set_ylabel(panel.label)
-            ax.set_title(plain(panel.title), fontsize=7)
         for ax in axes[max(len(panels) - columns, 0) : len(panels)]:
-            ax.set_xlabel(time)
+            ax.set_xlabel("time (s)")
             ax.tick_params(labelbottom=True)
         for ax in axes[len(panels) :]:
             ax.set_visible(False)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import pandas as pd
 
-from ded_bench.analysis.lines import groups, on_usual_model, title
+from ded_bench.analysis.lines import on_usual_model, title
 from ded_bench.analysis.paper_numbers import result_lines
 from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
@@ -155,7 +155,6 @@ def data_notes(sources: Sources) -> list[str]:
     """What is missing, mixed or old."""
     return [
         *_problems(sources),
-        *_missing(sources),
         *_makers(sources),
     ]
 
@@ -180,17 +179,6 @@ def _problems(sources: Sources) -> Iterator[str]:
             f"{reference.shipped} objectives of {reference.title} are those of the reference run that ships "
             "with the case, since it was not run on these instances here."
         )
-
-
-def _missing(sources: Sources) -> Iterator[str]:
-    """Test instances without rows."""
-    tests = list(sources.instances)[: sources.test_count]
-    if tests and (sources.judged["split"] == "test").all():
-        for regime, key, rows in groups(sources.judged):
-            if missing := [name for name in tests if name not in set(rows["instance"])]:
-                names = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
-                run = f"Only {len(tests) - len(missing)} of {len(tests)} test instances were run"
-                yield f"{run}: {title(*key)} {regime} (without {names})."
 
 
 def _makers(sources: Sources) -> Iterator[str]:

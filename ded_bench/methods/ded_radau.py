@@ -91,9 +91,7 @@ def element_count(case: Case, instance: Instance, length_s: float) -> int:
 
 def _kinks(instance: Instance) -> list[int]:
     """Grid indices k of the kinks of the loads, rounded, with the first and the last point of the grid."""
-    kinks = [t for load in instance.load.values() for t in load.kinks]
-    places = {round(t / instance.dt_s) for t in kinks if t < instance.horizon_s}
-    return sorted(places | {0, instance.steps})
+    return sorted({round(t / instance.dt_s) for t in instance.kinks})
 
 
 def element_ends(instance: Instance, elements: int) -> NDArray[np.int_]:

@@ -18,8 +18,8 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import search_folders
 from ded_bench.surrogates.linear import linear_model
 
-#: Bounds so wide, or so tight, that no schedule exceeds them, or every one does.
-WIDE, TIGHT = 1e6, 1e-3
+#: Bounds so tight that every schedule exceeds them.
+TIGHT = 1e-3
 
 
 def drawn(case: Case, count: int) -> StackedInstances:
@@ -74,19 +74,6 @@ def test_the_prediction_is_the_linear_models(case: Case) -> None:
     change = random_powers(case, inputs, 0.3) - p_gen
     moved = omega_of(keeper, inputs, p_gen + change) - omega_of(keeper, inputs, p_gen)
     np.testing.assert_allclose(np.tensordot(change, keeper.of_power, ([1, 2], [2, 3])), moved, atol=1e-12)
-
-
-def test_what_exceeds_nothing_stays_as_it_is(case: Case) -> None:
-    inputs = drawn(case, 4)
-    p_gen = random_powers(case, inputs, 1.0)
-    kept = keeper_of(case, WIDE)(inputs, p_gen)
-    np.testing.assert_array_equal(kept, p_gen)
-    peaks = np.abs(omega_of(keeper_of(case), inputs, p_gen)).max(axis=(1, 2))
-    one = keeper_of(case)
-    one.limit[:] = np.sort(peaks)[-2:].mean()
-    kept = one(inputs, p_gen)
-    changed = (kept != p_gen).any(axis=(1, 2))
-    np.testing.assert_array_equal(changed, peaks == peaks.max())
 
 
 @pytest.mark.parametrize("scale", [TIGHT, 0.3, 1.0])

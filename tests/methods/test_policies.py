@@ -17,13 +17,11 @@ from ded_bench.methods.dpc_paper import paper_training
 from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
-from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
+from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.methods.training_record import HISTORY, TrainingOptions, checkpoint_file
 from ded_bench.methods.training_run import TrainingRun
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.policies import in_operation, random_policy, short_instances
@@ -122,20 +120,6 @@ def test_facts_that_do_not_fit_are_refused(
     dataclasses.replace(policy, training=policy.training | {name: value}).save(path)
     with pytest.raises(InputError, match=problem):
         type(policy).load(path, threebus, policy.scope.regime)
-
-
-def test_what_is_timed_is_what_is_answered(threebus: Case) -> None:
-    """The first call is paid for by another instance; then one call gives one answer."""
-    policy, asked = random_policy("ded-dpc-paper", threebus), []
-
-    def answer(instance: Instance) -> Schedule:
-        asked.append(instance.id)
-        return policy(instance)[0]
-
-    solve, (instance,) = as_solver(policy.scope, answer, 3), short_instances(threebus, 1)
-    assert len(asked) == 1
-    assert solve(instance.model_copy(update={"id": "mine"})).iterations == 3
-    assert asked[1:] == ["mine"]
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What online.csv says of every method at its own latency."""
+"""What online.csv says: of every method at its own latency, and on islands beside today's practice."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from ded_bench.results.online_results import ONLINE, OnlineResults
 
 #: What rows of one line of a table share, besides the scenario.
 LOOP = [*GROUP, "period_s", "latency_s", "warm"]
-#: The operator's practice that others are set beside: method and settings.
-STATIC = ("ed", "every=1")
+#: What others are set beside: static dispatch of every second, and on islands practice; method and settings.
+STATIC, PRACTICE = ("ed", "every=1"), ("ed", "every=60")
+#: Names of an island's numbers in lines, their columns in online.csv, and units of the former in the latter.
+ISLAND = {
+    "mean_peak_mhz": ("mean_freq_max_hz", 1e3),
+    "mean_rms_mhz": ("mean_freq_rms_hz", 1e3),
+    "swing_peak_mhz": ("swing_max_hz", 1e3),
+    "agc_travel_pu": ("agc_travel_pu", 1.0),
+    "cps1": ("cps1", 1.0),
+    "increase_percent": ("increase_percent", 1.0),
+}
 #: Own latencies that differ by so small a part share a line.
 SAME = 0.01
 
@@ -23,10 +32,9 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
 
     `static_objective` and `static_excess_hz` are those of static dispatch of every second.
     """
-    rows = list(results.table.rows.values())
-    frame = named(ONLINE.frame(rows).assign(key=pd.Series([row.key for row in rows], dtype=object)))
+    frame = _predicted(results, case)
     own = (frame["latency_source"] == "timing") & (frame["forecast"] == QUALITIES[0])
-    frame = frame[own & frame["predicted"].astype(bool) & (frame["case"] == case)].reset_index(drop=True)
+    frame = frame[own].reset_index(drop=True)
     typical = frame.groupby([*GROUP, "period_s", "warm"])["latency_s"].transform("median")
     close = (frame["latency_s"] - typical).abs() <= SAME * typical
     frame["latency_s"] = frame["latency_s"].mask(close, typical)
@@ -36,6 +44,50 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     found = static.drop_duplicates(["regime", "scenario"], keep="last").set_index(["regime", "scenario"])
     names = {"objective": "static_objective", "max_excess_hz": "static_excess_hz"}
     return frame.join(found[list(names)].rename(columns=names), on=["regime", "scenario"])
+
+
+def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
+    """Rows of an island that have its numbers or failed, with their `minutes`, and practice's beside them.
+
+    `practice_objective`, `practice_mean_freq_max_hz` and `practice_agc_travel_pu` are those of static
+    dispatch every 60 s in the same scenario under the same kind of forecast.
+    """
+    frame = _predicted(results, case)
+    lasting = frame["plans"] * frame[["period_s", "latency_s"]].max(axis=1)
+    minutes = (lasting / 60).groupby(frame["scenario"]).transform("max").round()
+    frame["minutes"] = minutes.where(minutes > 0, minutes[minutes > 0].min())  # nobody came to the end
+    frame = frame[frame["cps1"].notna() | frame["objective"].isna()].reset_index(drop=True)
+    place = ["regime", "scenario", "forecast"]
+    practice = frame[(frame["method"] == PRACTICE[0]) & (frame["settings"] == PRACTICE[1])]
+    found = practice.drop_duplicates(place, keep="last").set_index(place)
+    names = ["objective", "mean_freq_max_hz", "agc_travel_pu"]
+    return frame.join(found[names].add_prefix("practice_"), on=place)
+
+
+def practice_lines(frame: pd.DataFrame) -> pd.DataFrame:
+    """One line per regime, kind of forecast, length, method, period and latency of `practice_rows`."""
+    by = ["regime", "forecast", "minutes", "method", "settings", "model", "period_s", "latency_s"]
+    made = [dict(zip(by, key, strict=True)) | _beside(rows) for key, rows in frame.groupby(by, sort=False)]
+    return line_table(made, [*by, *_beside(frame[:0])])
+
+
+def _beside(rows: pd.DataFrame) -> dict[str, Any]:
+    """Means over the scenarios that were operated to their end, and over those where practice was, too."""
+    done = rows.dropna(subset=["objective"])
+    both = done.dropna(subset=["practice_objective"])
+    found: dict[str, Any] = {"n": len(done), "failures": len(rows) - len(done)}
+    found |= {name: scale * done[column].mean() for name, (column, scale) in ISLAND.items()}
+    for name, column in (("peak", "mean_freq_max_hz"), ("travel", "agc_travel_pu")):
+        found[f"{name}_ratio"] = both[f"practice_{column}"].mean() / both[column].mean()
+    found["over_practice_percent"] = 100 * (both["objective"] / both["practice_objective"] - 1).mean()
+    return found
+
+
+def _predicted(results: OnlineResults, case: str) -> pd.DataFrame:
+    """Rows of a case whose plans started from the state when they took effect, in the order of the table."""
+    rows = list(results.table.rows.values())
+    frame = named(ONLINE.frame(rows).assign(key=pd.Series([row.key for row in rows], dtype=object)))
+    return frame[frame["predicted"].astype(bool) & (frame["case"] == case)].reset_index(drop=True)
 
 
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:

@@ -18,6 +18,7 @@ from ded_bench.cli.arguments import (
     positive_number,
     say,
 )
+from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
@@ -38,7 +39,8 @@ def add_commands(commands: Any) -> None:
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--scenarios", type=positive, metavar="N", help="only the first N of the case")
     chosen.add_argument("--scenario", type=Path, nargs="+", metavar="FILE", help="instead of the case's")
-    p.add_argument("--period", type=positive_number, default=1.0, metavar="S", help="between plans")
+    period = "between plans (default: option `every` of a method, where it is set; else 1)"
+    p.add_argument("--period", type=positive_number, metavar="S", help=period)
     latency = "timing, zero, or seconds"
     p.add_argument("--latency", type=names, default=("timing",), metavar="L[,L]", help=latency)
     qualities = ", ".join(QUALITIES)
@@ -51,6 +53,7 @@ def add_commands(commands: Any) -> None:
     )
     p.add_argument("--plant", choices=PLANTS, help="what is operated; default: the case's own")
     p.add_argument("--cold", action="store_true", help="never start a method from its last plan")
+    p.add_argument("--no-hindsight", action="store_true", help="look for no optimum of whole scenarios")
     p.add_argument("--time-limit", type=positive_number, metavar="S", help="per plan, of the clock (60 s)")
     p.set_defaults(run=_online)
 
@@ -71,13 +74,13 @@ def _online(a: argparse.Namespace) -> int:
     folder = a.out or default_results(case)
     operations = _operations(a, case, folder)
     say(f"{counted(len(operations), 'row')} asked for, each a scenario of some minutes")
-    rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row)
+    rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row, not a.no_hindsight)
     return 1 if any(row.objective is None for row in rows) else 0
 
 
 def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
-    from ded_bench.run.online.loop import LoopOptions
+    from ded_bench.run.online.loop import PERIOD_S, LoopOptions
     from ded_bench.run.online.operation import make_operations
     from ded_bench.run.online.planner import LIMIT_S
 
@@ -86,13 +89,18 @@ def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operati
     methods, scenarios = chosen_methods(a, search), load_scenarios(files, case)
     return [
         operation
-        for forecast, latency in itertools.product(a.forecast, a.latency)
+        for forecast, latency, method in itertools.product(a.forecast, a.latency, methods)
         for operation in make_operations(
             case,
             scenarios,
-            methods,
+            [method],
             a.regime or tuple(case.regimes),
-            LoopOptions(a.period, forecast=forecast, predict=a.state == "predicted", warm=not a.cold),
+            LoopOptions(
+                a.period or get_method(method[0]).interval_s(method[1]) or PERIOD_S,
+                forecast=forecast,
+                predict=a.state == "predicted",
+                warm=not a.cold,
+            ),
             latency,
             search,
             a.time_limit or LIMIT_S,

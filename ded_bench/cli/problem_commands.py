@@ -61,7 +61,9 @@ def add_commands(commands: Any) -> None:
     p.set_defaults(run=_instances)
 
     p = command(commands, "scenarios", "draw minutes of operation for the closed loop")
-    p.add_argument("--count", type=positive, default=SCENARIOS, help="how many to draw")
+    p.add_argument("--count", type=positive, default=SCENARIOS, help=f"how many of {DURATION_S:g} s to draw")
+    hours = "how many of an hour, in which loads drift, too (default: as many as there are)"
+    p.add_argument("--hours", type=natural, help=hours)
     declare(p, "--case", "--seed")
     p.add_argument("--out", type=Path, help="default: scenarios in the case's own folder")
     p.add_argument("--force", action="store_true", help="replace other scenarios of a versioned case")
@@ -229,12 +231,14 @@ def _scenarios(a: argparse.Namespace) -> int:
 
     case = _drawable(a.case, DURATION_S)
     folder = a.out or scenario_folder(problem_folder(a.case, case))
+    hours = len(list(folder.glob("*-h[0-9]*.json"))) if a.hours is None else a.hours
 
     def draw(folder: Path) -> Manifest:
-        return write_scenarios(case, a.count, a.seed, folder, servable)
+        return write_scenarios(case, a.count, a.seed, folder, servable, hours=hours)
 
     manifest = draw(folder) if a.force else _unless_changed(folder, draw)
     print(
-        f"{counted(a.count, 'scenario')} of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}"
+        f"{counted(a.count + hours, 'scenario')} of {case.id} (seed {a.seed}) in {folder}, "
+        f"version {manifest.version}"
     )
     return 0

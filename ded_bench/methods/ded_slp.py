@@ -16,7 +16,7 @@ import numpy as np
 
 from ded_bench.methods.first_schedules import first_schedules, static_dispatch
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
-from ded_bench.methods.knots import case_knots, is_reachable, knot_points
+from ded_bench.methods.knots import case_knots, control_times, is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
@@ -113,7 +113,8 @@ class SlpSolver:
         if self.options.knot_s is None:
             return case_knots(self.case, instance)
         count = round(instance.horizon_s / self.options.knot_s) + 1
-        return knot_points(np.linspace(0.0, instance.horizon_s, count), instance.dt_s)
+        times = np.linspace(0.0, instance.horizon_s, count), control_times(self.case, instance)
+        return knot_points(np.concatenate(times), instance.dt_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,14 +27,24 @@ def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
     return bool(((p_min[0] <= p_initial + reach) & (p_max[0] >= p_initial - reach)).all())
 
 
+def control_times(case: Case, instance: Instance) -> Array:
+    """When secondary control acts before the horizon, s: there every program has knots."""
+    if case.agc is None:
+        return np.empty(0)
+    given = instance.initial.agc
+    first = given.next_s if given is not None and given.next_s is not None else case.agc.period_s
+    return np.arange(first, instance.horizon_s - instance.dt_s / 2, case.agc.period_s)
+
+
 def knot_points(times: Array, dt_s: float) -> Indices:
     """Grid points of knots at `times` (s): inputs are linear between grid points, so knots lie on them."""
     return np.unique(np.rint(times / dt_s).astype(int))
 
 
 def case_knots(case: Case, instance: Instance) -> Indices:
-    """Grid points of the case's knots."""
-    return knot_points(case.knot_times(instance.horizon_s), instance.dt_s)
+    """Grid points of the case's knots, and of times of secondary control."""
+    times = [case.knot_times(instance.horizon_s), control_times(case, instance)]
+    return knot_points(np.concatenate(times), instance.dt_s)
 
 
 def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Indices:
@@ -55,9 +65,11 @@ def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Ind
     # The last two points are the end of the plan in force, which no knot has, and the horizon.
     ahead = np.empty(0) if last is None else last.t[1:-2]
     if len(ahead) < 2 or np.diff(ahead).min() < distance / 2:
-        return knot_points(times, instance.dt_s)
+        return case_knots(case, instance)
     beyond = np.arange(ahead[-1] + distance, instance.horizon_s - distance / 2, distance)
-    return knot_points(np.concatenate([[0.0], ahead, beyond, [instance.horizon_s]]), instance.dt_s)
+    ends = np.array([0.0, instance.horizon_s])
+    knots = np.concatenate([ends, ahead, beyond, control_times(case, instance)])
+    return knot_points(knots, instance.dt_s)
 
 
 def knot_weights(lengths: Indices) -> Array:

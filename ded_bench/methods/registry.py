@@ -63,6 +63,10 @@ class Method:
         options = read_options(self.options, settings.options)
         return dataclasses.replace(settings, options=options_text(options, timed=timed))
 
+    def interval_s(self, settings: Settings) -> float | None:
+        """How often it means to be asked in operation: its option `every`, where it has one and it is set."""
+        return getattr(read_options(self.options, settings.options), "every", None)
+
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance after another.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ded_bench.plants.plant import Plant
 from ded_bench.plants.simulate import simulate
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
@@ -90,14 +90,19 @@ def judge(case: Case, instance: Instance, trajectory: Trajectory, regime: str) -
 
 
 def _island_numbers(trajectory: Trajectory, excess: dict[str, float]) -> dict[str, float]:
-    hz, weight = trajectory.omega / (2 * np.pi), trajectory.case.inertia
-    mean = hz @ (weight / weight.sum())
+    hz, mean = trajectory.omega / (2 * np.pi), mean_hz(trajectory)
     found = {f"excess_{kind}_hz": value for kind, value in excess.items()}
     for name, values in (("mean_freq", mean), ("swing", hz - mean[:, None])):
         found[f"{name}_rms_hz"] = float(np.sqrt(np.mean(values**2)))
         found[f"{name}_max_hz"] = float(np.abs(values).max())
     agc = trajectory.columns.get(AGC_COLUMN, np.zeros(1))
     return found | {"agc_travel_pu": float(np.abs(np.diff(agc)).sum())}
+
+
+def mean_hz(trajectory: Trajectory) -> Array:
+    """The mean frequency, weighted with inertia, (n,), Hz, deviation from nominal."""
+    weight = trajectory.case.inertia
+    return np.asarray(trajectory.omega / (2 * np.pi) @ (weight / weight.sum()))
 
 
 def _positive(value: float) -> float:

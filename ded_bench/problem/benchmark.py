@@ -20,6 +20,7 @@ from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.quantities import Name
 from ded_bench.problem.sampling import (
     DURATION_S,
+    HOUR_S,
     VALIDATION_SEED,
     Servable,
     drawn_with_redraws,
@@ -80,7 +81,7 @@ def scenario_folder(problem_folder: Path) -> Path:
 
 def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
-    files = sorted(read_record(Manifest, folder / MANIFEST).files)
+    files = list(read_record(Manifest, folder / MANIFEST).files)
     return [folder / name for name in files[:limit]]
 
 
@@ -153,15 +154,20 @@ def write_scenarios(
     folder: Path,
     servable: Servable | None = None,
     duration_s: float = DURATION_S,
+    hours: int = 0,
 ) -> Manifest:
     """Write scenarios and their manifest into `folder`; scenarios of other seeds there are removed.
+
+    Args:
+        hours: so many scenarios of an hour beside them.
 
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
     """
     names = []
-    for index in range(count):
-        scenario = sample_scenario(case, seed, index, servable, duration_s)
+    wanted = [*((i, duration_s) for i in range(count)), *((i, HOUR_S) for i in range(hours))]
+    for index, lasting_s in wanted:
+        scenario = sample_scenario(case, seed, index, servable, lasting_s)
         names.append(f"{scenario.id}.json")
         text = scenario.model_dump_json(by_alias=True)  # in one line: mostly lists of numbers
         write_atomically(folder / names[-1], text + "\n")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.instance import Initial, Instance, LoadRamp
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
 from ded_bench.problem.quantities import Array, Range
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioLoad, ScenarioRamp
 
@@ -31,7 +31,7 @@ ATTEMPTS = 1000
 
 #: Scenarios of a case, and their duration, s, unless told otherwise.
 SCENARIOS, DURATION_S = 20, 300.0
-#: Loads of scenarios stay within this part of their nominal value, but for the fluctuation.
+#: Loads of scenarios stay within this part of their nominal value, but for fluctuation and drift.
 LOAD_RANGE = 0.3
 #: Standard deviations of announced starts (s) and rates (relative), and how many ramps are not announced.
 START_ERROR_S, RATE_ERROR, UNANNOUNCED = 1.5, 0.15, 0.2
@@ -39,6 +39,11 @@ START_ERROR_S, RATE_ERROR, UNANNOUNCED = 1.5, 0.15, 0.2
 FLUCTUATION, STEP_S, DECAY_S, SMOOTH_S = 0.0005, 0.5, 20.0, 2.0
 #: Digits of the fluctuation after the point, in pu: a tenth of a thousandth of its standard deviation.
 FLUCTUATION_DECIMALS = 8
+#: On islands its points are farther apart, s: files of grids with many loads stay small.
+ISLAND_STEP_S = 5.0
+#: Duration of an hour, s, whose ramps leave loads within a narrower range, and which drift beside that by up
+#: to a part of their nominal value; points of the drift, and the time within which it returns, s.
+HOUR_S, HOUR_RANGE, DRIFT, DRIFT_STEP_S, DRIFT_DECAY_S = 3600.0, 0.1, 0.05, 60.0, 1200.0
 
 #: A drawn instance as the case's plant can serve it, or None (`plants.plant.servable`).
 Servable = Callable[[Case, Instance], Instance | None]
@@ -167,18 +172,23 @@ def sample_scenario(
 ) -> Scenario:
     """Draw scenario `index` of a seed; it is drawn again if it cannot be served.
 
+    Scenarios of an hour or more are named `h<index>`, their loads drift.
+
     Args:
-        servable: is asked for the loads at 0, at both ends of every ramp and at the end; None: all can be.
+        servable: is asked for the loads at 0, at both ends of every ramp and at the end; on an island for
+            all of it, loads linear between points ISLAND_STEP_S apart; None: all can be.
 
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
     """
-    generator = np.random.default_rng(np.random.SeedSequence([SCENARIO_SEED + seed, index]))
+    numbers = (SCENARIO_SEED + seed, index) + ((round(HOUR_S),) if duration_s >= HOUR_S else ())
+    generator = np.random.default_rng(np.random.SeedSequence(numbers))
     for _ in range(ATTEMPTS):
-        scenario = _draw_scenario(case, seed, index, generator, duration_s)
+        scenario = _draw_scenario(case, numbers, generator, duration_s)
         initial = scenario.initial
-        for number, snapshot in enumerate(_snapshots(case, scenario)):
-            served = servable(case, snapshot) if servable else snapshot
+        asked = _snapshots(case, scenario) if case.slack is not None else [_throughout(case, scenario)]
+        for number, instance in enumerate(asked):
+            served = servable(case, instance) if servable else instance
             if served is None:
                 break
             initial = initial if number else served.initial
@@ -193,18 +203,30 @@ def _snapshots(case: Case, scenario: Scenario) -> list[Instance]:
     return [scenario.snapshot(case, t) for t in sorted({0.0, *(min(t, last) for t in ends), last})]
 
 
+def _throughout(case: Case, scenario: Scenario) -> Instance:
+    """A scenario and the horizon beyond it as one instance."""
+    last = scenario.duration_s + case.sampling.horizon_s
+    times = np.append(np.arange(0.0, last - ISLAND_STEP_S / 2, ISLAND_STEP_S), last)
+    load = {
+        bus: LoadPoints(points=tuple(zip(times.tolist(), one.at(times).tolist(), strict=True)))
+        for bus, one in scenario.load.items()
+    }
+    changes = {"schema_": "ded-bench/instance/2", "horizon_s": last, "load": load}
+    return scenario.snapshot(case, 0.0).model_copy(update=changes)
+
+
 def _draw_scenario(
-    case: Case, seed: int, index: int, generator: np.random.Generator, duration_s: float
+    case: Case, numbers: tuple[int, ...], generator: np.random.Generator, duration_s: float
 ) -> Scenario:
-    n_gen = len(case.generators)
+    n_gen, kind = len(case.generators), "s" if len(numbers) == 2 else "h"
     cost = rounded(_between(case.sampling.cost, generator.random(len(case.priced))))
     load = {bus: _draw_load(case, i, generator, duration_s) for i, bus in enumerate(case.loads)}
     first = np.array([load[bus].initial for bus in case.loads])
     return Scenario(
         schema_="ded-bench/scenario/1",
-        id=f"{case.id}-s{index:04d}",
+        id=f"{case.id}-{kind}{numbers[1]:04d}",
         case=case.id,
-        seed=(SCENARIO_SEED + seed, index),
+        seed=numbers,
         duration_s=duration_s,
         dt_s=case.sampling.dt_s,
         cost=_by_bus(case.priced, cost),
@@ -216,7 +238,8 @@ def _draw_scenario(
 def _draw_load(case: Case, number: int, generator: np.random.Generator, duration_s: float) -> ScenarioLoad:
     """One ramp in every horizon of the case; it turns round where it would leave the range."""
     ranges, nominal = case.sampling, float(case.load_nominal[number])
-    spread = min(ranges.load_relative, LOAD_RANGE)
+    widest = LOAD_RANGE if duration_s < HOUR_S else HOUR_RANGE
+    spread = min(ranges.load_relative, widest)
     level = initial = float(rounded(nominal * (1 + _between((-spread, spread), generator.random(1))))[0])
     last, ended, ramps = duration_s + ranges.horizon_s, 0.0, []
     for window in np.arange(0.0, last, ranges.horizon_s):
@@ -224,14 +247,18 @@ def _draw_load(case: Case, number: int, generator: np.random.Generator, duration
         begin = max(window + float(_between(ranges.start_s, start)), ended)
         length = float(_between(ranges.duration_s, duration))
         rate = float(_between(case.load_rate[:, number], size)) * (1 if sign < 0.5 else -1)
-        if abs(level + rate * length - nominal) > LOAD_RANGE * abs(nominal):
+        if abs(level + rate * length - nominal) > widest * abs(nominal):
             rate = -rate
-        room = LOAD_RANGE * abs(nominal) + (nominal - level) * np.sign(rate)
+        room = widest * abs(nominal) + (nominal - level) * np.sign(rate)
         length = min(length, max(room, 0.0) / abs(rate)) if rate else length
         ramp = _ramp(begin, length, rate, announced)
         level, ended = level + ramp.rate * ramp.duration, ramp.end
         ramps.append(ramp)
-    fluctuation = _draw_fluctuation(abs(nominal), last, generator)
+    step_s = STEP_S if case.slack is not None else ISLAND_STEP_S
+    if duration_s >= HOUR_S:
+        fluctuation = _draw_drift(abs(nominal), last, generator)
+    else:
+        fluctuation = _draw_fluctuation(abs(nominal), last, generator, step_s)
     return ScenarioLoad(initial=initial, ramps=tuple(ramps), fluctuation=fluctuation)
 
 
@@ -249,14 +276,16 @@ def _ramp(start: float, duration: float, rate: float, announced: list[float]) ->
     )
 
 
-def _draw_fluctuation(nominal: float, last: float, generator: np.random.Generator) -> Fluctuation:
+def _draw_fluctuation(
+    nominal: float, last: float, generator: np.random.Generator, step_s: float
+) -> Fluctuation:
     """A random walk that returns within DECAY_S, smoothed over SMOOTH_S; it starts at 0.
 
     Both are first-order recursions, x⁺ = a x + √(1 - a²) n and y⁺ = b y + (1 - b) x; the stationary
     variance of y is (1 - b) (1 + a b) / ((1 + b) (1 - a b)).
     """
-    a, b = np.exp(-STEP_S / DECAY_S), np.exp(-STEP_S / SMOOTH_S)
-    n = int(np.ceil(last / STEP_S - 1e-9))
+    a, b = np.exp(-step_s / DECAY_S), np.exp(-step_s / SMOOTH_S)
+    n = int(np.ceil(last / step_s - 1e-9))
     noise = [_normal(uniform) for uniform in generator.random(n)]
     values, x = np.zeros(n + 1), 0.0
     for k in range(n):
@@ -264,7 +293,18 @@ def _draw_fluctuation(nominal: float, last: float, generator: np.random.Generato
         values[k + 1] = b * values[k] + (1 - b) * x
     deviation = np.sqrt((1 - b) * (1 + a * b) / ((1 + b) * (1 - a * b)))
     values = np.round(values * (FLUCTUATION * nominal / deviation), FLUCTUATION_DECIMALS) + 0.0
-    return Fluctuation(step_s=STEP_S, values=tuple(values.tolist()), decay_s=DECAY_S)
+    return Fluctuation(step_s=step_s, values=tuple(values.tolist()), decay_s=DECAY_S)
+
+
+def _draw_drift(nominal: float, last: float, generator: np.random.Generator) -> Fluctuation:
+    """A random walk that returns within DRIFT_DECAY_S and stays within DRIFT; it starts at 0."""
+    a, n = np.exp(-DRIFT_STEP_S / DRIFT_DECAY_S), int(np.ceil(last / DRIFT_STEP_S - 1e-9))
+    values = np.zeros(n + 1)
+    for k, uniform in enumerate(generator.random(n)):
+        step = np.sqrt(1 - a**2) * DRIFT / 2 * _normal(uniform)
+        values[k + 1] = np.clip(a * values[k] + step, -DRIFT, DRIFT)
+    drift = np.round(values * nominal, 6) + 0.0
+    return Fluctuation(step_s=DRIFT_STEP_S, values=tuple(drift.tolist()), decay_s=DRIFT_DECAY_S)
 
 
 def _by_bus(buses: tuple[str, ...], values: Array) -> dict[str, float]:

@@ -226,6 +226,25 @@ ONLINE = (
     Column("failed", "failed", form=".1%"),
     Column("infeasible", "infeasible", form=".1%"),
 )
+#: The closed loop of an island beside today's practice, of `online_summary.practice_lines`.
+PRACTICE = (
+    *_HEAD,
+    Column("forecast", "forecast"),
+    Column("minutes", "minutes", form="g"),
+    Column("period_s", "plans every", "s", "g"),
+    Column("latency_s", "latency", "s", ".2g"),
+    Column("mean_peak_mhz", "peak of the mean frequency", "mHz", ".2f"),
+    Column("peak_ratio", "practice's over it", form=".2f"),
+    Column("mean_rms_mhz", "rms", "mHz", ".2f"),
+    Column("swing_peak_mhz", "largest swing", "mHz", ".2f"),
+    Column("agc_travel_pu", "AGC travel", "pu", ".2f"),
+    Column("travel_ratio", "practice's over it", form=".2f"),
+    Column("cps1", "CPS1", "%", ".1f"),
+    Column("over_practice_percent", "cost over practice", "%", ".3f"),
+    Column("increase_percent", "cost over hindsight", "%", ".3f"),
+    N,
+    FAILURES,
+)
 #: Over several grids.
 GRIDS = (
     CASE,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from ded_bench.analysis.certificate import Certificate, read_certificates
 from ded_bench.analysis.lines import judged_rows, named, newest
-from ded_bench.analysis.online_summary import online_rows
+from ded_bench.analysis.online_summary import online_rows, practice_rows
 from ded_bench.analysis.paper_numbers import Paper, read_paper
 from ded_bench.analysis.referee import REFEREE
 from ded_bench.analysis.reference import Reference, choose_reference
@@ -82,6 +82,11 @@ class Sources:
     def online(self) -> pd.DataFrame:
         """Rows of the closed loop: see `online_rows`."""
         return online_rows(OnlineResults(self.folder), self.case.id)
+
+    @cached_property
+    def practice(self) -> pd.DataFrame:
+        """Rows of the closed loop on an island: see `practice_rows`."""
+        return practice_rows(OnlineResults(self.folder), self.case.id)
 
     def has_schedule(self, key: Key) -> bool:
         """Whether a row can be drawn: its instance is known and its schedule is in the folder."""

@@ -11,6 +11,7 @@ import numpy as np
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table, cell, plain_name
+from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.trajectory import Trajectory
 from ded_bench.results.legacy import upgraded
@@ -74,6 +75,15 @@ class OnlineRow:
     ramp_violation: float | None = cell(default=None, lowest=0)
     bound_violation: float | None = cell(default=None, lowest=0)
     slack_travel_pu: float | None = cell(default=None, lowest=0)
+    mean_freq_rms_hz: float | None = cell(default=None, lowest=0)
+    mean_freq_max_hz: float | None = cell(default=None, lowest=0)
+    swing_rms_hz: float | None = cell(default=None, lowest=0)
+    swing_max_hz: float | None = cell(default=None, lowest=0)
+    excess_mean_hz: float | None = cell(default=None, lowest=0)
+    excess_relative_hz: float | None = cell(default=None, lowest=0)
+    excess_end_hz: float | None = cell(default=None, lowest=0)
+    agc_travel_pu: float | None = cell(default=None, lowest=0)
+    cps1: float | None = None
     unforeseen_hz: float | None = cell(default=None, lowest=0)
     plans: int = cell(default=0, lowest=0)
     late: int = cell(default=0, lowest=0)
@@ -174,10 +184,12 @@ class OnlineResults:
 
 
 def keep_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write times (s), powers of generators and slack, loads (pu) and frequency deviations (rad/s)."""
+    """Write times (s), powers of generators, slack and AGC, loads (pu) and frequency deviations (rad/s)."""
     stride = max(round(KEPT_S / (trajectory.t[1] - trajectory.t[0])), 1)
     names = ("t", "p_gen", "p_slack", "p_load", "omega")
     arrays = {name: getattr(trajectory, name)[::stride] for name in names}
+    if AGC_COLUMN in trajectory.columns:
+        arrays[AGC_COLUMN] = trajectory.columns[AGC_COLUMN][::stride]
     write_arrays(path, arrays, {"kept_s": KEPT_S})
 
 

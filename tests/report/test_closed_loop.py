@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from ded_bench.methods import ed
+from ded_bench.plants.plant import servable
+from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import sample_scenario
 from ded_bench.report.overview import write_overview
 from ded_bench.report.report import write_report
@@ -16,6 +18,7 @@ from ded_bench.results.rows import Results, Row
 from ded_bench.run.online.judgement import judge_operation
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import Planned
+from tests.detailed_cases import MIXED
 
 STATIC = {"scenario": "s", "regime": "TO", "method": "ed", "settings": "every=1", "period_s": 1.0}
 STATIC |= {"forecast": "announced", "predicted": True, "warm": True}
@@ -57,6 +60,34 @@ def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     Results(tmp_path / "other").add([Row("x", "test", "TO", "ed", "default", "Feasible", objective=1.0)])
     write_report(threebus, tmp_path / "other", tmp_path / "no-problems")
     assert "The closed loop" not in (tmp_path / "other" / "report.md").read_text()
+
+
+@pytest.mark.usefixtures("sketched")
+def test_an_island_s_report_sets_plans_beside_practice(tmp_path):
+    """Ratios and cost over ED every 60 s in the same scenario; a run that failed counts; a picture."""
+    case, results = Case.load(MIXED), OnlineResults(tmp_path / "island")
+    scenario = sample_scenario(case, 0, 0, servable, 120.0)
+    for every in (60.0, 1.0):
+        options = LoopOptions(period_s=every)
+        ask = lambda i, _, every=every: Planned(ed.dispatch(case, i, every))  # noqa: E731
+        trajectory = run_loop(case, scenario, ask, options).trajectory
+        known = STATIC | {"scenario": scenario.id, "settings": f"every={every:g}", "period_s": every}
+        known |= {"latency_s": 0.0, "plant": "detailed", "case": case.id, "plans": round(120 / every)}
+        row = OnlineRow(**known, **dataclasses.asdict(judge_operation(case, scenario, trajectory, "TO")))
+        keep_trajectory(results.files.trajectory(row.key), trajectory)
+        failed = OnlineRow(**known | {"scenario": "lost", "plans": 0}, error="the system cannot follow")
+        results.table.add([row, failed])
+    write_report(case, results.files.folder, tmp_path / "no-problems")
+    practice, static = pd.read_csv(tmp_path / "island" / "tables" / "practice.csv").to_dict("records")
+    rows = {row.settings: row for row in results.table.rows.values() if not row.error}
+    assert (practice["n"], practice["failures"], practice["minutes"]) == (1, 1, 2)
+    assert (practice["peak_ratio"], practice["over_practice_percent"]) == (1.0, 0.0)
+    one, other = rows["every=60"], rows["every=1"]
+    assert static["peak_ratio"] == pytest.approx(one.mean_freq_max_hz / other.mean_freq_max_hz)
+    assert static["travel_ratio"] == pytest.approx(one.agc_travel_pu / other.agc_travel_pu)
+    assert static["over_practice_percent"] == pytest.approx(100 * (other.objective / one.objective - 1))
+    assert static["mean_peak_mhz"] == pytest.approx(1e3 * other.mean_freq_max_hz)
+    assert (tmp_path / "island" / "figures" / "practice.png").is_file()
 
 
 def test_the_overview_sets_grids_side_by_side(tmp_path):

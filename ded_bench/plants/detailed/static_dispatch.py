@@ -45,9 +45,10 @@ class Balance:
 
 @dataclass(frozen=True)
 class StaticDispatch:
-    """Dispatch of the generators of a case."""
+    """Dispatch of the generators of a case, beside what secondary control holds."""
 
     equations: CaseSystem
+    held_pu: float = 0.0  # delivered beyond the powers, by all machines together
 
     @property
     def case(self) -> Case:
@@ -58,14 +59,15 @@ class StaticDispatch:
         """Solve the power flow and say what the powers are short of.
 
         Args:
-            power: of the generators, (n_gen,), pu.
+            power: of the generators without what secondary control holds, (n_gen,), pu.
             p_load: load injections, (n_load,), pu; other loads are nominal.
             guess: voltages to start from; None: nominal.
 
         Raises:
             SimulationError: the power flow has no solution.
         """
-        network, machines = self.equations.system.network, self.equations.p_machine(power)
+        network = self.equations.system.network
+        machines = self.equations.p_machine(power) + self.held_pu * self.equations.shares
         point = network.power_flow(machines, self.equations.p_drawn(p_load), guess)
         slopes = network.balance_slopes(point)[0]
         slopes[network.balancing] = -1.0
@@ -183,7 +185,8 @@ class StaticDispatch:
 
         Args:
             instance: gives costs, loads and the powers at t = 0.
-            times: ascending from 0, (n,), s; on an island the powers at 0 are given.
+            times: ascending from 0, (n,), s; on an island the powers at 0 are given. What secondary control
+                holds then stays, and powers are the set-points beside it.
 
         Returns:
             Powers, (n, n_gen), pu. Behind an infinite machine they are a merit order.
@@ -194,12 +197,35 @@ class StaticDispatch:
         cost, p_load = instance.cost_gen(self.case), instance.p_load(self.case, times)
         if self.case.slack is not None:
             return merit_order(self.case, cost, instance.cost_slack(self.case), p_load)
-        found = self.weigh(instance.p_initial(self.case), p_load[0])
+        beside = dataclasses.replace(self, held_pu=self._held(instance))
+        found = beside.weigh(instance.p_initial(self.case), p_load[0])
         powers = [found.power]
-        for load, apart in zip(p_load[1:], np.diff(times).tolist(), strict=True):
-            found = self.cheapest(cost, load, found, self.case.ramp * apart)
+        for k, apart in enumerate(np.diff(times).tolist()):
+            found = beside.after(cost, p_load[k : k + 2], found, self.case.ramp * apart)
             powers.append(found.power)
         return np.array(powers)
+
+    def after(self, cost: Array, p_load: Array, start: Balance, reach: Array, halvings: int = 4) -> Balance:
+        """Dispatch after loads have changed from one to the other, (2, n_load); other arguments: `cheapest`.
+
+        In two steps, each within half the reach, where one is too long for the power flow: before powers
+        follow, a single machine takes what loads change by.
+        """
+        try:
+            return self.cheapest(cost, p_load[1], start, reach)
+        except SimulationError:
+            if not halvings:
+                raise
+        middle = p_load.mean(axis=0)
+        half = self.after(cost, np.stack([p_load[0], middle]), start, reach / 2, halvings - 1)
+        return self.after(cost, np.stack([middle, p_load[1]]), half, reach / 2, halvings - 1)
+
+    def _held(self, instance: Instance) -> float:
+        """What secondary control holds from t = 0 on, pu; it may act at once."""
+        agc, control = instance.initial.agc, self.case.agc
+        if agc is None or control is None:
+            return 0.0
+        return -control.k * agc.integral_rad if agc.next_s == 0.0 else agc.held_pu
 
     def balanced_instance(self, instance: Instance) -> Instance:
         """An instance whose powers at t = 0 are balanced, rounded as the sampler does.

@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 
 import pandas as pd
 
-from ded_bench.analysis.lines import on_usual_model, title
+from ded_bench.analysis.lines import on_usual_model, title, titled
+from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.paper_numbers import result_lines
 from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
 from ded_bench.problem.case import Case
-from ded_bench.report.columns import ISLAND, TABLE_V, TABLE_VI, tabulate, without_paper
+from ded_bench.report.columns import ISLAND, PRACTICE, TABLE_V, TABLE_VI, tabulate, without_paper
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
 
@@ -65,6 +66,8 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         Text(what),
         *(Text(text, note=True) for text in alarms(sources)),
         *_on_island(sources),
+        *_in_operation(sources),
+        *pictures["practice"],
         *usual_first(five, shown),
         *usual_first(six, shown),
         Items(tuple(said)),
@@ -91,6 +94,19 @@ def _on_island(sources: Sources) -> Iterator[PageTable]:
             f"{rows_caption(sources)}; feasible: within {ISLAND_HZ:g} Hz of every bound"
         )
         yield PageTable(tabulate(ISLAND, island_summary(sources.judged)), ISLAND, caption, "island")
+
+
+def _in_operation(sources: Sources) -> Iterator[PageTable]:
+    """What plans do to an island in operation, beside today's practice, where rows have it."""
+    if sources.case.slack is None and len(sources.practice):
+        lines = titled(practice_lines(sources.practice)).sort_values(
+            ["regime", "forecast", "minutes"], kind="stable", ascending=[True, False, True]
+        )
+        caption = (
+            "In operation beside today's practice (ED every 60 s, AGC for the rest): means over n scenarios; "
+            "ratios and costs beside practice over those where it was operated, too"
+        )
+        yield PageTable(tabulate(PRACTICE, lines), PRACTICE, caption, "practice")
 
 
 def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:

@@ -1,41 +1,64 @@
 """What operating a scenario cost and which limits it broke, beside hindsight and loads that no plan knew.
 
-Hindsight is the whole scenario optimised at once with true loads, for the case's own plant.
+Hindsight is the whole scenario optimised at once with true loads, for the case's own plant; on islands in
+windows that overlap, where it is long.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import Plant
-from ded_bench.plants.score import STRICT_HZ, judge
+from ded_bench.plants.score import STRICT_HZ, judge, mean_hz
 from ded_bench.plants.simulate import simulate
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
-from ded_bench.run.online.loop import LoopOptions
+from ded_bench.run.online.loop import LoopOptions, run_loop
+from ded_bench.run.online.planner import Planned
 
 #: Knots of hindsight lie so many times as close as the case's: renewed plans may bend anywhere.
 FINER = 4
+#: Length of a window of an island's hindsight, s.
+WINDOW_S = 300.0
+#: The Eastern Interconnection's bound on the rms of minutes' mean frequency, Hz (NERC BAL-001, CPS1).
+EPSILON_HZ, MINUTE_S = 0.018, 60.0
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """One trajectory in one regime; the excess at a point of time is the worst generator's."""
+    """One trajectory in one regime; the excess at a point of time is that over the most exceeded bound.
+
+    Islands have numbers about the mean frequency and swings about it, too (`Score`).
+    """
 
     objective: float  # Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points, as of the scorer
-    max_excess_hz: float  # max over k, i of (|ω_i| - bound)_+
-    mean_excess_hz: float  # mean over k of max over i of (|ω_i| - bound)_+
-    share_outside: float  # of the grid points where some |ω_i| is more than 1e-6 Hz beyond the bound
+    max_excess_hz: float  # the largest, also over what counts at the end only
+    mean_excess_hz: float  # mean over all grid points
+    share_outside: float  # of the grid points where it is more than 1e-6 Hz
     ramp_violation: float  # pu per step
     bound_violation: float  # pu
     slack_travel_pu: float  # Σ_k |P_s(t_k+1) - P_s(t_k)|
+    mean_freq_rms_hz: float | None = None
+    mean_freq_max_hz: float | None = None
+    swing_rms_hz: float | None = None
+    swing_max_hz: float | None = None
+    excess_mean_hz: float | None = None
+    excess_relative_hz: float | None = None
+    excess_end_hz: float | None = None
+    agc_travel_pu: float | None = None
+    cps1: float | None = None  # %, see `cps1`
+
+
+#: What islands have in addition, as the scorer names it.
+OF_ISLANDS = tuple(f.name for f in fields(Judgement) if f.default is None and f.name != "cps1")
 
 
 @dataclass(frozen=True)
@@ -54,7 +77,8 @@ def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regi
         InputError: unknown regime.
     """
     score = judge(case, scenario.snapshot(case, 0.0), trajectory, regime)
-    excess = np.abs(trajectory.omega).max(axis=1) - case.omega_bound(regime)
+    bounds = case.bounds(regime)
+    excess = bounds.beyond(trajectory.omega @ bounds.matrix.T).max(axis=1)
     excess_hz = np.maximum(excess, 0.0) / (2 * np.pi)
     return Judgement(
         objective=score.objective,
@@ -64,7 +88,25 @@ def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regi
         ramp_violation=score.ramp_violation,
         bound_violation=score.bound_violation,
         slack_travel_pu=float(np.abs(np.diff(trajectory.p_slack)).sum()),
+        **{name: getattr(score, name) for name in OF_ISLANDS},
+        cps1=cps1(trajectory.t, mean_hz(trajectory)) if case.slack is None else None,
     )
+
+
+def cps1(t: Array, mean: Array) -> float:
+    """Control performance: 100 (2 - mean over minutes of (mean frequency of the minute)² / ε²), %.
+
+    As NERC's CPS1 of an island, which has no tie: its area control error is -10 B Δf. What is left at the end
+    counts as a minute if it is half of one or more, or all that there is, else with the one before.
+
+    Args:
+        t: from 0, equidistant, (n,), s.
+        mean: frequency deviation, (n,), Hz.
+    """
+    steps = max(round(MINUTE_S / (t[1] - t[0])), 1)
+    starts = np.arange(max(round((len(t) - 1) / steps), 1)) * steps
+    minutes = np.add.reduceat(mean, starts) / np.diff(starts, append=len(mean))
+    return float(100 * (2 - np.mean(minutes**2) / EPSILON_HZ**2))
 
 
 def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None = None) -> Hindsight:
@@ -80,6 +122,8 @@ def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None =
         RuntimeError: neither finds a schedule.
         SimulationError: the plant cannot follow it.
     """
+    if case.slack is None:
+        return _in_windows(case, scenario, regime)
     instance = whole_instance(case, scenario)
     interval_s = case.sampling.horizon_s / (case.n_knots - 1) / FINER
     reasons = []
@@ -90,6 +134,24 @@ def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None =
             return Hindsight(name, judge_operation(case, scenario, trajectory, regime), trajectory)
         reasons.append(solution.error)
     raise RuntimeError(f"no schedule for the whole of {scenario.id}: {reasons[-1]}")
+
+
+def _in_windows(case: Case, scenario: Scenario, regime: str) -> Hindsight:
+    """Optimise windows of WINDOW_S, the next one from the middle of each on, with the case's knots."""
+    interval_s = case.sampling.horizon_s / (case.n_knots - 1)
+    solver = get_method("ded-slp").prepare(case, regime, Settings(f"knot_s={interval_s!r}"))
+
+    def ask(instance: Instance, last: Schedule | None) -> Planned:
+        solution = solver(instance)
+        if solution.schedule is None:
+            raise RuntimeError(f"no schedule for {instance.id}: {solution.error}")
+        return Planned(solution.schedule)
+
+    is_whole = scenario.duration_s <= WINDOW_S
+    period_s = scenario.duration_s if is_whole else WINDOW_S / 2
+    options = LoopOptions(period_s, forecast="perfect", horizon_s=WINDOW_S, to_end=True)
+    trajectory = run_loop(case, scenario, ask, options).trajectory
+    return Hindsight("ded-slp", judge_operation(case, scenario, trajectory, regime), trajectory)
 
 
 def whole_instance(case: Case, scenario: Scenario) -> Instance:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ded_bench.methods.ramp_follower import follow
 from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
+from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Instance
@@ -23,6 +24,8 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
 from ded_bench.run.online.planner import Ask, Planned
 
+#: Between plans unless told otherwise, s.
+PERIOD_S = 1.0
 #: Steps that differ from a whole number by less are whole.
 WHOLE = 1e-6
 
@@ -31,11 +34,13 @@ WHOLE = 1e-6
 class LoopOptions:
     """How a loop runs."""
 
-    period_s: float = 1.0
+    period_s: float = PERIOD_S
     latency_s: float = 0.0
     forecast: str = "announced"
     predict: bool = True  # plan from the state predicted for τ + latency; False: from that at τ
     warm: bool = True  # methods that can use the plan in force are given it
+    horizon_s: float = 0.0  # plans last at least so long; no less than the period and the case's horizon
+    to_end: bool = False  # but not beyond the scenario
 
     def steps(self, dt_s: float) -> tuple[int, int]:
         """Period and latency in steps of the grid."""
@@ -78,7 +83,7 @@ class _History:
         self.now, self.state = 0, plant.initial(first)
         self.p_load = scenario.p_load(case)
         self.omega, self.p_set, self.p_gen = np.empty((3, n, len(case.generators)))
-        self.p_slack = np.empty(n)
+        self.p_slack, self.agc = np.empty((2, n))
         self.p_set[0] = first.p_initial(case)
 
     def go_on(self, p_set: Array) -> None:
@@ -87,6 +92,8 @@ class _History:
         piece = self.ahead(p_set, self.p_load[k])
         self.omega[k], self.p_set[k], self.p_gen[k] = piece.omega, p_set, piece.p_gen
         self.p_slack[k], self.state = piece.p_slack, piece.end
+        if self._case.agc is not None:
+            self.agc[k] = self._plant.columns(piece.states)[AGC_COLUMN]
         self.now += len(p_set) - 1
 
     def ahead(self, p_set: Array, p_load: Array) -> Piece:
@@ -94,10 +101,10 @@ class _History:
         return self._plant.advance(self.state, p_set, p_load, self._dt)
 
     def trajectory(self) -> Trajectory:
-        """All of it, without the plant's own states."""
-        return Trajectory(
-            self._grid, self.omega, self.p_set, self.p_gen, self.p_load, self.p_slack, self._case
-        )
+        """All of it, without the plant's own states; of its columns, what secondary control asks for."""
+        columns = {} if self._case.agc is None else {AGC_COLUMN: self.agc}
+        whole = (self._grid, self.omega, self.p_set, self.p_gen, self.p_load, self.p_slack, self._case)
+        return Trajectory(*whole, columns=columns)
 
 
 def run_loop(
@@ -125,7 +132,10 @@ def run_loop(
 class _Loop:
     def __init__(self, case: Case, scenario: Scenario, ask: Ask, options: LoopOptions, plant: Plant) -> None:
         self.case, self.scenario, self.ask, self.options, self.plant = case, scenario, ask, options, plant
-        self.dt, self.horizon = scenario.dt_s, case.sampling.horizon_s
+        self.dt = scenario.dt_s
+        self.horizon, longest = case.sampling.horizon_s, max(options.period_s, options.horizon_s)
+        if longest > self.horizon:
+            self.horizon = math.ceil(longest / self.dt - WHOLE) * self.dt
         self.history = _History(case, scenario, plant)
         power = self.history.p_set[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
@@ -175,13 +185,15 @@ class _Loop:
         return self.history.ahead(self._followed(start), loads.at(times)).end
 
     def _instance(self, state: PlantState, loads: Forecast, start: int) -> Instance:
-        points = loads.points(start * self.dt, self.horizon)
+        left = (self.scenario.steps - start) * self.dt
+        horizon = min(self.horizon, left) if self.options.to_end else self.horizon
+        points = loads.points(start * self.dt, horizon)
         return Instance(
             schema_="ded-bench/instance/2",
             id=f"{self.scenario.id[:50]}-{start}",
             case=self.case.id,
             seed=self.scenario.seed,
-            horizon_s=self.horizon,
+            horizon_s=horizon,
             dt_s=self.dt,
             cost=self.scenario.cost,
             load=dict(zip(self.case.loads, points, strict=True)),

@@ -17,7 +17,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, named
-from ded_bench.plants.plant import plant_of
+from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import Scenario
 from ded_bench.results.folder import ResultsFolder
@@ -85,7 +85,8 @@ def make_operations(
             timed = method.canonical(settings, timed=True).options
             job = regime, method.name, timed, model_name(model)
             seconds, source = _latency(case, job, latency, timing)
-            own = dataclasses.replace(options, latency_s=seconds)
+            longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
+            own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
             for scenario in scenarios:
                 made_from = *(a.fingerprint for a in artifacts), f"{limit_s:g}"
                 row = OnlineRow(
@@ -113,8 +114,17 @@ def operate(
     results: OnlineResults,
     workers: int = 1,
     on_row: Callable[[OnlineRow], None] = lambda row: None,
+    look_back: bool = True,
 ) -> list[OnlineRow]:
     """Operate what the results folder lacks; every row is saved as soon as it exists.
+
+    Args:
+        case: the grid.
+        operations: rows to be made.
+        results: where they are kept.
+        workers: processes.
+        on_row: is told of every new row.
+        look_back: whether hindsight is found where it is missing; else costs may stand beside none.
 
     Returns:
         The rows of all operations, old and new, in their order.
@@ -125,7 +135,8 @@ def operate(
     table = results.table
     todo = [o for o in operations if not table.made_from(o.row.key, o.row.fingerprint, o.row.method_version)]
     with Workers(workers) as pool:
-        _look_back(case, todo, results, pool)
+        if look_back:
+            _look_back(case, operations, results, pool)
         calls = ((operate_one, (case, o, results.files)) for o in todo)
         with tqdm(total=len(todo), unit="scenario", disable=None, desc="online") as bar:
             for operation, answer in pool.imap(calls, todo):
@@ -134,6 +145,9 @@ def operate(
                 table.add([row])
                 on_row(row)
                 bar.update()
+    rows = [table.rows[o.row.key] for o in operations]
+    if later := [row for row in (_compared(r, results) for r in rows) if row != table.rows[row.key]]:
+        table.add(later)  # hindsight that was found after them
     return [table.rows[o.row.key] for o in operations]
 
 
@@ -149,9 +163,13 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     row = _row(o, judgement, reason_of(missing[0].error) if missing else "")
     method_s = sum(answer.seconds for answer in answers)
     loop_s = time.perf_counter() - started - method_s
+    try:
+        unforeseen = unforeseen_hz(case, o.scenario, o.options, plant)
+    except SimulationError:  # nobody answers to them there, as plans do
+        unforeseen = None
     return dataclasses.replace(
         row,
-        unforeseen_hz=unforeseen_hz(case, o.scenario, o.options, plant),
+        unforeseen_hz=unforeseen,
         plans=len(answers),
         late=sum(answer.late for answer in missing),
         failed=sum(not answer.late for answer in missing),
@@ -162,7 +180,7 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     )
 
 
-def look_back(case: Case, scenario: Scenario, row: HindsightRow, files: OnlineFiles) -> HindsightRow:
+def find_hindsight(case: Case, scenario: Scenario, row: HindsightRow, files: OnlineFiles) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
     found = hindsight(case, scenario, row.regime, plant_of(case, row.plant))
     keep_trajectory(files.hindsight_trajectory(*row.key), found.trajectory)
@@ -176,14 +194,14 @@ def look_back(case: Case, scenario: Scenario, row: HindsightRow, files: OnlineFi
     )
 
 
-def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:
+def _look_back(case: Case, asked_for: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:
     """Find the hindsight of every scenario and regime that is not there yet."""
-    asked = {(o.row.scenario, o.row.regime, o.row.plant): o.scenario for o in todo}
+    asked = {(o.row.scenario, o.row.regime, o.row.plant): o.scenario for o in asked_for}
     wanted = [
         (scenario, HindsightRow(*key, **_made(case, key[2], scenario))) for key, scenario in asked.items()
     ]
     missing = [one for one in wanted if not results.hindsight.made_from(one[1].key, one[1].fingerprint)]
-    calls = ((look_back, (case, *one, results.files)) for one in missing)
+    calls = ((find_hindsight, (case, *one, results.files)) for one in missing)
     for (_, row), answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
     ):
@@ -193,15 +211,15 @@ def _look_back(case: Case, todo: Sequence[Operation], results: OnlineResults, po
 
 def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:
     """A row with its cost over hindsight, where both are known."""
-    best = results.hindsight.rows[row.scenario, row.regime, row.plant].objective
-    if row.objective is None or not best:
+    best = results.hindsight.rows.get((row.scenario, row.regime, row.plant))
+    if row.objective is None or best is None or not best.objective:
         return row
-    return dataclasses.replace(row, increase_percent=100 * (row.objective / best - 1))
+    return dataclasses.replace(row, increase_percent=100 * (row.objective / best.objective - 1))
 
 
 def _row(o: Operation, judgement: Judgement | None = None, error: str = "") -> OnlineRow:
     numbers = {} if judgement is None else dataclasses.asdict(judgement)
-    if any(not abs(value) <= LARGEST for value in numbers.values()):
+    if any(value is not None and not abs(value) <= LARGEST for value in numbers.values()):
         numbers, error = {}, f"cost or violations are above {LARGEST:g}"
     return dataclasses.replace(o.row, **numbers, error=error, date=now())
 

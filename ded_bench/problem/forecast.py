@@ -10,7 +10,7 @@ import numpy as np
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import LoadPoints
-from ded_bench.problem.scenario import Scenario, ScenarioLoad, ScenarioRamp
+from ded_bench.problem.scenario import Scenario, ScenarioLoad, ramped_for
 
 Quality = Literal["announced", "perfect", "worse", "persistence"]
 #: `announced`: ramps as announced; `perfect`: what will be; `worse`: announcements four times as wrong;
@@ -58,32 +58,36 @@ def _load(load: ScenarioLoad, quality: str, now: float, until: float) -> tuple[A
         return np.array([now, until]), np.full(2, load.at(np.array(now)))
     if quality == "perfect":
         inside = load.fluctuation.times
+        inside = inside[(inside > now) & (inside < until)].tolist()
         times = _joined([*inside, *(t for ramp in load.ramps for t in (ramp.start, ramp.end))], now, until)
         return times, load.at(times)
     ramps = tuple(_expected(load, WORSE if quality == "worse" else 1.0, now))
-    steps = np.arange(now, until, load.fluctuation.step_s)
-    times = _joined([*steps, *(t for ramp in ramps for t in (ramp.start, ramp.end))], now, until)
+    steps = np.arange(now, until, load.fluctuation.step_s).tolist()
+    times = _joined(
+        [*steps, *(t for start, duration, _ in ramps for t in (start, start + duration))], now, until
+    )
     decay = np.exp(-(times - now) / load.fluctuation.decay_s)
-    ramped = sum(ramp.rate * np.clip(times - ramp.start, 0.0, ramp.duration) for ramp in ramps)
+    ramped = sum(rate * ramped_for(times, start, duration) for start, duration, rate in ramps)
     return times, np.asarray(load.initial + ramped + load.fluctuation_at(np.array(now)) * decay)
 
 
-def _expected(load: ScenarioLoad, wrong: float, now: float) -> Iterator[ScenarioRamp]:
-    """The ramps that are known at `now`, as they are expected; announcements are `wrong` times as wrong."""
+def _expected(load: ScenarioLoad, wrong: float, now: float) -> Iterator[tuple[float, float, float]]:
+    """Start, duration and rate of ramps that are known at `now`; announcements are `wrong` times as wrong."""
     for ramp in load.ramps:
         if ramp.start <= now:
-            yield ramp
+            yield ramp.start, ramp.duration, ramp.rate
         elif ramp.announced_start is not None and ramp.announced_rate is not None:
             start = max(ramp.start + wrong * (ramp.announced_start - ramp.start), now)
-            rate = ramp.rate + wrong * (ramp.announced_rate - ramp.rate)
-            yield ramp.model_copy(update={"start": start, "rate": rate})
+            yield start, ramp.duration, ramp.rate + wrong * (ramp.announced_rate - ramp.rate)
 
 
 def _joined(times: Iterable[float], first: float, last: float) -> Array:
     """The times strictly between two, each once, and these two."""
-    inside = np.unique([t for t in times if first + RESOLUTION < t < last - RESOLUTION])
-    kept = inside[np.diff(inside, prepend=-np.inf) > RESOLUTION]
-    return np.concatenate([[first], kept, [last]])
+    kept = [first]
+    for t in sorted(times):
+        if kept[-1] + RESOLUTION < t < last - RESOLUTION:
+            kept.append(t)
+    return np.array([*kept, last])
 
 
 def _points(times: Array, values: Array, start: float, horizon_s: float) -> LoadPoints:

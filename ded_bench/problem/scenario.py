@@ -68,12 +68,17 @@ class ScenarioLoad(Record):
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
-        ramped = sum(ramp.rate * np.clip(t - ramp.start, 0.0, ramp.duration) for ramp in self.ramps)
+        ramped = sum(ramp.rate * ramped_for(t, ramp.start, ramp.duration) for ramp in self.ramps)
         return np.asarray(self.initial + ramped + self.fluctuation_at(t))
 
     def fluctuation_at(self, t: Array) -> Array:
         """Fluctuation in pu at times `t` in s (any shape)."""
         return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
+
+
+def ramped_for(t: Array, start: float, duration: float) -> Array:
+    """How long a ramp has gone on at times `t`, s."""
+    return np.minimum(np.maximum(t - start, 0.0), duration)  # np.clip takes twice as long
 
 
 class Scenario(Fingerprinted):

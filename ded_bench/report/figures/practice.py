@@ -51,7 +51,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         + ", ".join(one["label"])
         + "."
     )
-    yield Drawn("practice", caption, time_figure(f"{most[0]}, {sources.tightest}", panels, 1, "time (min)"))
+    yield Drawn("practice", caption, time_figure(f"{most[0]}, {sources.tightest}", panels, 1))
 
 
 def _place(method: str, settings: str) -> int:
@@ -68,13 +68,13 @@ def _panels(sources: Sources, rows: pd.DataFrame, kept: list[dict[str, Array]]) 
     limits = 1e3 * RAD_TO_HZ * case.bounds(sources.tightest).limit
     mean, swing, agc = [], [], []
     for place, label, arrays in zip(rows["place"], rows["label"], kept, strict=True):
-        minutes, hz = arrays["t"] / 60, 1e3 * RAD_TO_HZ * arrays["omega"]
+        t, hz = arrays["t"], 1e3 * RAD_TO_HZ * arrays["omega"]
         style = {"color": COLOURS[place], "linewidth": 0.9}
-        mean.append(Curve(minutes, hz @ weight, label, style))
+        mean.append(Curve(t, hz @ weight, label, style))
         about = np.abs(hz - (hz @ weight)[:, None]).max(axis=1)
-        swing.append(Curve(minutes, about, label, style))
+        swing.append(Curve(t, about, label, style))
         if AGC_COLUMN in arrays:
-            agc.append(Curve(minutes, arrays[AGC_COLUMN], label, style))
+            agc.append(Curve(t, arrays[AGC_COLUMN], label, style))
     return [
         Panel("mean frequency (mHz)", mean, (limits[0], -limits[0])),
         Panel("largest swing (mHz)", swing, (limits[1],)),

@@ -168,7 +168,7 @@ def test_the_integrator_is_of_order_four(plant, mixed, quiet_instance):
 
 
 def test_in_pieces_it_does_what_it_does_at_once(mixed, plant, quiet_instance):
-    """Also where a piece begins or ends at a time of secondary control, which acts once."""
+    """To the last bit, also where a piece begins or ends at a time of secondary control, which acts once."""
     instance, schedule = ramping(mixed, quiet_instance)
     whole, p_load = simulate(mixed, instance, schedule, plant), instance.p_load(mixed)
     state = plant.initial(instance)
@@ -177,7 +177,7 @@ def test_in_pieces_it_does_what_it_does_at_once(mixed, plant, quiet_instance):
         piece = plant.advance(state, whole.p_set[k], p_load[k], instance.dt_s)
         state = piece.end
         for name in ("omega", "p_gen"):
-            np.testing.assert_allclose(getattr(piece, name), getattr(whole, name)[k], rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(getattr(piece, name), getattr(whole, name)[k])
     agc = whole.columns["agc"]
     assert np.flatnonzero(np.diff(agc)).tolist() == [199, 399, 599]
     assert agc[-1] == pytest.approx(state.held, rel=1e-9)
@@ -189,7 +189,7 @@ def test_what_is_observed_at_rest_leads_to_the_same_state(mixed, plant, quiet_in
     state = plant.initial(instance)
     seen = json.loads(plant.observed(state).initial(mixed).model_dump_json())
     again = alter(instance, schema="ded-bench/instance/2", initial=seen)
-    for mine, other in zip(plant.initial(again), state, strict=True):
+    for mine, other in zip(plant.initial(again)[:-1], state[:-1], strict=True):  # nothing is carried yet
         np.testing.assert_allclose(mine, other, rtol=0, atol=1e-9)
 
 

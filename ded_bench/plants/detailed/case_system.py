@@ -15,7 +15,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.quantities import Array
 
 if TYPE_CHECKING:
-    from ded_bench.plants.detailed.detailed_stepper import DetailedStates
+    from ded_bench.plants.detailed.detailed_stepper import CarriedVoltages, DetailedStates
 
 
 class DetailedState(NamedTuple):
@@ -28,6 +28,7 @@ class DetailedState(NamedTuple):
     v_ref: Array  # exciters' references, (n_machine,), pu
     offset: Array  # governors' references less set-points, (n_machine,), pu
     p_set: Array  # (n_gen,), pu
+    carried: CarriedVoltages | None = None  # by the integrator; None: nothing happened before
 
 
 class DetailedRun(NamedTuple):

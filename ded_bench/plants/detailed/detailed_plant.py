@@ -8,6 +8,7 @@ governors; what turbines deliver follows. Loads draw constant power at any volta
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 from collections.abc import Mapping
@@ -104,7 +105,12 @@ class DetailedPlant:
         self, state: DetailedState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
     ) -> Piece:
         """See `Plant.advance`; `states` are a DetailedRun. On an island the slack's power is zero."""
-        from ded_bench.plants.detailed.detailed_stepper import DetailedStates, PlantInputs, integrate_plant
+        from ded_bench.plants.detailed.detailed_stepper import (
+            DetailedStates,
+            PlantInputs,
+            carried_voltages,
+            integrate_plant,
+        )
 
         equations, n, control = self.equations, len(p_set), self.control(state, dt_s)
         system, machines = equations.system, equations.scheduled
@@ -120,7 +126,8 @@ class DetailedPlant:
         needed = max(system.fastest * dt_s / STEP_BY_MODE, dt_s / LONGEST_S if exact else 1.0)
         steps = int(np.ceil(needed - 1e-9))
         try:
-            done = integrate_plant(system.data, network, inputs, control, steps, states)
+            carried = copy.deepcopy(state.carried) or carried_voltages(network, drawn[0], states.v[0])
+            done = integrate_plant(system.data, network, inputs, control, steps, carried, states)
         except np.linalg.LinAlgError:
             done = 0
         if done < n or not np.isfinite(states.x[-1]).all():
@@ -130,7 +137,12 @@ class DetailedPlant:
         if ahead < 0:
             ahead %= control.period
         end = state._replace(
-            x=states.x[-1], v=states.v[-1], held=float(states.held[-1]), next_s=ahead * dt_s, p_set=p_set[-1]
+            x=states.x[-1],
+            v=states.v[-1],
+            held=float(states.held[-1]),
+            next_s=ahead * dt_s,
+            p_set=p_set[-1],
+            carried=carried,
         )
         omega = states.x[:, SPEED, machines] * system.data.omega_0[machines]
         p_gen = equations.turbines(states.x)[:, machines]

@@ -24,6 +24,7 @@ from ded_bench.plants.detailed.equations import (
     sources,
 )
 from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 
@@ -63,6 +64,25 @@ class DetailedStates(NamedTuple):
     p_e: Array  # (n, n_machine), pu
 
 
+class CarriedVoltages(NamedTuple):
+    """What goes on from piece to piece, so that pieces are the whole to the last bit."""
+
+    recent: Array  # voltages at each stage of the last four steps, (4, 4, 2 n_load), pu
+    load: LoadSlopes
+    age: Indices  # integrator steps since the slopes are these, (1,)
+
+
+@compiled
+def carried_voltages(network: CompiledNetwork, drawn: Array, v: Array) -> CarriedVoltages:
+    """What a state without a past has, at loads (n_load,) and voltages (2 n_port,), pu."""
+    n_load = len(drawn)
+    load = LoadSlopes(np.empty((n_load, 4)), np.empty((len(v), len(v))))
+    renew(network, drawn, v, load)
+    recent = np.empty((4, 4, 2 * n_load))
+    recent[:, :] = v[: 2 * n_load]
+    return CarriedVoltages(recent, load, np.zeros(1, dtype=np.intp))
+
+
 @compiled
 def integrate_plant(
     data: MachineArrays,
@@ -70,6 +90,7 @@ def integrate_plant(
     inputs: PlantInputs,
     agc: SecondaryControl,
     steps: int,
+    carried: CarriedVoltages,
     states: DetailedStates,
 ) -> int:
     """Integrate from the first point of time to the last; a share due at the last point is not applied.
@@ -80,6 +101,7 @@ def integrate_plant(
         inputs: at the points.
         agc: secondary control.
         steps: integrator steps from one point to the next.
+        carried: from the piece before; becomes what the next one needs.
         states: receives what happens.
 
     Returns:
@@ -93,12 +115,11 @@ def integrate_plant(
     p_ref, drawn, p_e = np.empty(n_machine), inputs.drawn[0].copy(), np.empty(n_machine)
     source = np.empty(len(v))
     # Voltages at the same stage of the last four steps predict those of the next.
-    recent = np.empty((4, 4, 2 * n_load))
-    recent[:, :] = v[: 2 * n_load]
-    load = LoadSlopes(np.empty((n_load, 4)), np.empty((len(v), len(v))))
-    renew(network, drawn, v, load)
-    age = 0
+    recent, load, age = carried.recent, carried.load, carried.age[0]
     for k in range(n):
+        if k == n - 1:  # the next piece does this point once more
+            carried.age[0] = age
+            recent, load = recent.copy(), LoadSlopes(load.slopes.copy(), load.answer.copy())
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
         states.held[k] = held

@@ -10,7 +10,7 @@ import contextlib
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from ded_bench.plants.lossless.stepper import Carried
 
 #: Longest step times the fastest mode: far inside the region of stability; errors of the exact method are
 #: below 1e-12.
@@ -38,6 +41,7 @@ class LosslessState(NamedTuple):
     omega: Array  # (n_gen,), rad/s
     p_gen: Array  # (n_gen,), pu
     divisions: float  # steps per second of the integrator
+    carried: Carried | None = None  # by the integrator; None: nothing happened before
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,14 @@ class LosslessPlant:
         self, state: LosslessState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
     ) -> Piece:
         """See `Plant.advance`; steps of fixed length lead from point to point, so that none spans a kink."""
-        from ded_bench.plants.lossless.stepper import DORMAND_PRINCE_8, KUTTA_4, GridInputs, integrate
+        from ded_bench.plants.lossless.stepper import (
+            DORMAND_PRINCE_8,
+            KUTTA_4,
+            Carried,
+            GridInputs,
+            carried_from,
+            integrate,
+        )
 
         network, n = self.network, len(p_set)
         theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
@@ -83,15 +94,18 @@ class LosslessPlant:
         inputs = GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
         steps = max(int(np.ceil(state.divisions * dt_s)), 1)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
+        tableau, past = DORMAND_PRINCE_8 if exact else KUTTA_4, state.carried
         try:
-            done = integrate(
-                DORMAND_PRINCE_8 if exact else KUTTA_4, grid, inputs, steps, theta, omega, p_slack
-            )
+            if past is None or past.recent.shape[1] != len(tableau.c):
+                carried = carried_from(tableau, grid, theta[0])
+            else:
+                carried = Carried(*(part.copy() for part in past))
+            done = integrate(tableau, grid, inputs, steps, carried, theta, omega, p_slack)
         except np.linalg.LinAlgError:
             done = 0
         if done < n:
             raise SimulationError("the system cannot follow this schedule: the power flow has no solution")
-        end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions)
+        end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions, carried)
         return Piece(omega, p_set, p_slack, theta, end)
 
     def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:

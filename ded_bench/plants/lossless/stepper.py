@@ -61,12 +61,31 @@ class GridInputs(NamedTuple):
     dt: float  # s
 
 
+class Carried(NamedTuple):
+    """What goes on from piece to piece, so that pieces are the whole to the last bit."""
+
+    recent: Array  # angles at each stage of the last four steps, (4, n_stages, n_algebraic), rad
+    inverse: Array  # of the Jacobian, (n_algebraic, n_algebraic), rad/pu
+
+
+@compiled
+def carried_from(tableau: Tableau, grid: CompiledGrid, theta: Array) -> Carried:
+    """What a state without a past has, at angles (n_bus,); LinAlgError if the Jacobian is singular."""
+    n = len(grid.algebraic)
+    carried = Carried(np.empty((4, len(tableau.c), n)), np.empty((n, n)))
+    for i in range(n):
+        carried.recent[:, :, i] = theta[grid.algebraic[i]]
+    _invert(grid, theta, carried.inverse)
+    return carried
+
+
 @compiled
 def integrate(
     tableau: Tableau,
     grid: CompiledGrid,
     inputs: GridInputs,
     steps: int,
+    carried: Carried,
     theta: Array,
     omega: Array,
     p_slack: Array,
@@ -78,6 +97,7 @@ def integrate(
         grid: the network.
         inputs: powers at n points of time.
         steps: steps from one point to the next.
+        carried: from the piece before; becomes what the next one needs.
         theta: angles of all buses, (n, n_bus), rad; the first row is given and the others are computed.
         omega: frequency deviations, (n, n_gen), rad/s; likewise.
         p_slack: receives the slack's power, (n,), pu.
@@ -90,17 +110,15 @@ def integrate(
     n_stages = len(tableau.c)
     h = inputs.dt / steps
     # Angles at the same stage of the last four steps predict those of the next.
-    recent = np.empty((4, n_stages, n_algebraic))
-    for i in range(n_algebraic):
-        recent[:, :, i] = theta[0, grid.algebraic[i]]
+    recent, inverse = carried.recent, carried.inverse
     angle, f, wanted = theta[0].copy(), np.empty(n_bus), np.empty(n_algebraic)
     angle_rate, speed_rate = np.empty((n_stages, n_gen)), np.empty((n_stages, n_gen))
     start, speed = np.empty(n_gen), omega[0].copy()
     for g in range(n_gen):
         start[g] = angle[grid.generators[g]]
-    inverse = np.empty((n_algebraic, n_algebraic))
-    _invert(grid, angle, inverse)
     for k in range(n):
+        if k == n - 1:  # the next piece does this point once more
+            recent, inverse = recent.copy(), inverse.copy()
         for j in range(steps):
             for s in range(n_stages):
                 inside = (j + tableau.c[s]) / steps

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -235,3 +236,7 @@ def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solve
     from ded_bench.methods.registry import get_method
 
     return get_method(method).prepare(case, regime, settings)
+
+
+if "gymnasium" in sys.modules:  # its users find the environments by their ids
+    importlib.import_module("ded_bench.gym")

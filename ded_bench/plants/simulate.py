@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import numpy as np
+
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import Plant, PlantState, SimulationError, plant_of
 from ded_bench.problem.case import Case
@@ -46,11 +48,12 @@ def simulate(
     p_set, p_load = schedule.at(instance.grid), instance.p_load(case)
     start = plant.initial(instance) if state is None else state
     piece = plant.advance(start, p_set, p_load, instance.dt_s, exact)
+    # Sums over arrays of another order differ in the last bit.
     return Trajectory(
         t=instance.grid,
-        omega=piece.omega,
+        omega=np.ascontiguousarray(piece.omega),
         p_set=p_set,
-        p_gen=piece.p_gen,
+        p_gen=np.ascontiguousarray(piece.p_gen),
         p_load=p_load,
         p_slack=piece.p_slack,
         case=case,

@@ -1,4 +1,4 @@
-"""The examples run, and do what they say."""
+"""The examples run, and do what they say; training is shortened."""
 
 from __future__ import annotations
 
@@ -37,3 +37,44 @@ def test_dispatch_with_foresight(ninebus: Case, monkeypatch: pytest.MonkeyPatch)
     schedule = lookahead_dispatch.solve(instance, "NO", ninebus)
     verdict = ded_bench.score(instance, schedule, "NO")
     assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8
+
+
+def run_example(code: str, folder: Path) -> None:
+    """Run code beside the examples, in a process of its own: other packages warn."""
+    environment = os.environ | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{EXAMPLES}", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_policy_learns_through_the_plant(ninebus: Case, tmp_path: Path) -> None:
+    """Whatever it has learned in a few steps, it keeps bounds, ramps and P_0."""
+    run_example("import learned_policy; learned_policy.train(steps=2, batch=4)", tmp_path)
+    code = """
+import ded_bench, learned_policy
+from ded_bench.problem.sampling import sample_instance
+case = ded_bench.Case.load("9bus")
+instance = sample_instance(case, 1_500_000, 0)
+verdict = ded_bench.score(instance, learned_policy.solve(instance, "NO", case), "NO")
+assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8, verdict
+"""
+    run_example(code, tmp_path)
+
+
+def test_model_predictive_control(tmp_path: Path) -> None:
+    """It keeps every limit in TO, and costs within a per cent of the linear programs; asked again, too."""
+    code = """
+import ded_bench, do_mpc_dispatch
+from ded_bench.problem.sampling import sample_instance
+case = ded_bench.Case.load("9bus")
+instance = sample_instance(case, 1_500_000, 0)
+mine = do_mpc_dispatch.solve(instance, "TO", case)
+theirs = ded_bench.solve(instance, "ded-slp", "TO").schedule
+verdict, other = (ded_bench.score(instance, s, "TO") for s in (mine, theirs))
+assert verdict.feasible, verdict
+assert verdict.objective < 1.01 * other.objective, (verdict, other)
+again = do_mpc_dispatch.solve(instance, "TO", case)
+assert abs(again.p - mine.p).max() < 1e-6
+"""
+    run_example(code, tmp_path)

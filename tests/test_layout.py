@@ -18,7 +18,7 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 PACKAGE = Path(ded_bench.__file__).parent
 FLOORS = (
     *("files", "problem", "plants", "solvers", "results", "surrogates", "methods", "run", "analysis"),
-    *("report", "cli"),
+    *("report", "learning", "gym", "cli"),
 )
 #: Twelve hexadecimal digits or more.
 FINGERPRINT = re.compile(r"\b[0-9a-f]{12,}\b")

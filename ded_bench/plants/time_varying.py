@@ -240,6 +240,45 @@ class TimeVarying:
         start, end = on_input * (count - risen)[:, None], on_input * risen[:, None]
         return LocalRows(rows.interval, rows.x[:, 0], rows.start[:, 0] + start, rows.end[:, 0] + end)
 
+    def gradient(self, by_omega: Array, by_p_slack: Array, by_p_gen: Array) -> Array:
+        """Derivatives of any function of the outputs by the set-points at the knots, by the adjoint.
+
+        Args:
+            by_omega: its derivatives by ω at all grid points, shape (n_points, n_gen).
+            by_p_slack: by P_s, shape (n_points,).
+            by_p_gen: by what generators deliver, shape (n_points, n_gen).
+
+        Returns:
+            Shape (n_knots, n_gen).
+        """
+        length, owner = self.lengths, self._intervals
+        on_state, on_input = by_p_slack[:, None] * self.slack[owner], by_p_gen.copy()
+        for j, k in enumerate(map(slice, self.points[:-1], [*self.points[1:-1], len(owner)])):
+            if isinstance(self.speed, slice):
+                on_state[k, self.speed] += by_omega[k]
+            else:
+                on_state[k] += by_omega[k] @ self.speed[j]
+            if self.delivered is not None:
+                on_state[k] += by_p_gen[k] @ self.delivered.c[j]
+                on_input[k] = by_p_gen[k] @ self.delivered.d[j]
+
+        def add(r: int, costate: Array) -> None:
+            here = np.flatnonzero(r < np.append(length[:-1], length[-1] + 1))
+            costate[here, 0] += on_state[self.points[here] + r]
+
+        rows = self._costates(1, add)
+        later = ((np.arange(len(owner)) - self.points[owner]) / length[owner])[:, None]
+        found = np.zeros_like(self.p_gen)
+        np.add.at(found, owner, (1.0 - later) * on_input)
+        np.add.at(found, owner + 1, later * on_input)
+        costate = np.zeros(self.slack.shape[1])
+        for j in reversed(range(len(length))):
+            slope = costate @ self.across.h[j] / length[j]
+            found[j + 1] += slope + rows.end[j, 0]
+            found[j] += costate @ self.across.g[j] - slope + rows.start[j, 0]
+            costate = costate @ self.across.f[j] + rows.x[j, 0]
+        return found
+
     def _costates(self, n_rows: int, add: Callable[[int, Array], None]) -> LocalRows:
         """The adjoint recursion through all intervals at once, `n_rows` weighted sums in each.
 

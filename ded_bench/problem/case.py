@@ -272,6 +272,14 @@ class Case(Fingerprinted, Extended):
             raise InputError(f"case {self.id}", f"regimes.{regime}", problem)
         return 2 * np.pi * limits.omega_hz
 
+    def casadi(self, plant: str | None = None) -> Any:
+        """The equations of its plant, or of another, as CasADi expressions: a `learning.CasadiModel`.
+
+        Raises:
+            InputError: there is no such plant, or its equations are not known to CasADi.
+        """
+        return importlib.import_module("ded_bench.learning").casadi_model(self, plant)
+
     def check_regimes(self, regimes: Iterable[str]) -> None:
         """Raise InputError unless the case knows every one of the regimes."""
         for regime in regimes:

@@ -1,0 +1,120 @@
+"""Linear models along a trajectory, as NumPy arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ded_bench.plants.plant import Plant, plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.plants.time_varying import Indices, TimeVarying
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
+from ded_bench.surrogates.condensed import hat_functions
+
+#: Slopes are those of intervals of this length, s: gradients are then right to a ten-thousandth.
+INTERVAL_S = 0.1
+#: How far a time may be from a grid point that it is at, in steps.
+BETWEEN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedMap:
+    """ω ≈ omega + d_omega · (P - p) and P_s ≈ p_slack + d_p_slack · (P - p), P being a schedule's powers."""
+
+    t: Array  # (n_t,), s
+    p: Array  # of the schedule along whose trajectory it holds, (n_knots, n_gen), pu
+    omega: Array  # of that trajectory, (n_t, n_gen), rad/s
+    p_slack: Array  # (n_t,), pu
+    d_omega: Array  # (n_t, n_gen, n_knots, n_gen), rad/s per pu
+    d_p_slack: Array  # (n_t, n_knots, n_gen)
+
+
+def linearise(
+    case: Case,
+    instance: Instance,
+    schedule: Schedule,
+    plant: Plant | None = None,
+    interval_s: float = INTERVAL_S,
+) -> TimeVarying:
+    """Simulate a schedule and linearise the plant along it: x⁺ = f x + g u + h Δu from point to point.
+
+    Knots of the model lie `interval_s` apart, and where the schedule has rows or secondary control acts.
+
+    Raises:
+        SimulationError: the plant cannot follow the schedule.
+        InputError: as `simulate`.
+    """
+    plant = plant or plant_of(case)
+    trajectory = simulate(case, instance, schedule, plant)
+    return linearised_along(plant, instance, schedule, trajectory, interval_s)
+
+
+def linearised_along(
+    plant: Plant, instance: Instance, schedule: Schedule, trajectory: Trajectory, interval_s: float
+) -> TimeVarying:
+    """As `linearise`, along a trajectory of the schedule."""
+    return plant.linearise_along(trajectory, _points(plant.case, instance, schedule, interval_s))
+
+
+def from_schedule(model: TimeVarying, instance: Instance, schedule: Schedule) -> Array:
+    """Powers at the model's knots by those at the schedule's rows, (n_model_knots, n_knots)."""
+    return hat_functions(instance.grid[model.points], schedule.t)
+
+
+def condense(
+    case: Case,
+    instance: Instance,
+    schedule: Schedule,
+    plant: Plant | None = None,
+    interval_s: float = INTERVAL_S,
+) -> CondensedMap:
+    """The linear map from a schedule's powers to frequencies and the slack's power, along its trajectory.
+
+    Its times are the knots of `linearise`.
+
+    Raises:
+        SimulationError: the plant cannot follow the schedule.
+        InputError: as `simulate`.
+    """
+    model = linearise(case, instance, schedule, plant, interval_s)
+    hats, n_gen = from_schedule(model, instance, schedule), len(case.generators)
+    # Columns: the knot, then the generator, of which one is moved.
+    moved = np.einsum("jk,gi->jgki", hats, np.eye(n_gen)).reshape(len(hats), n_gen, -1)
+    x, states = np.zeros((model.across.f.shape[1], moved.shape[2])), []
+    for j, length in enumerate(model.lengths):
+        states.append(x)
+        driven = model.across.g[j] @ moved[j] + model.across.h[j] @ (moved[j + 1] - moved[j]) / length
+        x = model.across.f[j] @ x + driven
+    states.append(x)
+    shape = len(schedule.t), n_gen
+    model_at = [*range(len(model.lengths)), len(model.lengths) - 1]  # the last point is of the last interval
+    if isinstance(model.speed, slice):
+        d_omega = np.array([x[model.speed] for x in states])
+    else:
+        d_omega = np.array([model.speed[j] @ x for j, x in zip(model_at, states, strict=True)])
+    d_slack = np.array([model.slack[j] @ x for j, x in zip(model_at, states, strict=True)])
+    return CondensedMap(
+        t=instance.grid[model.points],
+        p=schedule.p,
+        omega=model.omega[model.points],
+        p_slack=model.p_slack[model.points],
+        d_omega=d_omega.reshape(-1, n_gen, *shape),
+        d_p_slack=d_slack.reshape(-1, *shape),
+    )
+
+
+def _points(case: Case, instance: Instance, schedule: Schedule, interval_s: float) -> Indices:
+    """Grid points of a model's knots, strictly increasing from the first to the last."""
+    dt_s, last = instance.dt_s, instance.steps
+    times = [np.arange(0.0, instance.horizon_s, interval_s), schedule.t]
+    if (agc := case.agc) is not None:
+        given = instance.initial.agc
+        first = agc.period_s if given is None or given.next_s is None else given.next_s
+        times.append(np.arange(first, instance.horizon_s, agc.period_s))
+    places = np.concatenate(times) / dt_s  # a row between grid points is a bend at both of them
+    both = np.concatenate([np.floor(places + BETWEEN), np.ceil(places - BETWEEN), [last]]).astype(np.intp)
+    return np.unique(np.clip(both, 0, last))

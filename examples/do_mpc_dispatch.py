@@ -1,0 +1,64 @@
+"""Nonlinear model predictive control by do-mpc, with the equations of `case.casadi()`, as one's own method.
+
+pip install do-mpc
+ded-bench solve --method do_mpc_dispatch:solve --regime TO --limit 2 --out results/mine
+ded-bench online --method do_mpc_dispatch:solve --regime TO --limit 1 --out results/mine
+"""
+
+import warnings
+from functools import cache
+
+import casadi
+import numpy as np
+
+from ded_bench import Schedule
+
+with warnings.catch_warnings():  # on packages that it can do without
+    warnings.simplefilter("ignore")
+    import do_mpc
+
+
+@cache
+def controller(case, regime):
+    """Collocation once a second, enough where modes are slow; set-points are states, their ramps inputs."""
+    plant, model, now = case.casadi(), do_mpc.model.Model("continuous", "SX"), {}
+    x, p = (model.set_variable("_x", name, of.shape) for name, of in (("x", plant.x), ("p", plant.u)))
+    z, ramp = model.set_variable("_z", "z", plant.z.shape), model.set_variable("_u", "ramp", plant.u.shape)
+    load = model.set_variable("_tvp", "load", plant.p_load.shape)
+    price = model.set_variable("_tvp", "price", (len(case.generators) + 1, 1))
+    ode, alg, _, p_gen, p_slack = plant.function(x, z, p, load, casadi.SX.zeros(plant.p.shape))
+    model.set_rhs("x", ode)
+    model.set_rhs("p", ramp)
+    model.set_alg("alg", alg)
+    model.set_expression("paid", casadi.dot(price, casadi.vertcat(p_gen, casadi.sqrt(p_slack**2 + 1e-6))))
+    y, limit, _ = plant.monitored(regime)
+    y = casadi.Function("y", [plant.x], [y / (0.99 * limit)])(x)  # some room between the points
+    model.set_expression("y", casadi.vertcat(y, -y))
+    model.setup()
+    mpc = do_mpc.controller.MPC(model)
+    mpc.settings.n_horizon, mpc.settings.t_step = round(case.sampling.horizon_s), 1.0
+    mpc.settings.collocation_deg, mpc.settings.supress_ipopt_output = 3, True
+    mpc.set_objective(mterm=casadi.SX(0), lterm=model.aux["paid"])
+    mpc.set_rterm(ramp=0.0)
+    mpc.set_nl_cons("y", model.aux["y"], ub=1.0, soft_constraint=True, penalty_term_cons=1e3)
+    mpc.bounds["lower", "_x", "p"], mpc.bounds["upper", "_x", "p"] = case.p_min, case.p_max
+    mpc.bounds["lower", "_u", "ramp"], mpc.bounds["upper", "_u", "ramp"] = -case.ramp, case.ramp
+    known = mpc.get_tvp_template()
+    now["known"] = known
+    mpc.set_tvp_fun(lambda _: now["known"])
+    mpc.setup()
+    return mpc, plant, known, now
+
+
+def solve(instance, regime, case):
+    """Answer one instance, or one moment of the closed loop."""
+    mpc, plant, known, now = controller(case, regime)
+    t = np.arange(mpc.settings.n_horizon + 1.0)
+    known["_tvp", :, "load"] = list(instance.p_load(case, t))
+    known["_tvp", :, "price"] = [np.append(instance.cost_gen(case), instance.cost_slack(case))] * len(t)
+    (x, z, _), now["known"] = plant.start(instance), known
+    mpc.reset_history()
+    mpc.x0, mpc.z0 = np.concatenate([x, instance.p_initial(case)]), z
+    mpc.set_initial_guess()
+    mpc.make_step(mpc.x0)
+    return Schedule(t, mpc.data.prediction(("_x", "p"))[:, :, 0].T)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import command, counted, declare, natural, positive, say
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.methods.options import described
 from ded_bench.methods.registry import Method, get_method, registered
 from ded_bench.problem.benchmark import (
@@ -45,6 +45,15 @@ def add_commands(commands: Any) -> None:
     p = command(commands, "path", "print the folder of a shipped case")
     p.add_argument("case", help="its name")
     p.set_defaults(run=_path)
+
+    p = command(commands, "import", "make a case of a MATPOWER grid")
+    p.add_argument("file", type=Path, help="MATPOWER case (.m); parsed, never executed")
+    p.add_argument(
+        "--dynamics", type=Path, required=True, metavar="FILE", help="bus,h,xd1 as CSV, or PSS/E dyr"
+    )
+    p.add_argument("--like", help="case with the ranges, regimes and ramp limit; default: of similar size")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="the case's folder, and its name")
+    p.set_defaults(run=_import)
 
     p = command(commands, "methods", "list methods, their options and defaults")
     p.add_argument("name", nargs="?", metavar="NAME", help="only this one; default: all")
@@ -141,6 +150,28 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
 def _path(a: argparse.Namespace) -> int:
     Case.load(a.case)
     print(case_file(a.case).resolve().parent)
+    return 0
+
+
+def _import(a: argparse.Namespace) -> int:
+    from ded_bench.analysis.matpower_case import imported
+    from ded_bench.plants.plant import SimulationError
+
+    path = a.out / "case.json"
+    if path.exists():
+        raise InputError(path, "", "is there already")
+    try:
+        case = imported(a.file, a.dynamics, a.out.resolve().name, Case.load(a.like) if a.like else None)
+    except SimulationError as error:
+        print(f"ded-bench: {a.file}: the lossless grid has no equilibrium: {error}", file=sys.stderr)
+        return 1
+    write_record(case, path)
+    assert isinstance(case.source, dict)
+    print(
+        f"case {case.id} in {a.out}: {len(case.machines)} generators, slack {case.slack}, {case.n_bus} buses"
+    )
+    print(f"{case.source['conversion'].partition('; ')[2]}; knots {case.knots}")
+    print(f"next: ded-bench cases {a.out}")
     return 0
 
 

@@ -1,0 +1,292 @@
+"""A lossless case (case/2) of a MATPOWER grid and its machines' dynamics, by the rules of docs/grids.md."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import string
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ded_bench.analysis.inspect_case import suggested_knots
+from ded_bench.files.errors import InputError
+from ded_bench.files.matpower import read_matpower
+from ded_bench.files.strict import parse_record, read_text
+from ded_bench.files.table import records
+from ded_bench.plants.plant import plant_of
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.grid_files import BASE_MVA
+from ded_bench.problem.lossless_case import LosslessCase
+from ded_bench.problem.quantities import Array
+from ded_bench.problem.sampling import rounded
+
+Complex = NDArray[np.complex128]
+
+#: What is assumed of every machine, as on the shipped grids: d / m, 1/s.
+DAMPING = 0.3
+#: Newton's method ends at this mismatch, pu, and gives up after so many steps.
+MISMATCH, NEWTON_STEPS = 1e-10, 30
+#: Where H and x'd stand among the numbers of a PSS/E dyr record, by its model.
+DYR = {"GENROU": (4, 8), "GENROE": (4, 8), "GENSAL": (3, 7), "GENSAE": (3, 7)}
+#: Columns of MATPOWER's matrices that are read.
+COLUMNS = {
+    "baseMVA": [0],
+    "bus": range(9),
+    "gen": [0, 1, 2, 5, 6, 7, 8, 9],
+    "branch": [0, 1, 2, 3, 4, 8, 9, 10],
+}
+#: Columns of a CSV file of dynamics: those that are needed, and others.
+NEEDED, OPTIONAL = ("bus", "h", "xd1"), ("mva", "p_min", "p_max", "ramp_pu_per_s")
+
+
+class MatpowerGrid(NamedTuple):
+    """What is in service of a MATPOWER file."""
+
+    path: str | Path
+    base_mva: float
+    bus: Array
+    gen: Array
+    branch: Array
+    places: dict[int, int]  # rows of the buses by their numbers
+
+    @property
+    def reference(self) -> int:
+        """Number of the reference bus."""
+        return int(self.bus[self.bus[:, 1] == 3, 0][0])
+
+
+class Unit(NamedTuple):
+    """A machine in service, powers and limits on 100 MVA."""
+
+    bus: int
+    name: str
+    power: complex
+    mva: float
+    h: float  # s, on its own base; likewise x'd, pu
+    xd1: float
+    p_min: float
+    p_max: float
+    ramp: float | None
+
+
+def imported(path: str | Path, dynamics: str | Path, name: str, like: Case | None = None) -> LosslessCase:
+    """Make a case.
+
+    Args:
+        path: MATPOWER file; it is parsed, not executed.
+        dynamics: CSV with columns bus, h (s), xd1 (pu), both on the machine's base, and perhaps mva, p_min
+            and p_max (pu of 100 MVA), ramp_pu_per_s; machines at one bus in the order of the MATPOWER file.
+            Or a PSS/E dyr file with GENROU, GENROE, GENSAL or GENSAE records.
+        name: id of the case.
+        like: gives nominal frequency, ramp limit, regimes and the sampler's ranges; None: see `alike`.
+
+    Raises:
+        InputError: a file is wrong, or a machine lacks data; it is named.
+        SimulationError: the lossless network has no equilibrium at nominal powers.
+    """
+    grid, known = _grid(path), _dynamics(dynamics)
+    voltage, generated = _power_flow(grid)
+    units = _units(grid, dynamics, known, generated)
+    like = alike(len(grid.bus) + len(units)) if like is None else like
+    data = _record(grid, name, like, units, voltage)
+    case = parse_record(LosslessCase, json.dumps(data), path)
+    fastest = float(np.abs(plant_of(case).nominal().modes).max()) / (2 * np.pi)
+    return parse_record(LosslessCase, json.dumps(data | {"knots": suggested_knots(case, fastest)}), path)
+
+
+def alike(n_bus: int) -> Case:
+    """The shipped physical lossless case with the most similar number of buses."""
+    cases = map(Case.load, sorted(SHIPPED_CASES.glob("*/case.json")))
+    lossless = [case for case in cases if case.schema_ == "ded-bench/case/2"]
+    return min(lossless, key=lambda case: abs(math.log(case.n_bus / n_bus)))
+
+
+def _grid(path: str | Path) -> MatpowerGrid:
+    found = read_matpower(path)
+    for name, columns in COLUMNS.items():
+        if name not in found or found[name].shape[1] <= max(columns) or not len(found[name]):
+            raise InputError(path, f"mpc.{name}", f"is needed, with {max(columns) + 1} columns or more")
+        if not np.isfinite(found[name][:, columns]).all():
+            raise InputError(path, f"mpc.{name}", "has a value that is not finite")
+    bus = found["bus"][found["bus"][:, 1] != 4]
+    branch, gen = found["branch"][found["branch"][:, 10] > 0], found["gen"][found["gen"][:, 7] > 0]
+    places = {int(row[0]): i for i, row in enumerate(bus)}
+    if len(places) < len(bus) or not np.isin([*gen[:, 0], *branch[:, :2].flat], bus[:, 0]).all():
+        problem = "two have the same number, or one of a branch or machine is missing"
+        raise InputError(path, "mpc.bus", problem)
+    if list(bus[:, 1]).count(3) != 1 or not (gen[:, 0] == bus[bus[:, 1] == 3, 0]).any():
+        raise InputError(path, "mpc.bus", "exactly one reference bus (type 3) with a machine is needed")
+    return MatpowerGrid(path, float(found["baseMVA"][0, 0]), bus, gen, branch, places)
+
+
+def _dynamics(path: str | Path) -> dict[int, list[dict[str, float]]]:
+    """Data of machines by bus, in the order of the file."""
+    found: dict[int, list[dict[str, float]]] = {}
+    for place, cells in (_of_dyr if Path(path).suffix.lower() == ".dyr" else _of_csv)(path):
+        one = _numbers(path, place, cells)
+        if not set(NEEDED) <= one.keys():
+            raise InputError(path, place, f"needs {', '.join(NEEDED)}")
+        found.setdefault(int(one["bus"]), []).append(one)
+    return found
+
+
+def _of_dyr(path: str | Path) -> Iterator[tuple[str, dict[str, str]]]:
+    for record in re.split(r"/[^\n]*", read_text(path)):  # what follows a record is a comment
+        words = re.sub(r"['\",]", " ", record).split()
+        if len(words) > 2 and (columns := DYR.get(words[1].upper())):
+            values = zip(
+                NEEDED, (words[0], *(words[3 + c] for c in columns if 3 + c < len(words))), strict=False
+            )
+            yield f"{words[1]} of bus {words[0]}", dict(values)
+
+
+def _of_csv(path: str | Path) -> Iterator[tuple[str, dict[str, str]]]:
+    (_, header), *lines = records(read_text(path), path) or [(0, [])]
+    header = [cell.strip() for cell in header]
+    if missing := [name for name in NEEDED if name not in header]:
+        raise InputError(path, missing[0], f"required column is missing (needed: {', '.join(NEEDED)})")
+    if unknown := [name for name in header if name not in NEEDED + OPTIONAL]:
+        raise InputError(path, unknown[0][:40], f"unknown column (known: {', '.join(NEEDED + OPTIONAL)})")
+    for line, cells in lines:
+        if len(cells) != len(header):
+            raise InputError(path, f"line {line}", f"{len(cells)} values for {len(header)} columns")
+        yield f"line {line}", {n: cell for n, cell in zip(header, cells, strict=True) if cell.strip()}
+
+
+def _numbers(path: str | Path, place: str, cells: dict[str, str]) -> dict[str, float]:
+    found = {}
+    for name, cell in cells.items():
+        try:
+            found[name] = float(cell)
+        except ValueError:
+            found[name] = math.nan
+        if not math.isfinite(found[name]) or (name in ("h", "xd1", "mva") and found[name] <= 0):
+            what = "a number" if name in ("bus", "p_min", "p_max") else "a positive number"
+            raise InputError(path, f"{place}, {name}", f"{cell[:20]!r} is not {what}")
+    return found
+
+
+def _power_flow(grid: MatpowerGrid) -> tuple[Complex, Complex]:
+    """Voltages, and powers generated at the buses, of the solved AC power flow, pu of 100 MVA."""
+    path, base, bus, gen, branch, places = grid
+    n, scale = len(bus), base / BASE_MVA
+    y = np.zeros((n, n), dtype=np.complex128)
+    y[np.diag_indices(n)] = (bus[:, 4] + 1j * bus[:, 5]) / BASE_MVA
+    for row in branch:
+        i, j = places[int(row[0])], places[int(row[1])]
+        if row[2] == row[3] == 0:
+            raise InputError(path, f"mpc.branch {row[0]:g}-{row[1]:g}", "has no impedance")
+        series, half = scale / complex(row[2], row[3]), 0.5j * row[4] * scale
+        tap = (row[8] or 1.0) * np.exp(1j * np.radians(row[9]))
+        y[i, i] += (series + half) / abs(tap) ** 2
+        y[j, j] += series + half
+        y[i, j] -= series / np.conj(tap)
+        y[j, i] -= series / tap
+    drawn, size = (bus[:, 2] + 1j * bus[:, 3]) / BASE_MVA, bus[:, 7].copy()
+    wanted = -drawn
+    for row in gen:
+        wanted[places[int(row[0])]] += (row[1] + 1j * row[2]) / BASE_MVA
+        size[places[int(row[0])]] = row[5]
+    held = np.isin(bus[:, 0], gen[:, 0]) & (bus[:, 1] != 1)
+    angle, load = np.flatnonzero(bus[:, 1] != 3), np.flatnonzero(~held)
+    v = np.where(held, size, bus[:, 7]) * np.exp(1j * np.radians(bus[:, 8]))
+    for _ in range(NEWTON_STEPS):
+        current = y @ v
+        off = v * np.conj(current) - wanted
+        mismatch = np.concatenate([off.real[angle], off.imag[load]])
+        if np.abs(mismatch).max() < MISMATCH:
+            return v, v * np.conj(current) + drawn
+        unit = v / np.abs(v)
+        by_angle = 1j * v[:, None] * np.conj(np.diag(current) - y * v)
+        by_size = v[:, None] * np.conj(y * unit) + np.diag(np.conj(current) * unit)
+        rows = np.hstack([by_angle[:, angle], by_size[:, load]])
+        try:
+            step = np.linalg.solve(np.vstack([rows.real[angle], rows.imag[load]]), mismatch)
+        except np.linalg.LinAlgError:
+            break
+        turn, grow = np.zeros(n), np.zeros(n)
+        turn[angle], grow[load] = step[: len(angle)], step[len(angle) :]
+        v = (np.abs(v) - grow) * np.exp(1j * (np.angle(v) - turn))
+        if not np.isfinite(v).all():
+            break
+    raise InputError(path, "mpc", "the AC power flow has no solution from the voltages given")
+
+
+def _units(
+    grid: MatpowerGrid, dynamics: str | Path, known: dict[int, list[dict[str, float]]], generated: Complex
+) -> list[Unit]:
+    """Machines in service; those of a bus share its reactive power by rating, its first one balances."""
+    by_bus: dict[int, list[Array]] = {}
+    for row in grid.gen:
+        by_bus.setdefault(int(row[0]), []).append(row)
+    if missing := [number for number, rows in by_bus.items() if len(known.get(number, [])) < len(rows)]:
+        buses = ", ".join(map(str, missing[:10])) + (" ..." if len(missing) > 10 else "")
+        raise InputError(dynamics, "h, xd1", f"are needed of every machine in service, also at bus {buses}")
+    units = []
+    for number, rows in by_bus.items():
+        own, total = known[number], generated[grid.places[number]]
+        rating = [one.get("mva", float(row[6])) for one, row in zip(own, rows, strict=False)]
+        if min(rating) <= 0:
+            raise InputError(dynamics, "mva", f"is needed of the machine at bus {number}")
+        p = [float(row[1]) / BASE_MVA for row in rows]
+        p[0] += float(total.real) - sum(p)
+        for k, (one, row) in enumerate(zip(own, rows, strict=False)):
+            letter = string.ascii_lowercase[k] if len(rows) > 1 else ""
+            power = complex(p[k], float(total.imag) * rating[k] / sum(rating))
+            low, high = (one.get(n, float(row[c]) / BASE_MVA) for n, c in (("p_min", 9), ("p_max", 8)))
+            given = f"g{number}{letter}", power, rating[k], one["h"], one["xd1"], low, high
+            units.append(Unit(number, *given, one.get("ramp_pu_per_s")))
+    return units
+
+
+def _record(
+    grid: MatpowerGrid, name: str, like: Case, units: Sequence[Unit], voltage: Complex
+) -> dict[str, Any]:
+    """The case's file, without knots."""
+    buses, lines, machines = [], [], {}
+    slack = next(unit for unit in units if unit.bus == grid.reference)
+    for row, v in zip(grid.bus, np.abs(voltage), strict=True):
+        load = {"p_nominal": _plain(-row[2] / BASE_MVA)} if row[2] else {}
+        buses.append({"id": f"{row[0]:.0f}", "kind": "load" if load else "junction", "v": _plain(v), **load})
+    for row in grid.branch:
+        factor = (row[8] or 1.0) * BASE_MVA / grid.base_mva
+        ends = {"from": f"{row[0]:.0f}", "to": f"{row[1]:.0f}"}
+        if row[3] <= 0 or row[2] < 0:
+            where = f"mpc.branch {ends['from']}-{ends['to']}"
+            raise InputError(grid.path, where, "needs r of at least 0 and x above 0 in a lossless network")
+        lines.append({**ends, "r": _plain(row[2] * factor), "x": _plain(row[3] * factor)})
+    for unit in units:
+        x, v = unit.xd1 * BASE_MVA / unit.mva, abs(voltage[grid.places[unit.bus]])
+        internal = abs(v + 1j * x * np.conj(unit.power) / v)
+        kind = "slack" if unit is slack else "generator"
+        buses.append({"id": unit.name, "kind": kind, "v": _plain(internal)})
+        lines.append({"from": str(unit.bus), "to": unit.name, "r": 0.0, "x": _plain(x)})
+        if unit is slack:
+            continue
+        p = unit.power.real
+        if not unit.p_min <= p <= unit.p_max or unit.p_min >= unit.p_max:
+            within = f"{unit.p_min:g} to {unit.p_max:g}"
+            problem = f"{p:g} pu is not within its limits, {within}; the dynamics may give p_min, p_max"
+            raise InputError(grid.path, f"machine at bus {unit.bus}", problem)
+        m = 2 * unit.h * unit.mva / (2 * np.pi * like.f0_hz * BASE_MVA)
+        machine = {"m": m, "d": DAMPING * m, "p_nominal": p, "p_min": unit.p_min, "p_max": unit.p_max}
+        machine |= {} if unit.ramp is None else {"ramp_pu_per_s": unit.ramp}
+        machines[unit.name] = {key: _plain(value) for key, value in machine.items()}
+    source = {
+        "data": f"{Path(grid.path).name}, dynamics of its machines",
+        "conversion": f"ded-bench import; assumed: d / m = {DAMPING:g} 1/s; frequency, ramp limit, "
+        f"regimes and sampling as in {like.id}",
+    }
+    kept = {"f0_hz", "ramp_pu_per_s", "regimes", "sampling"}
+    data: dict[str, Any] = {"schema": like.schema_, "id": name, "source": source}
+    data |= json.loads(like.model_dump_json(by_alias=True, include=kept))
+    return data | {"buses": buses, "lines": lines, "machines": machines}
+
+
+def _plain(value: float) -> float:
+    return float(rounded(np.array(value)))

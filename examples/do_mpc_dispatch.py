@@ -5,17 +5,13 @@ ded-bench solve --method do_mpc_dispatch:solve --regime TO --limit 2 --out resul
 ded-bench online --method do_mpc_dispatch:solve --regime TO --limit 1 --out results/mine
 """
 
-import warnings
 from functools import cache
 
 import casadi
+import do_mpc
 import numpy as np
 
 from ded_bench import Schedule
-
-with warnings.catch_warnings():  # on packages that it can do without
-    warnings.simplefilter("ignore")
-    import do_mpc
 
 
 @cache
@@ -37,7 +33,8 @@ def controller(case, regime):
     model.setup()
     mpc = do_mpc.controller.MPC(model)
     mpc.settings.n_horizon, mpc.settings.t_step = round(case.sampling.horizon_s), 1.0
-    mpc.settings.collocation_deg, mpc.settings.supress_ipopt_output = 3, True
+    mpc.settings.collocation_deg, mpc.settings.store_full_solution = 3, True
+    mpc.settings.supress_ipopt_output()
     mpc.set_objective(mterm=casadi.SX(0), lterm=model.aux["paid"])
     mpc.set_rterm(ramp=0.0)
     mpc.set_nl_cons("y", model.aux["y"], ub=1.0, soft_constraint=True, penalty_term_cons=1e3)

@@ -50,10 +50,10 @@ def run_example(code: str, folder: Path) -> None:
 
 def test_a_policy_learns_through_the_plant(ninebus: Case, tmp_path: Path) -> None:
     """Whatever it has learned in a few steps, it keeps bounds, ramps and P_0."""
-    run_example("import learned_policy; learned_policy.train(steps=2, batch=4)", tmp_path)
     code = """
 import ded_bench, learned_policy
 from ded_bench.problem.sampling import sample_instance
+learned_policy.train(steps=2, batch=4)
 case = ded_bench.Case.load("9bus")
 instance = sample_instance(case, 1_500_000, 0)
 verdict = ded_bench.score(instance, learned_policy.solve(instance, "NO", case), "NO")

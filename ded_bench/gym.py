@@ -6,6 +6,7 @@ Importing this module registers `ded_bench/<case>-<regime>-v0` of every shipped 
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any, cast
@@ -22,7 +23,7 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import LARGEST_DEVIATION_HZ, Instance, State
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.quantities import Array
-from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
+from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
 
@@ -85,7 +86,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         largest_hz = self.case.regimes[regime].largest_hz
         self.price = step_cost / largest_hz if price is None else price
         self.action_space = Box(-1.0, 1.0, (len(self.case.generators),), np.float32)
-        seen = self.plant.observed(self.plant.initial(self._drawn(POLICY_SEED)))
+        seen = self.plant.observed(self._drawn(POLICY_SEED)[1])
         ends = _ends(self.case, seen)
         self._spaces: dict[str, Any] = {
             name: Box(low.astype(np.float32), high.astype(np.float32)) for name, (low, high) in ends.items()
@@ -109,11 +110,14 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         if given is not None:
             given.check_case(self.case)
         master = POLICY_SEED + int(self.np_random.integers(VALIDATION_SEED - POLICY_SEED))
-        self.instance: Instance = self._drawn(master) if given is None else given
+        self.instance: Instance
+        self._state: PlantState
+        self.instance, self._state = (
+            self._drawn(master) if given is None else (given, self.plant.initial(given))
+        )
         instance, n_gen = self.instance, len(self.case.generators)
         self._cost = instance.cost_gen(self.case), instance.cost_slack(self.case)
         self._loads, self._now = instance.p_load(self.case), 0
-        self._state: PlantState = self.plant.initial(instance)
         self._omega, self._p_set, self._p_gen = np.zeros((3, instance.steps + 1, n_gen))
         self._p_slack, self._agc = np.zeros((2, instance.steps + 1))
         self._p_set[0] = instance.p_initial(self.case)
@@ -157,8 +161,12 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             }
         return self._observation(), -cost - self.price * excess, ended, False, info
 
-    def _drawn(self, master: int) -> Instance:
-        return sample_instance(self.case, master, 0, servable)
+    def _drawn(self, master: int) -> tuple[Instance, PlantState]:
+        """The first draw that the plant, which need not be the case's own, can begin with."""
+        for instance in sample_instances(self.case, master, ATTEMPTS, servable=servable):
+            with contextlib.suppress(SimulationError):
+                return instance, self.plant.initial(instance)
+        raise InputError(f"case {self.case.id}", "plant", f"{self.plant.name} can begin with no draw")
 
     def _moved(self, action: Array, first: int, last: int) -> Array:
         """Set-points at the end of a step, (n_gen,), pu."""

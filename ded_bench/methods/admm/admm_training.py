@@ -7,6 +7,7 @@ distribution's mean averages that out; the policy keeps the one with the least l
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
@@ -31,7 +32,6 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
-from ded_bench.problem.schedule import Schedule
 
 #: Weights fit every grid: training may start from another's.
 TAKES_START = True
@@ -280,12 +280,8 @@ def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy
 
 
 def _feasible_share(policy: AdmmPolicy, instances: Sequence[Instance]) -> float:
-    pairs = zip(instances, policy(instances), strict=True)
-    return sum(_feasible(policy.scope, *pair) for pair in pairs) / len(instances)
-
-
-def _feasible(scope: Scope, instance: Instance, schedule: Schedule) -> bool:
-    try:
-        return score(scope.case, instance, schedule, scope.regime).feasible
-    except SimulationError:
-        return False
+    case, regime, found = policy.scope.case, policy.scope.regime, 0
+    for instance, schedule in zip(instances, policy(instances), strict=True):
+        with contextlib.suppress(SimulationError):
+            found += score(case, instance, schedule, regime).feasible
+    return found / len(instances)

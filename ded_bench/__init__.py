@@ -135,10 +135,11 @@ def simulate(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import simulate
+    from ded_bench.plants.plant import as_plant
     from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
-    return simulate.simulate(own, instance, as_schedule(schedule, own), _plant_of(own, plant))
+    return simulate.simulate(own, instance, as_schedule(schedule, own), as_plant(own, plant))
 
 
 def simulate_many(
@@ -166,7 +167,7 @@ def simulate_many(
         InputError: there are not as many instances as schedules, or the case or plant is unknown.
     """
     from ded_bench.files.errors import InputError
-    from ded_bench.plants.plant import plant_of
+    from ded_bench.plants.plant import as_plant
     from ded_bench.plants.simulate import in_threads
     from ded_bench.problem.instance import Instance
 
@@ -176,7 +177,7 @@ def simulate_many(
     if not many:
         return []
     own = _case_of(many[0], case)
-    chosen = _plant_of(own, plant) or plant_of(own)
+    chosen = as_plant(own, plant)
     return in_threads(lambda pair: simulate(*pair, own, chosen), zip(many, schedules, strict=True), threads)
 
 
@@ -201,10 +202,11 @@ def score(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import score
+    from ded_bench.plants.plant import as_plant
     from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
-    return score.score(own, instance, as_schedule(schedule, own), regime, _plant_of(own, plant))
+    return score.score(own, instance, as_schedule(schedule, own), regime, as_plant(own, plant))
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:
@@ -216,12 +218,6 @@ def _case_of(instance: Instance, case: Case | None) -> Case:
     if not (SHIPPED_CASES / instance.case / "case.json").is_file():
         raise InputError(f"instance {instance.id}", "case", f"{instance.case!r} is no shipped case: give it")
     return _shipped(instance.case)
-
-
-def _plant_of(case: Case, plant: str | Plant | None) -> Plant | None:
-    from ded_bench.plants.plant import plant_of
-
-    return plant_of(case, plant) if isinstance(plant, str) else plant
 
 
 @functools.cache

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import PlantState, SimulationError, plant_of, servable
+from ded_bench.plants.plant import Plant, PlantState, SimulationError, as_plant, servable
 from ded_bench.plants.score import AGC_COLUMN, Score, judge
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import LARGEST_DEVIATION_HZ, Instance, State
@@ -58,7 +58,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
     Args:
         case: a case, its folder, or the name of a shipped one.
         regime: one of the case's.
-        plant: its name; None: the case's own.
+        plant: its name, or a plant of the case; None: the case's own.
         price: of 1 Hz of excess in a step; None: an excess as large as the bound costs as much as nominal
             loads at the sampler's mean cost.
         render_mode: nothing is rendered.
@@ -73,12 +73,12 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         self,
         case: Case | str | Path,
         regime: str,
-        plant: str | None = None,
+        plant: str | Plant | None = None,
         price: float | None = None,
         render_mode: None = None,
     ) -> None:
         self.case = case if isinstance(case, Case) else Case.load(case)
-        self.regime, self.plant, self.render_mode = regime, plant_of(self.case, plant), render_mode
+        self.regime, self.plant, self.render_mode = regime, as_plant(self.case, plant), render_mode
         self._bounds = self.case.bounds(regime)
         ranges = self.case.sampling
         self._points = max(round(STEP_S / ranges.dt_s), 1)

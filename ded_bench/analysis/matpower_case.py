@@ -31,6 +31,8 @@ Complex = NDArray[np.complex128]
 DAMPING = 0.3
 #: Newton's method ends at this mismatch, pu, and gives up after so many steps.
 MISMATCH, NEWTON_STEPS = 1e-10, 30
+#: Matrices of more buses, which are full, would fill the memory.
+MOST_BUSES = 5000
 #: Where H and x'd stand among the numbers of a PSS/E dyr record, by its model.
 DYR = {"GENROU": (4, 8), "GENROE": (4, 8), "GENSAL": (3, 7), "GENSAE": (3, 7)}
 #: Columns of MATPOWER's matrices that are read.
@@ -114,6 +116,8 @@ def _grid(path: str | Path) -> MatpowerGrid:
         if not np.isfinite(found[name][:, columns]).all():
             raise InputError(path, f"mpc.{name}", "has a value that is not finite")
     bus = found["bus"][found["bus"][:, 1] != 4]
+    if len(bus) > MOST_BUSES:
+        raise InputError(path, "mpc.bus", f"has more than {MOST_BUSES} buses")
     branch, gen = found["branch"][found["branch"][:, 10] > 0], found["gen"][found["gen"][:, 7] > 0]
     places = {int(row[0]): i for i, row in enumerate(bus)}
     if len(places) < len(bus) or not np.isin([*gen[:, 0], *branch[:, :2].flat], bus[:, 0]).all():

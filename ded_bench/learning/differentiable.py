@@ -13,7 +13,7 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.learning.linear_maps import INTERVAL_S, from_schedule, linearised_along
-from ded_bench.plants.plant import Plant, SimulationError, plant_of
+from ded_bench.plants.plant import Plant, SimulationError, as_plant
 from ded_bench.plants.simulate import in_threads, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -82,7 +82,7 @@ def simulated(
     instances: Sequence[Instance],
     t: Array,
     power: torch.Tensor,
-    plant: Plant | None = None,
+    plant: str | Plant | None = None,
     interval_s: float = INTERVAL_S,
     threads: int | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -93,7 +93,7 @@ def simulated(
         instances: of the case, with the same grid of time.
         t: times of the schedules' rows, (n_knots,), s, from 0 to the horizon.
         power: set-points at them, (batch, n_knots, n_gen), pu; double precision tells small excesses apart.
-        plant: what is simulated; None: the case's own.
+        plant: its name, or a plant of the case; None: the case's own.
         interval_s: see `linearise`.
         threads: how many work at once; None: as many as there are cores.
 
@@ -110,8 +110,7 @@ def simulated(
         raise InputError("power", "", f"has the shape {tuple(power.shape)}, but needs {shape}")
     if len({(i.horizon_s, i.dt_s) for i in instances}) != 1:
         raise InputError("instances", "", "must be some, with the same grid of time")
-    own = plant or plant_of(case)
-    batch = _Runs(own, instances, np.asarray(t, dtype=np.float64), interval_s, threads)
+    batch = _Runs(as_plant(case, plant), instances, np.asarray(t, dtype=np.float64), interval_s, threads)
     omega, p_slack, p_gen = _SimulationLayer.apply(power, batch)  # type: ignore[no-untyped-call]
     return omega, p_slack, p_gen
 
@@ -122,7 +121,7 @@ def cost_and_excess(
     t: Array,
     power: torch.Tensor,
     regime: str,
-    plant: Plant | None = None,
+    plant: str | Plant | None = None,
     interval_s: float = INTERVAL_S,
     threads: int | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.plants.plant import Plant, plant_of
+from ded_bench.plants.plant import Plant, as_plant
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
@@ -37,20 +37,21 @@ def linearise(
     case: Case,
     instance: Instance,
     schedule: Schedule,
-    plant: Plant | None = None,
+    plant: str | Plant | None = None,
     interval_s: float = INTERVAL_S,
 ) -> TimeVarying:
     """Simulate a schedule and linearise the plant along it: x⁺ = f x + g u + h Δu from point to point.
 
-    Knots of the model lie `interval_s` apart, and where the schedule has rows or secondary control acts.
+    The plant may be named; None is the case's own. Knots of the model lie `interval_s` apart, and where the
+    schedule has rows or secondary control acts.
 
     Raises:
         SimulationError: the plant cannot follow the schedule.
         InputError: as `simulate`.
     """
-    plant = plant or plant_of(case)
-    trajectory = simulate(case, instance, schedule, plant)
-    return linearised_along(plant, instance, schedule, trajectory, interval_s)
+    chosen = as_plant(case, plant)
+    trajectory = simulate(case, instance, schedule, chosen)
+    return linearised_along(chosen, instance, schedule, trajectory, interval_s)
 
 
 def linearised_along(
@@ -69,7 +70,7 @@ def condense(
     case: Case,
     instance: Instance,
     schedule: Schedule,
-    plant: Plant | None = None,
+    plant: str | Plant | None = None,
     interval_s: float = INTERVAL_S,
 ) -> CondensedMap:
     """The linear map from a schedule's powers to frequencies and the slack's power, along its trajectory.

@@ -161,6 +161,15 @@ def plant_of(case: Case, name: str | None = None) -> Plant:
     return _made(case, name)
 
 
+def as_plant(case: Case, given: str | Plant | None) -> Plant:
+    """A plant of a case that is given, or by its name; None: the case's own.
+
+    Raises:
+        InputError: as `plant_of`.
+    """
+    return plant_of(case, given) if given is None or isinstance(given, str) else given
+
+
 @functools.lru_cache(maxsize=16)
 def _made(case: Case, name: str) -> Plant:
     module, _, kind = PLANTS[name].partition(":")

@@ -139,6 +139,7 @@ class _OnPlant:
     soft: bool  # an infeasible instance has a schedule, too: that of least excess
     is_near: bool  # the first schedule is thought to be near the optimum: its limits get rows at once
     limits: set[Limit] = field(default_factory=set)
+    last: KnotProgram | None = None
     best: Simulated | None = None  # the cheapest strictly feasible one
     steps: list[float] = field(default_factory=list)  # largest move of a set-point by each program, pu
     radius: float = np.inf  # most that a program may move one, pu
@@ -176,7 +177,9 @@ class _OnPlant:
     def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
         bounds = self.bounds.tightened(MARGIN)
-        program = KnotProgram(self.case, self.instance, bounds, model, radius=self.radius)
+        last, self.last = self.last, None  # a chain of all would be kept
+        program = KnotProgram(self.case, self.instance, bounds, model, radius=self.radius, before=last)
+        self.last = program
         if self.is_near:
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf

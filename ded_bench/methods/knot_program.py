@@ -10,6 +10,10 @@ every piece p of a few grid points, so that every row is local to one interval b
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
     limits on P, on its ramps, and on outputs of ω at the knots and at chosen points between them
 
+On islands, which have many more states than set-points, the program is **condensed**: x is substituted, and
+u are its only columns. A row of an output is then dense, so that limits at knots, too, have rows only where
+they may bind; the answer is that of all of them.
+
 The outputs are those that the regime bounds (`problem.limits.Bounds`): ω itself, or its mean and the swings
 about it. Where the plant delivers other powers than its set-points, what is delivered is paid. Few of the
 limits between knots bind: they get rows as solutions ask for them (`slp.solve_with_rows_added`).
@@ -19,12 +23,14 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 
 from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits, transfer_room
+from ded_bench.methods.output_rows import ROUND_OFF, BasisByPlaces, OutputRows
 from ded_bench.methods.reserve import Reserve
 from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
@@ -35,8 +41,6 @@ from ded_bench.solvers.linear_program import FormAnswer, FreeForm, moved_columns
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 
-#: Entries of rows below this are left out: they are what a double leaves of zero.
-ROUND_OFF = 1e-13
 #: Whether PIQP factorises dense blocks, and its regularisation; the next where one stalls. A sparse matrix is
 #: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
 SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
@@ -50,6 +54,11 @@ LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
 RESIDUAL, REGULARISATION = 1e-8, 1e-9
 #: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval.
 NEAR, PARTS = 0.9, 8
+#: A row of a condensed program is dense: at knots a limit has one if the trajectory exceeds this part of the
+#: bound, or an answer exceeds that part when another row is missing; between knots where the bound is
+#: exceeded, at peaks and at so many points of an interval. Chosen on validation draws of two-area-agc and
+#: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
+HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
 
 #: (output, grid point) of a limit between knots.
 Limit = tuple[int, int]
@@ -80,6 +89,8 @@ class KnotProgram:
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
         radius: most that a set-point may move, pu (trust region).
+        condensed: whether states are substituted; None: on islands.
+        before: the program along the trajectory before, near whose end to start.
     """
 
     def __init__(
@@ -90,6 +101,8 @@ class KnotProgram:
         model: TimeVarying,
         reserve: Reserve | None = None,
         radius: float = np.inf,
+        condensed: bool | None = None,
+        before: KnotProgram | None = None,
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
         self.bounds, self._reserve, self._radius = bounds, reserve, radius
@@ -99,16 +112,26 @@ class KnotProgram:
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
-        n_state = model.slack.shape[1]
+        self._condensed = case.slack is None if condensed is None else condensed
+        n_state = 0 if self._condensed else model.slack.shape[1]
         at_end = self._n_gen + n_state
         self._s = np.arange(len(self.pieces)) + at_end * owner
         power = (own + at_end * np.arange(self._n))[:, None]
         self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
+        self._last = power[:, 0] + at_end - 1  # of each interval
         self._n_columns = len(self.pieces) + at_end * self._n
         self._durations = model.lengths * instance.dt_s
         self._price = instance.cost_slack(case)
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._cost = self._columns_cost()
+        #: Outputs and knots whose limits have rows, by knots.
+        bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
+        self._bounded = self._held = bounded
+        if self._condensed:
+            self._held = bounded & (np.abs(model.omega[model.points[1:]]) > HELD * bounds.limit)
+        self._basis: BasisByPlaces | None = None
+        if before is not None and self._condensed:
+            self._held, self._basis = self._held | before._held, before._basis
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
@@ -118,17 +141,29 @@ class KnotProgram:
             limits: (output, grid point) of the limits between knots, shape (n_limits, 2).
             time_limit_s: see `piqp.solve_form`.
         """
-        form, model = self._unlimited(), self.model
-        rows, low, high = self._frequency_rows(limits), *self._room(limits[:, 1], limits[:, 0])
-        least, most = (room.reshape(self._n, -1) for room in self._room(model.points[1:]))
-        if isinstance(model.speed, slice):
-            speed = self._x[:, model.speed]
-            form.lower[speed], form.upper[speed] = least, most
-        else:
-            at_knots, held = self._at_knots
-            rows = sp.vstack([at_knots, rows])
-            low, high = np.append(least.ravel()[held], low), np.append(most.ravel()[held], high)
-        return self._answer(form.with_rows(rows, low, high), time_limit_s)
+
+        def once(left_s: float) -> tuple[FormAnswer, Array]:
+            form = self._unlimited()
+            low, high = self._room(limits[:, 1], limits[:, 0])
+            least, most = self._room(self.model.points[1:])
+            if isinstance(self.model.speed, slice) and not self._condensed:
+                speed = self._x[:, self.model.speed]
+                rows = self._frequency_rows(limits)
+                form.lower[speed], form.upper[speed] = least.reshape(speed.shape), most.reshape(speed.shape)
+            else:
+                held, rows = self._held.ravel(), self._rows_held(limits)
+                low, high = np.append(least[held], low), np.append(most[held], high)
+            form, none = form.with_rows(rows, low, high), np.zeros(self._n)
+            if not self._condensed:
+                return self._answer(form, left_s), none
+            places = self._output_rows.places(self._held, limits)
+            start = None if self._basis is None else self._basis.start(places)
+            answer = solve_by_highs(form, max(left_s, 0.0), start)
+            if answer.status == Status.OPTIMAL and answer.basis is not None:
+                self._basis = BasisByPlaces.of(answer.basis, places)
+            return answer, none
+
+        return self._at_all_knots(once, time_limit_s)
 
     def solve_relaxed(
         self, limits: Indices, time_limit_s: float, by_interval: bool = False
@@ -144,16 +179,25 @@ class KnotProgram:
         Returns:
             The answer, and the largest widening in rad/s.
         """
-        started = time.perf_counter()
-        form, place, widening = self._relaxed(limits, by_interval, LEAST_PRICE)
-        answer = self._answer(form, time_limit_s)
-        if answer.status == Status.FAILED:
-            other = solve_by_highs(form, max(time_limit_s - (time.perf_counter() - started), 0.0))
-            version = f"{answer.version}, {other.version}"
-            answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
-        if answer.status != Status.OPTIMAL:
-            return answer, np.inf
-        return replace(answer, x=answer.x[place]), float(answer.x[widening].max())
+        widest = np.inf
+
+        def once(left_s: float) -> tuple[FormAnswer, Array]:
+            nonlocal widest
+            started = time.perf_counter()
+            form, place, widening = self._relaxed(limits, by_interval, LEAST_PRICE)
+            answer = self._answer(form, left_s)
+            if answer.status == Status.FAILED:
+                other = solve_by_highs(form, max(left_s - (time.perf_counter() - started), 0.0))
+                version = f"{answer.version}, {other.version}"
+                answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
+            if answer.status != Status.OPTIMAL:
+                widest = np.inf
+                return answer, np.zeros(self._n)
+            widened = answer.x[widening]
+            widest = float(widened.max())
+            return replace(answer, x=answer.x[place]), np.broadcast_to(widened, self._n)
+
+        return self._at_all_knots(once, time_limit_s), widest
 
     def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with a priced excess of outputs in every interval, and with the reserve.
@@ -164,35 +208,77 @@ class KnotProgram:
         Returns:
             As `solve`; the objective is not that of the plan alone.
         """
-        deadline = time.perf_counter() + time_limit_s
-        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-        if self._reserve is not None:
-            form, moved = self._with_reserve(self._reserve, form, place, excess)
-            place = moved[place]
-        answer = solve_form(form, time_limit_s, True, REGULARISATION, RESIDUAL)
-        if answer.status == Status.FAILED:
-            answer = self._answer(form, deadline - time.perf_counter())
-        if answer.status == Status.FAILED:
-            answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
-        return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
 
-    def near(self, outputs: Array) -> set[Limit]:
+        def once(left_s: float) -> tuple[FormAnswer, Array]:
+            deadline = time.perf_counter() + left_s
+            form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
+            if self._reserve is not None:
+                form, moved = self._with_reserve(self._reserve, form, place, excess)
+                place, excess = moved[place], moved[excess]
+            if self._condensed:
+                answer = self._answer(form, left_s)
+            else:
+                answer = solve_form(form, left_s, True, REGULARISATION, RESIDUAL)
+            if answer.status == Status.FAILED:
+                answer = self._answer(form, deadline - time.perf_counter())
+            if answer.status == Status.FAILED:
+                answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
+            if answer.status != Status.OPTIMAL:
+                return answer, np.zeros(self._n)
+            return replace(answer, x=answer.x[place]), answer.x[excess]
+
+        return self._at_all_knots(once, time_limit_s)
+
+    def _at_all_knots(
+        self, once: Callable[[float], tuple[FormAnswer, Array]], time_limit_s: float
+    ) -> FormAnswer:
+        """Solve until limits at knots that have no row yet are kept, too.
+
+        Args:
+            once: solves in a time, s, with rows for those held; how far limits are widened at each knot but
+                the first follows the answer, (n_intervals,), rad/s.
+            time_limit_s: s.
+        """
+        deadline, iterations = time.perf_counter() + time_limit_s, 0
+        while True:
+            answer, widened = once(deadline - time.perf_counter())
+            iterations += answer.iterations
+            if answer.status == Status.OPTIMAL and not self._held.all():
+                beyond = self._beyond_at_knots(answer.x) - widened[:, None]
+                missing = self._bounded & ~self._held & (beyond > (KNOT_NEAR - 1.0) * self.bounds.limit)
+                if (beyond[missing] > 0.0).any():
+                    self._held = self._held | missing
+                    continue
+            return replace(answer, iterations=iterations)
+
+    def _beyond_at_knots(self, columns: Array) -> Array:
+        """How far outputs are beyond their bounds at all knots but the first, (n_intervals, n_out), rad/s."""
+        u = np.zeros_like(self.model.p_gen)
+        u[1:] = columns[self._u]
+        change = (self._speed_at_knots @ self.model.states(u)[1:, :, None])[..., 0]
+        return np.abs(self.model.omega[self.model.points[1:]] + change) - self.bounds.limit
+
+    def near(self, outputs: Array, left_open: float = 0.0) -> set[Limit]:
         """Points between knots at which an output comes near its bound.
 
         Args:
             outputs: shape (n_points, n_out), rad/s.
+            left_open: excess that needs no row, rad/s.
         """
+        parts = FEW_PARTS if self._condensed else PARTS
+        least = left_open if self._condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
         size, points, beyond = np.abs(outputs.T), self.model.points, self.bounds.beyond(outputs).T
         chosen = np.zeros(size.shape, dtype=bool)
         peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
         chosen[:, 1:-1] = peak
         # A peak that is cut off moves to the points beside it.
         over = peak & (beyond[:, 1:-1] > 0.0)
-        chosen[:, :-2] |= over
-        chosen[:, 2:] |= over
-        chosen[:, divided(points, np.full(len(points) - 1, PARTS))] = True
+        if not self._condensed:
+            chosen[:, :-2] |= over
+            chosen[:, 2:] |= over
+        chosen[:, divided(points, np.full(len(points) - 1, parts))] = True
         chosen[:, points] = False
-        of, k = np.nonzero(chosen & (beyond > (NEAR - 1.0) * self.bounds.limit[:, None]))
+        of, k = np.nonzero(chosen & (beyond > least))
         return set(zip(of.tolist(), k.tolist(), strict=True))
 
     def excess(self, outputs: Array) -> float:
@@ -215,6 +301,8 @@ class KnotProgram:
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         """PIQP's, by the next factorisation where one stalls."""
+        if self._condensed:
+            return solve_by_highs(form, max(time_limit_s, 0.0))
         deadline, iterations = time.perf_counter() + time_limit_s, 0
         is_short = self._n == len(self.model.omega) - 1 and self._n_columns < LONG * self._n
         for staged, regularisation in SPARSE if is_short else DENSE:
@@ -250,16 +338,15 @@ class KnotProgram:
     def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""
         form = self._unlimited()
-        at_knots, held = self._at_knots
-        at_knot = np.repeat(np.arange(self._n), len(self.bounds.limit))[held]
-        own = np.append(at_knot, self._interval_of(limits[:, 1]))
-        after = self._x[:, -1] if by_interval else np.array([self._n_columns - 1])
+        held = self._held.ravel()
+        own = np.append(np.nonzero(self._held)[0], self._interval_of(limits[:, 1]))
+        after = self._last if by_interval else self._last[-1:]
         none = np.zeros(len(after))
         form, place, new = form.with_columns(
             after, none + price * max(self._cost.sum(), 1.0), none, none + np.inf
         )
         of_limit = new[own] if by_interval else np.full(len(own), new[0])
-        outputs = sp.csc_matrix(sp.vstack([at_knots, self._frequency_rows(limits)]))
+        outputs = self._rows_held(limits)
         outputs = moved_columns(outputs, place, len(form.cost))
         one = np.ones(len(own)), (np.arange(len(own)), of_limit)
         widening = sp.csc_matrix(one, outputs.shape)
@@ -299,12 +386,17 @@ class KnotProgram:
             cost[self._u] = self._generation[1:]
             return cost
         rows = self.model.cost_rows(self._instance.cost_gen(self._case))
+        if self._condensed:
+            cost[self._u] = self.model.by_set_points(rows).sum(axis=0)[1:]
+            return cost
         cost[self._u] = rows.end
         cost[self._u[:-1]] += rows.start[1:]
         cost[self._x[:-1]] = rows.x[1:]
         return cost
 
     def _dynamics_rows(self) -> sp.csc_matrix:
+        if self._condensed:
+            return self._matrix(0, [])
         across = self.model.across
         end = across.h / self.model.lengths[:, None, None]
         row = np.arange(self._x.size).reshape(self._n, -1)
@@ -343,20 +435,31 @@ class KnotProgram:
         return self._matrix(2 * n, blocks)
 
     @functools.cached_property
-    def _at_knots(self) -> tuple[sp.csc_matrix, Indices]:
-        """Outputs at all knots but the first where they are bounded, and which of all of them these are.
-
-        A knot belongs to the interval after it.
-        """
-        n_out, speed = len(self.bounds.limit), self.model.speed
-        row = np.arange(self._n * n_out).reshape(self._n, -1)
+    def _speed_at_knots(self) -> Array:
+        """C of outputs at all knots but the first: a knot belongs to the interval after it."""
+        speed = self.model.speed
         if isinstance(speed, slice):
-            one = np.broadcast_to(np.eye(n_out), (self._n, n_out, n_out))
-            every = self._matrix(row.size, [(row, self._x[:, speed], one)])
-        else:
-            every = self._matrix(row.size, [(row, self._x, np.concatenate([speed[1:], speed[-1:]]))])
-        held = np.flatnonzero(np.isfinite(self._room(self.model.points[1:])[1]))
-        return every[held], held
+            n_out = len(self.bounds.limit)
+            columns = np.zeros((self._n, n_out, self.model.slack.shape[1]))
+            columns[:, :, speed] = np.eye(n_out)
+            return columns
+        return np.concatenate([speed[1:], speed[-1:]])
+
+    def _rows_held(self, limits: Indices) -> sp.csc_matrix:
+        """Outputs at knots and between them whose limits have rows."""
+        if self._condensed:  # the only columns are those of set-points
+            return self._output_rows.matrix(self._output_rows.places(self._held, limits))
+        return sp.csc_matrix(sp.vstack([self._all_knots, self._frequency_rows(limits)]))
+
+    @functools.cached_property
+    def _output_rows(self) -> OutputRows:
+        return OutputRows(self.model, self._speed_at_knots)
+
+    @functools.cached_property
+    def _all_knots(self) -> sp.csc_matrix:
+        row = np.arange(self._held.size).reshape(self._held.shape)
+        every = self._matrix(row.size, [(row, self._x, self._speed_at_knots)])
+        return every[np.flatnonzero(self._held)]
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
         rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])

@@ -156,7 +156,8 @@ def solve_with_rows_added(
             answer = program.solve_soft(places, deadline - time.perf_counter())
         elif not infeasible:
             answer = program.solve(places, deadline - time.perf_counter())
-        if not rows.soft and (infeasible or answer.status == Status.FAILED):  # none, or PIQP finds none
+        has_none = answer.status in (Status.FAILED, Status.INFEASIBLE)  # or PIQP finds none
+        if not rows.soft and (infeasible or has_none):
             iterations += 0 if infeasible else answer.iterations
             left = deadline - time.perf_counter()
             answer, widening = program.solve_relaxed(places, left, rows.by_interval)
@@ -164,7 +165,9 @@ def solve_with_rows_added(
         if answer.status != Status.OPTIMAL:
             break
         prediction = program.predict(answer.x)
-        excess, added = program.excess(prediction.outputs), program.near(prediction.outputs) - limits
+        excess = program.excess(prediction.outputs)
+        least = (rows.enough if np.isfinite(rows.enough) else rows.open) / 2
+        added = program.near(prediction.outputs, least) - limits
         limits |= added if excess > rows.open else set()
         infeasible = infeasible or widening > rows.open
         if not added or (not rows.by_interval if infeasible else excess <= rows.enough):

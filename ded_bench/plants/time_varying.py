@@ -279,6 +279,30 @@ class TimeVarying:
             costate = costate @ self.across.f[j] + rows.x[j, 0]
         return found
 
+    def by_set_points(self, rows: LocalRows) -> Array:
+        """Rows in the variables of intervals as rows in the set-points alone: states are substituted.
+
+        Every row is taken back through the intervals before its own, all rows of later intervals at once.
+
+        Args:
+            rows: in ascending order of intervals; interval n_intervals is the last knot, which has no end.
+
+        Returns:
+            Shape (n_rows, n_knots, n_gen).
+        """
+        found = np.zeros((len(rows.interval), *self.p_gen.shape))
+        found[np.arange(len(found)), rows.interval] = rows.start
+        has_end = np.flatnonzero(rows.interval < len(self.lengths))
+        found[has_end, rows.interval[has_end] + 1] = rows.end[has_end]
+        costate, at_end = rows.x.copy(), self.across.h / self.lengths[:, None, None]
+        for j in range(len(self.lengths) - 1, -1, -1):
+            later = slice(int(np.searchsorted(rows.interval, j, side="right")), None)
+            end = costate[later] @ at_end[j]
+            found[later, j + 1] += end
+            found[later, j] += costate[later] @ self.across.g[j] - end
+            costate[later] = costate[later] @ self.across.f[j]
+        return found
+
     def _costates(self, n_rows: int, add: Callable[[int, Array], None]) -> LocalRows:
         """The adjoint recursion through all intervals at once, `n_rows` weighted sums in each.
 

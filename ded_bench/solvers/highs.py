@@ -8,7 +8,7 @@ import highspy
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import Basis, FormAnswer, FreeForm
 from ded_bench.solvers.status import Status
 
 _OPTIONS: dict[str, Any] = {
@@ -25,8 +25,14 @@ _STATUS = {
 }
 
 
-def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
-    """Solve a linear program."""
+def solve_form(form: FreeForm, time_limit_s: float = np.inf, start: Basis | None = None) -> FormAnswer:
+    """Solve a linear program.
+
+    Args:
+        form: the program.
+        time_limit_s: s; may be infinite.
+        start: where to start: where a program ended that is like this one, but for rows that may be new.
+    """
     highs = highspy.Highs()  # type: ignore[no-untyped-call]
     for name, value in (_OPTIONS | {"time_limit": float(time_limit_s)}).items():
         highs.setOptionValue(name, value)
@@ -39,7 +45,16 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
     program.a_matrix_.start_, program.a_matrix_.index_ = rows.indptr, rows.indices
     program.a_matrix_.value_ = rows.data
     highs.passModel(program)
+    if start is not None:
+        begun, basic = highspy.HighsBasis(), highspy.HighsBasisStatus.kBasic
+        begun.col_status = start.columns.tolist()
+        begun.row_status = [basic if mark is None else mark for mark in start.rows]
+        begun.valid = begun.alien = True
+        highs.setBasis(begun)
     highs.run()
     found, iterations = highs.getModelStatus(), int(highs.getInfo().simplex_iteration_count)
     status, x = _STATUS.get(found, Status.FAILED), np.array(highs.getSolution().col_value)
-    return FormAnswer(status, x, iterations, f"highs {highs.version()}", highs.modelStatusToString(found))
+    ended = highs.getBasis()
+    basis = Basis(np.array(ended.col_status, dtype=object), np.array(ended.row_status, dtype=object))
+    message = highs.modelStatusToString(found)
+    return FormAnswer(status, x, iterations, f"highs {highs.version()}", message, basis)

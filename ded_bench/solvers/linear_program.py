@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyomo.environ as pyo
@@ -96,6 +96,13 @@ def moved_columns(matrix: sp.csc_matrix, place: Indices, n_columns: int) -> sp.c
     return sp.csc_matrix((matrix.data, matrix.indices, np.cumsum(counts)), (matrix.shape[0], n_columns))
 
 
+class Basis(NamedTuple):
+    """Where a simplex method starts or ends, in the solver's own marks."""
+
+    columns: NDArray[np.object_]
+    rows: NDArray[np.object_]  # equalities first; None: basic
+
+
 @dataclass(frozen=True, eq=False)
 class FormAnswer:
     """What a solver says to one linear program; x has values of use only with status `Optimal`."""
@@ -105,6 +112,7 @@ class FormAnswer:
     iterations: int
     version: str
     message: str
+    basis: Basis | None = None  # where a simplex method ended
 
 
 @dataclass(frozen=True, eq=False)

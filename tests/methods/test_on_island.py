@@ -10,15 +10,22 @@ from scipy.signal import lsim
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
+from ded_bench.methods.ded_slp import OPEN
+from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knots import case_knots
 from ded_bench.methods.registry import METHODS, get_method
+from ded_bench.methods.slp import Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S
 from ded_bench.plants.plant import plant_of
 from ded_bench.plants.score import score
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Transfer
+from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from tests.detailed_cases import MIXED
 
@@ -85,6 +92,39 @@ def test_what_ded_slp_confirms_is_what_the_scorer_finds(
     found = score(island, instance, solution.schedule, regime)
     assert found.feasible_strict
     assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)
+
+
+@pytest.mark.parametrize("way", ["solve", "solve_relaxed", "solve_soft"])
+def test_condensed_programs_have_the_optimum_of_those_with_states(
+    island: Case, instance: Instance, way: str
+) -> None:
+    """Along the static dispatch, beyond its bounds; widened where no schedule can keep them."""
+    points = case_knots(island, instance)
+    schedule = Schedule(instance.grid[points], slow_dispatch(island, instance, points))
+    model = plant_of(island).linearise_along(simulate(island, instance, schedule), points)
+    bounds = island.bounds("TO").tightened(part=0.9 if way == "solve_relaxed" else 0.0)
+    found, widened = [], []
+    for condensed in (False, True):
+        program = KnotProgram(island, instance, bounds, model, condensed=condensed)
+        if not condensed:
+            limits = np.array(sorted(program.near(program.model.omega)))
+        answer = getattr(program, way)(limits, np.inf)
+        if way == "solve_relaxed":
+            widened.append(answer[1])
+            answer = answer[0]
+        assert answer.status == Status.OPTIMAL
+        found.append(program.predict(answer.x))
+    with_states, without = found
+    assert without.objective == pytest.approx(with_states.objective, rel=1e-7)
+    if widened:
+        assert widened[1] == pytest.approx(widened[0], rel=1e-4)
+        assert widened[0] > 0.0
+        attempt = solve_with_rows_added(program, set(), Rows(OPEN, OPEN), np.inf)
+        assert attempt.status == Status.INFEASIBLE
+        assert attempt.wanted is not None
+    else:
+        kept = bounds.beyond(without.outputs)[points[1:]].max()
+        assert kept < (1e-9 if way == "solve" else 0.02 * bounds.limit.min())
 
 
 def test_transfers_are_limits_of_programs(island: Case, instance: Instance) -> None:

@@ -190,12 +190,14 @@ class TimeVarying:
         """
         interval = np.searchsorted(self.points, points) - 1
         steps, slot = points - self.points[interval], _places(interval)
+        chosen, place = np.unique(interval, return_inverse=True)
 
         def add(r: int, costate: Array) -> None:
             here = np.flatnonzero(steps == r)
-            costate[interval[here], slot[here]] += self._speed_rows(interval[here], generators[here])
+            costate[place[here], slot[here]] += self._speed_rows(interval[here], generators[here])
 
-        return self._costates(int(slot.max(initial=-1)) + 1, add).take(interval, slot)
+        rows = self._costates(int(slot.max(initial=-1)) + 1, add, chosen).take(place, slot)
+        return rows._replace(interval=interval)
 
     def slack_rows(self, first: Indices) -> LocalRows:
         """Sums of δP_s over stretches of grid points, as rows in the variables of their intervals.
@@ -303,19 +305,24 @@ class TimeVarying:
             costate[later] = costate[later] @ self.across.f[j]
         return found
 
-    def _costates(self, n_rows: int, add: Callable[[int, Array], None]) -> LocalRows:
-        """The adjoint recursion through all intervals at once, `n_rows` weighted sums in each.
+    def _costates(
+        self, n_rows: int, add: Callable[[int, Array], None], chosen: Indices | None = None
+    ) -> LocalRows:
+        """The adjoint recursion through all intervals, or some, at once, `n_rows` weighted sums in each.
 
         Args:
             n_rows: sums per interval.
             add: called with a number of steps r from the intervals' starts, and the costates there, shape
                 (n_intervals, n_rows, n_state), to which it adds the weights of δx at that point.
+            chosen: intervals, in ascending order.
         """
-        (n, n_state), n_gen = self.slack.shape, self.p_gen.shape[1]
-        f, g, h = self.step
+        chosen = np.arange(len(self.slack)) if chosen is None else chosen
+        lengths = self.lengths[chosen]
+        (n_state, n_gen), n = (self.slack.shape[1], self.p_gen.shape[1]), len(lengths)
+        f, g, h = self.step if n == len(self.slack) else self.step.take(chosen)
         costate = np.zeros((n, n_rows, n_state))
         on_start, on_slope = np.zeros((2, n, n_rows, n_gen))
-        for r in range(int(self.lengths.max()), -1, -1):
+        for r in range(int(lengths.max(initial=0)), -1, -1):
             add(r, costate)
             if r:
                 through = costate @ g
@@ -323,8 +330,9 @@ class TimeVarying:
                 on_slope += (r - 1) * through + costate @ h
                 costate = costate @ f
         if self.reset is not None:
-            costate[self.reset.intervals] = costate[self.reset.intervals] @ self.reset.f
-        end = on_slope / self.lengths[:, None, None]
+            begun = np.isin(chosen, self.reset.intervals)
+            costate[begun] = costate[begun] @ self.reset.f
+        end = on_slope / lengths[:, None, None]
         return LocalRows(np.arange(n), costate, on_start - end, end)
 
 

@@ -102,7 +102,7 @@ def test_condensed_programs_have_the_optimum_of_those_with_states(
     points = case_knots(island, instance)
     schedule = Schedule(instance.grid[points], slow_dispatch(island, instance, points))
     model = plant_of(island).linearise_along(simulate(island, instance, schedule), points)
-    bounds = island.bounds("TO").tightened(part=0.9 if way == "solve_relaxed" else 0.0)
+    bounds = island.bounds("TO").tightened(part=0.99 if way == "solve_relaxed" else 0.0)
     found, widened = [], []
     for condensed in (False, True):
         program = KnotProgram(island, instance, bounds, model, condensed=condensed)
@@ -115,10 +115,12 @@ def test_condensed_programs_have_the_optimum_of_those_with_states(
         assert answer.status == Status.OPTIMAL
         found.append(program.predict(answer.x))
     with_states, without = found
-    assert without.objective == pytest.approx(with_states.objective, rel=1e-7)
+    # Beside the price of a widening, what the cost is hardly counts for an interior point.
+    same = 1e-3 if widened else 1e-7
+    assert without.objective == pytest.approx(with_states.objective, rel=same)
     if widened:
         assert widened[1] == pytest.approx(widened[0], rel=1e-4)
-        assert widened[0] > 0.0
+        assert widened[0] > 10 * OPEN
         attempt = solve_with_rows_added(program, set(), Rows(OPEN, OPEN), np.inf)
         assert attempt.status == Status.INFEASIBLE
         assert attempt.wanted is not None

@@ -124,6 +124,8 @@ class KnotProgram:
         self._price = instance.cost_slack(case)
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._cost = self._columns_cost()
+        # By set-points, whichever columns pay for what they lead to.
+        self._all_costs = (self._cost if model.delivered is None else self._generation[1:]).sum()
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded
@@ -343,7 +345,7 @@ class KnotProgram:
         after = self._last if by_interval else self._last[-1:]
         none = np.zeros(len(after))
         form, place, new = form.with_columns(
-            after, none + price * max(self._cost.sum(), 1.0), none, none + np.inf
+            after, none + price * max(self._all_costs, 1.0), none, none + np.inf
         )
         of_limit = new[own] if by_interval else np.full(len(own), new[0])
         outputs = self._rows_held(limits)

@@ -92,6 +92,8 @@ def solve(
 ) -> Solution:
     """Solve one instance in this process; a method's model is built once and used again.
 
+    Linear algebra runs in one thread, as in the commands: several slow these methods down.
+
     Args:
         instance: what to solve.
         method: one of ours, one that an installed package brings, or `module:function`.
@@ -229,9 +231,19 @@ def _shipped(name: str) -> Case:
 
 @functools.lru_cache(maxsize=8)
 def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+    from threadpoolctl import ThreadpoolController, threadpool_limits
+
     from ded_bench.methods.registry import get_method
 
-    return get_method(method).prepare(case, regime, settings)
+    with threadpool_limits(1):
+        solver = get_method(method).prepare(case, regime, settings)
+    libraries = ThreadpoolController()  # to find them takes milliseconds, a policy less than one
+
+    def solve(instance: Instance) -> Solution:
+        with libraries.limit(limits=1):
+            return solver(instance)
+
+    return solve
 
 
 if "gymnasium" in sys.modules:  # its users find the environments by their ids

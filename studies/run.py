@@ -106,9 +106,10 @@ def main(arguments: list[str] | None = None) -> int:
     trained = [Path(asked.results, "policies"), Path(f"results/{name}-reference/policies")]
     holds = {"train": bool(asked.train)}
     holds["policies"] = holds["train"] or any(folder.is_dir() for folder in trained)
-    for entry in entries(read_steps(asked.runs or name), asked.step, holds):
+    road = list(entries(read_steps(asked.runs or name), asked.step, holds))
+    for number, entry in enumerate(road, start=1):
         words = command_line(entry, asked)
-        print(shlex.join(words), flush=True)
+        print("" if asked.list else f"[{number} of {len(road)}] ", shlex.join(words), sep="", flush=True)
         code = 0 if asked.list else subprocess.run(words, check=False).returncode
         if code:
             return code

@@ -9,9 +9,11 @@ import threading
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import ded_bench
 from ded_bench.files.errors import InputError
+from ded_bench.methods.registry import Method
 from ded_bench.methods.solution import Settings
 from ded_bench.plants import score, simulate
 from ded_bench.plants.detailed.detailed_stepper import integrate_plant
@@ -74,7 +76,7 @@ def test_training_says_what_to_install(tmp_path) -> None:
         code = f"{WITHOUT_TORCH}from ded_bench.cli import main; sys.exit(main({arguments}))"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
         assert done.returncode == 2
-        assert done.stderr == "ded-bench: torch: training needs it: pip install 'ded-bench[train]'\n"
+        assert done.stderr == "ded-bench: torch: training needs it: pip install torch\n"
         assert not list(tmp_path.iterdir())
 
 
@@ -86,6 +88,24 @@ def test_the_scorer_needs_no_method() -> None:
     code += "p = list(i.initial.power.values())\n"
     code += "score(i, Schedule(np.array([0.0, 0.05]), np.array([p, p])), 'TO')"
     assert loaded_after(code) == ["numba", "scipy"]
+
+
+def test_linear_algebra_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the commands, and the caller's own threads afterwards."""
+    [instance] = ded_bench.load_instances("9bus", limit=1)
+    found = []
+
+    def threads() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    def counting(*_: object) -> None:
+        found.append(threads())
+
+    monkeypatch.setattr(Method, "prepare", lambda *_: counting)
+    with threadpool_limits(2):
+        ded_bench.solve(instance, "ed", "TO", settings=Settings(time_limit_s=123.0))
+        assert set(threads()) == {2}
+    assert set(found[0]) == {1}
 
 
 def test_everything_promised_is_there() -> None:

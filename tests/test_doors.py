@@ -117,8 +117,9 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
     Path("own_function.py").write_text(source)
     file = problem / "instances" / f"{load_split(problem).test[0]}.json"  # the one that `bench` times
     chosen = ("--regime", "NO,TO", "--instance", file, "--out", "out")
-    code, out, _ = command("solve", "--method", "own_function:solve", *chosen)
+    code, out, err = command("solve", "--method", "own_function:solve", *chosen)
     assert code == 1
+    assert "own_function.solve TO, 1 time: returned nothing" in err
     rows = {row["regime"]: row for row in map(json.loads, out.splitlines())}
     assert {row["method"] for row in rows.values()} == {"own_function.solve"}
     assert rows["NO"]["status"] == "Feasible"
@@ -135,7 +136,9 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
     assert code == 2
     assert "own_function.solve: not timed, since no method has this name\n" in err
     bench = ("bench", "--case", problem, "--results", "out", "--instances", "1", "--repeats", "1")
-    assert command(*bench, "--method", "own_function:solve")[0] == 1  # its TO has nothing to time
+    code, _, err = command(*bench, "--method", "own_function:solve,ed")
+    assert code == 1  # its TO has nothing to time
+    assert "ed: not timed, since the results hold no rows of it" in err
     times = {(row.regime, row.round): row for row in read_timing(Path("out/timing.csv"))}
     assert sorted(times) == [("NO", 0), ("NO", 1), ("TO", 0), ("TO", 1)]
     assert times["NO", 1].solve_s > 0
@@ -165,9 +168,7 @@ def test_a_folder_of_schedules_is_a_method(problem, tmp_path, command) -> None:
     (folder / f"{one['instance']}.csv").write_text("t,P_plant\n0,0.6\n5,0.6\n")
     code, _, err = command(*score, "--name", "mine")
     assert code == 1
-    assert (
-        f"ded-bench: NO {one['instance']}: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
-    )
+    assert f"ded-bench: mine NO, 1 time: {folder}/{one['instance']}.csv: t: must end at the horizon" in err
     assert {row.method for row in Results(out).rows.values()} == {"mine"}
     for wrong in (
         score,  # no name

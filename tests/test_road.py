@@ -7,6 +7,8 @@ import functools
 import importlib.util
 import io
 import shlex
+import subprocess
+import types
 from pathlib import Path
 
 import pytest
@@ -65,6 +67,13 @@ def solved(road: list[list[str]]) -> dict[tuple[str, str, str], int | None]:
     found = {(",".join(a.method), a.set, a.model): a.limit for a in chosen}
     assert len(found) == len(chosen)  # nothing is asked for twice
     return found
+
+
+def test_it_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: types.SimpleNamespace(returncode=0))
+    road = commands("report", "9bus", "--runs", "quick")
+    _, found = run("report", "--runs", "quick")
+    assert [line[1] for line in found] == [f"{len(road)}]"] * len(road)  # after "[1 of "
 
 
 @pytest.mark.parametrize("case", GRIDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +13,13 @@ from ded_bench.plants.plant import NominalPoint, SimulationError, plant_of, serv
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import VALIDATION_SEED, drawn_with_redraws
 
 #: Longest distance of knots, in periods of the fastest mode.
 KNOT_PERIODS = 2 / 3
+#: Within these lie the data of nearly all grids.
+PLAUSIBLE = {"|V| of buses, pu": (0.8, 1.2), "inertia constants, s": (1.0, 15.0), "modes, Hz": (0.1, 3.0)}
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,41 @@ def check_case(case: Case, count: int) -> CaseCheck:
         peak_hz=_peaks(case, runs),
         violating={regime: float(np.mean(found)) if found else 0.0 for regime, found in beyond.items()},
     )
+
+
+def implausible(case: Case, found: CaseCheck) -> Iterator[str]:
+    """What to look at again: data that few grids have, knots that are too few, bounds that tell nothing."""
+    if feeding := [
+        f"{bus} {power:g}" for bus, power in zip(case.loads, case.load_nominal, strict=True) if power > 0
+    ]:
+        yield f"loads that feed in, pu (a load that draws is negative): {', '.join(feeding)}"
+    if isinstance(
+        case, LosslessCase
+    ):  # behind x'd a generator's |V| is no bus's; its largest power is its base
+        voltages = {bus.id: bus.v for bus in case.buses if bus.kind != "generator"}
+        rated = {n: m.m * np.pi * case.f0_hz / m.p_max for n, m in case.machines.items() if m.p_max > 0}
+    else:
+        voltages = {bus.id: bus.v for bus in case.detailed.network.buses}
+        rated = {name: machine.h for name, machine in case.detailed.machines.items()}
+    modes = {str(place): value for place, value in enumerate(found.frequency_hz.tolist(), start=1)}
+    for name, values in (
+        ("|V| of buses, pu", voltages),
+        ("inertia constants, s", rated),
+        ("modes, Hz", modes),
+    ):
+        low, high = PLAUSIBLE[name]
+        if outside := [f"{key} {value:.3g}" for key, value in values.items() if not low <= value <= high]:
+            yield f"{name}, outside {low:g} to {high:g}: {', '.join(outside[:5])}{', …' * (len(outside) > 5)}"
+    if found.knots and case.n_knots < found.knots:
+        yield f"knots: {case.n_knots}, fewer than the {found.knots} that the fastest mode suggests"
+    for regime, share in found.violating.items():
+        if found.served and share in (0, 1):
+            said = (
+                "keeps its bounds on every draw: they cost nothing"
+                if share == 0
+                else "breaks it on every draw"
+            )
+            yield f"regime {regime}: static dispatch {said}"
 
 
 def suggested_knots(case: Case, fastest_hz: float) -> int:

@@ -77,9 +77,7 @@ def read_paper(problems: Path) -> Paper | None:
     return paper
 
 
-def result_lines(
-    rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper | None, reference: str
-) -> pd.DataFrame:
+def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, reference: str) -> pd.DataFrame:
     """The lines of the paper's Tables V and VI: in each regime the paper's rows first, then all others.
 
     Args:
@@ -94,7 +92,7 @@ def result_lines(
     """
     ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
     usual = {key[:2]: key for key in ours if is_usual(key[2], key[3], key[1])}
-    theirs = paper.rows() if paper else {}
+    theirs = paper.rows()
     beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in theirs.items()}
     times = {tuple(line[name] for name in GROUP): line for line in records(timing)}
     lines = []

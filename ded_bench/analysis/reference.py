@@ -1,8 +1,8 @@
 """The reference of a case: which method gaps are measured against, and its objectives.
 
 Where a case carries a paper's numbers, it is the method that the paper measures against; elsewhere an
-accurate one, whose claims the scorer confirms. Objectives come from the rows of a results folder; where it
-lacks some, from the reference run that ships with the case.
+accurate one, whose claims the scorer confirms; where nobody ran it, the best feasible schedule. Objectives
+come from the rows of a results folder; where it lacks some, from the reference run that ships with the case.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from ded_bench.results.objectives import OBJECTIVES, Objective
 
 #: References of cases without a paper's numbers, the first that has objectives.
 ACCURATE = ("ded-radau", "ded-slp")
+#: What stands for a method where none of these has objectives: the best feasible row of each instance counts.
+BEST = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +28,21 @@ class Reference:
     """What gaps are measured against.
 
     Attributes:
-        method: its name; the settings are the default ones.
+        method: its name, or BEST; the settings are the default ones.
         objectives: by (instance, regime).
         shipped: how many of them come from the case's reference run, not from rows.
+        wanted: the method to run where BEST stands in for one.
     """
 
     method: str
     objectives: pd.Series[float]
     shipped: int = 0
+    wanted: str = ""
 
     @property
     def title(self) -> str:
         """The reference as tables name it."""
-        return title(self.method)
+        return title(self.method) if self.method else "the best feasible schedule"
 
 
 def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[Objective] = ()) -> Reference:
@@ -52,6 +56,7 @@ def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[
         shipped: objectives of the case's reference run.
     """
     candidates = paper.references if paper else ACCURATE
+    best = _by_instance(rows[rows["feasible"] == True].sort_values("objective"))  # noqa: E712
     ours = set(zip(rows["instance"], rows["problems_version"], strict=True))
     usable = OBJECTIVES.frame([o for o in shipped if (o.instance, o.problems_version) in ours])
     for method in candidates:
@@ -60,7 +65,7 @@ def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[
         objectives = own.combine_first(_by_instance(usable[usable["method"] == method]))
         if len(objectives):
             return Reference(method, objectives, len(objectives) - len(own))
-    return Reference(candidates[0], _by_instance(rows[:0]))
+    return Reference(BEST if len(best) else candidates[0], best, 0, candidates[-1])
 
 
 def _by_instance(rows: pd.DataFrame) -> pd.Series[float]:

@@ -13,12 +13,17 @@ import numpy as np
 import pandas as pd
 
 from ded_bench.analysis.lines import GROUP, HEAD, groups, head, line_table
+from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ
 from ded_bench.results.rows import Key
 from ded_bench.solvers.status import Status
 
 #: What a solver's claim must be to count as a success; the verdict of the scorer is another column.
 SUCCESS = [str(status) for status in (Status.OPTIMAL, Status.FEASIBLE, Status.POLICY)]
 VIOLATIONS = ("freq_violation_hz", "ramp_violation", "bound_violation", "initial_violation")
+#: What each of them is called.
+LIMITS = dict(zip(VIOLATIONS, ("frequency", "ramp", "bounds", "initial power"), strict=True))
+#: The scorer's limits on each of them for `feasible`; islands' frequencies have ISLAND_HZ.
+FEASIBLE = dict(zip(VIOLATIONS, (FEASIBLE_HZ, *[FEASIBLE_PU] * 3), strict=True))
 #: Means over rows of islands: column of the rows, and its unit in theirs.
 ISLAND = {
     "mean_peak_mhz": ("mean_freq_max_hz", 1e3),
@@ -123,17 +128,42 @@ def _spread(name: str, values: pd.Series[float]) -> dict[str, float]:
     return {f"{name}_{part}": float(value) for part, value in zip(SPREAD, found, strict=True)}
 
 
-def tradeoff(frame: pd.DataFrame, timing: pd.DataFrame) -> pd.DataFrame:
-    """Mean gap against time per schedule, of rows with their gaps: one point per line.
+def largest_violation(rows: pd.DataFrame) -> str:
+    """The largest violation of some rows in units of its tolerance, in words: how far beyond which limit."""
+    scored = rows.dropna(subset=["objective"])
+    if not len(scored):
+        return "–"
+    shares = _shares(scored).max()
+    name = str(shares.idxmax())
+    if shares[name] <= 1:
+        return "none"
+    return f"{scored[name].max():.2g} {'Hz' if name == VIOLATIONS[0] else 'pu'} ({LIMITS[name]})"
 
+
+def _shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """Every violation in units of the scorer's tolerance."""
+    shares = rows[list(FEASIBLE)].astype(float) / pd.Series(FEASIBLE)
+    is_island = rows["excess_mean_hz"].notna()
+    shares["freq_violation_hz"] *= np.where(is_island, FEASIBLE_HZ / ISLAND_HZ, 1.0)
+    return shares.fillna(-1.0)
+
+
+def outcome(frame: pd.DataFrame, timing: pd.DataFrame | None = None) -> pd.DataFrame:
+    """What became of every line's rows, of rows with their gaps: who solved what, gaps, violations, times.
+
+    Of `rows`, `solved` have a score and `feasible` keep every limit; `largest` is the largest violation.
     `seconds` is the median of the timing table where it has the line (`alone` is true), else that
     of the results table, taken under parallel load.
     """
     loaded = frame.groupby(GROUP)["solve_s"].median()
-    alone = timing.dropna(subset=["solve_s"]).set_index(GROUP)["solve_s"]
+    alone = (loaded if timing is None else timing.set_index(GROUP)["solve_s"]).dropna()
     found = summary(frame)
+    found["solved"] = found["rows"] - found["failures"]
+    found["feasible"] = (found["correct_rate"] * found["rows"]).round().fillna(0).astype(int)
+    found["largest"] = [largest_violation(group) for *_, group in groups(frame)]
     keys = pd.MultiIndex.from_frame(found[GROUP])
     measured = keys.isin(alone.index)
     seconds: Any = np.where(measured, alone.reindex(keys), loaded.reindex(keys)) if len(found) else []
     found = found.assign(gap_percent=found["gap_percent_mean"], seconds=seconds, alone=measured)
-    return found[[*HEAD, "n", "correct_rate", "gap_percent", "seconds", "alone"]]
+    counts = ("n", "rows", "solved", "feasible", "correct_rate")
+    return found[[*HEAD, *counts, "gap_percent", "largest", "seconds", "alone"]]

@@ -5,6 +5,15 @@ import sys
 if sys.platform == "win32":
     sys.exit("ded-bench: needs Linux or macOS (on Windows: the Windows Subsystem for Linux)")
 
-from ded_bench.cli.commands import main
+from collections.abc import Sequence
 
-__all__ = ["main"]
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    try:
+        from ded_bench.cli.commands import main as run  # a second, in which one may think better of it
+
+        return run(argv)
+    except KeyboardInterrupt:
+        print("ded-bench: interrupted; what was finished is saved, run again to continue", file=sys.stderr)
+        return 130

@@ -131,7 +131,7 @@ def add_instances(p: Parser) -> None:
     """Declare which instances are answered or judged."""
     chosen = p.add_mutually_exclusive_group()
     chosen.add_argument("--split", choices=SPLITS, default="test", help="which instances")
-    chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="instead of a split")
+    chosen.add_argument("--instance", type=Path, nargs="+", metavar="FILE", help="or ids, instead of a split")
     p.add_argument("--limit", type=positive, help="only the first so many of the split")
     p.add_argument("--case", help=f"{CASE_HELP}; default: the instances', or {DEFAULT_CASE}")
 

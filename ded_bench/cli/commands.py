@@ -60,6 +60,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         place = f"{error.filename}: " if error.filename else ""
         print(f"ded-bench: {place}{error.strerror or error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("ded-bench: interrupted; what was finished is saved, run again to continue", file=sys.stderr)
-        return 130

@@ -75,22 +75,27 @@ def _bench(a: argparse.Namespace) -> int:
     from ded_bench.methods.registry import get_method, registered
     from ded_bench.plants.plant import servable
     from ded_bench.results.rows import Results
+    from ded_bench.results.timing import model_name, timing_summary
+    from ded_bench.surrogates.find import MODELS
 
     chosen = select_split(a.case)
     case = chosen.case
     results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
     known = {key.method for key in results.rows}
-    if not a.method:
-        for name in sorted(known - set(methods)):
-            say(f"{name}: not timed, since no method has this name")
+    skipped = {name: "no method has this name" for name in known if not a.method and name not in methods}
+    skipped |= {name: "the results hold no rows of it" for name in methods if a.method and name not in known}
+    for key in results.rows:
+        if key.method in methods and (model := model_name(key.model)) not in ("", *MODELS):
+            skipped[f"{key.method} on {model}"] = "its model was given as a file"
+    for name, reason in sorted(skipped.items()):
+        say(f"{name}: not timed, since {reason}")
     if not known & set(methods):
         raise InputError(
             results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
         )
     timed = ", ".join(sorted(known & set(methods)))
     say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
-    from ded_bench.results.timing import timing_summary
     from ded_bench.run.bench import bench, choose_sample, runs_of
 
     jobs = runs_of(results.rows.values(), Settings(search=search_folders(case, results.folder)), methods)
@@ -158,7 +163,7 @@ def _report(a: argparse.Namespace) -> int:
     from ded_bench.report.report import write_report
     from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
 
-    written = write_report(case, folder, problem_folder(a.case, case))
+    written = write_report(case, folder, problem_folder(a.case, case), print)
     OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +19,14 @@ from ded_bench.cli.arguments import (
     positive_number,
     say,
 )
+from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
 from ded_bench.problem.forecast import QUALITIES
-from ded_bench.problem.scenario import load_scenarios
-from ded_bench.results.folder import default_results, search_folders
+from ded_bench.problem.scenario import Scenario, load_scenarios
+from ded_bench.results.folder import ResultsFolder, default_results, search_folders
 
 if TYPE_CHECKING:
     from ded_bench.results.online_results import OnlineRow
@@ -72,21 +74,29 @@ def _online(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
-    operations = _operations(a, case, folder)
+    files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
+    scenarios = load_scenarios(files, case)
+    if "timing" in a.latency and not _timed(a, case, search_folders(case, folder)):
+        return 1
+    operations = _operations(a, case, folder, scenarios)
     say(f"{counted(len(operations), 'row')} asked for, each a scenario of some minutes")
     rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row, not a.no_hindsight)
+    from ded_bench.cli.outcome import tell_operated
+
+    tell_operated(rows, ResultsFolder(folder))
     return 1 if any(row.objective is None for row in rows) else 0
 
 
-def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operation]:
+def _operations(
+    a: argparse.Namespace, case: Case, folder: Path, scenarios: Sequence[Scenario]
+) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
     from ded_bench.run.online.loop import PERIOD_S, LoopOptions
     from ded_bench.run.online.operation import make_operations
     from ded_bench.run.online.planner import LIMIT_S
 
     search = search_folders(case, folder)
-    files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
-    methods, scenarios = chosen_methods(a, search), load_scenarios(files, case)
+    methods = chosen_methods(a, search)
     return [
         operation
         for forecast, latency, method in itertools.product(a.forecast, a.latency, methods)
@@ -109,12 +119,32 @@ def _operations(a: argparse.Namespace, case: Case, folder: Path) -> list[Operati
     ]
 
 
+def _timed(a: argparse.Namespace, case: Case, search: tuple[Path, ...]) -> bool:
+    """Time methods whose times no results folder has; whether all have an answer to be timed."""
+    from ded_bench.run.bench import FEW, Job, measure
+    from ded_bench.run.online.operation import timed_job, timed_latency
+
+    case.check_regimes(a.regime or ())
+    for (name, settings), regime in itertools.product(chosen_methods(a, search), a.regime or case.regimes):
+        try:
+            timed_latency(case, timed_job(case, get_method(name), regime, settings), search)
+        except InputError:
+            say(f"{name} {regime} is not timed yet: its latency is measured on {FEW} drawn instances first")
+            rows = measure(case, Job(name, regime, settings), ResultsFolder(search[0]).latency)
+            if not any(row.counts for row in rows):
+                say(f"{name} {regime} has no answer to any of them: {rows[-1].error}")
+                return False
+    return True
+
+
 def _print_row(row: OnlineRow) -> None:
     name = f"{row.scenario} {row.regime} {row.method} {row.settings} {row.latency_s:.3g} s:"
     if row.objective is None or row.max_excess_hz is None:
         print(f"{name} {row.error}", flush=True)
         return
     over = "no hindsight" if row.increase_percent is None else f"{row.increase_percent:.4f} % over hindsight"
+    if (row.increase_percent or 0.0) < 0 < row.max_excess_hz:
+        over += " (less than it, since the bound is exceeded)"
     excess = f"largest excess {1e3 * row.max_excess_hz:.4f} mHz"
     plans = f"{row.late} late, {row.failed} failed, {row.infeasible} infeasible of {row.plans}"
     print(f"{name} {over}, {excess}, {plans}", flush=True)

@@ -213,7 +213,7 @@ def _list() -> int:
 
 
 def _check(case: Case, count: int) -> int:
-    from ded_bench.analysis.inspect_case import check_case
+    from ded_bench.analysis.inspect_case import check_case, implausible
     from ded_bench.plants.plant import SimulationError
 
     sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
@@ -225,6 +225,8 @@ def _check(case: Case, count: int) -> int:
         print(f"ded-bench: case {case.id}: {error}", file=sys.stderr)
         return 1
     _print_check(case, found)
+    for warning in implausible(case, found):
+        print(f"warning      {warning}")
     if not found.served:
         print(f"ded-bench: case {case.id}: no instance can be served", file=sys.stderr)
         return 1

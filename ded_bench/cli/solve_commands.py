@@ -29,6 +29,7 @@ from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import (
     Selection,
     check_own_name,
+    instance_file,
     problem_folder,
     select_files,
     select_split,
@@ -126,12 +127,10 @@ def _solve(a: argparse.Namespace) -> int:
     there = f", {len(finished)} there already" if finished else ""
     say(f"{counted(len(todo), 'row')} to solve{there}")
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
-    bad = [row for row in rows if row.status == Status.FAILED or row.objective is None]
-    print(
-        f"{counted(len(rows), 'row')} in {results.path} "
-        f"({len(finished)} there already, {len(bad)} without a score)",
-        file=sys.stderr,
-    )
+    from ded_bench.cli.outcome import tell_solved
+
+    tell_solved(case, a.case, results, rows, sys.stderr if a.instance else sys.stdout)
+    print(f"{counted(len(rows), 'row')} in {results.path} ({len(finished)} there already)", file=sys.stderr)
     return 1 if any(row.status == Status.FAILED for row in rows) else 0
 
 
@@ -282,17 +281,17 @@ def _score_folder(a: argparse.Namespace) -> int:
     chosen = _chosen(a)
     results = Results(a.out or default_results(chosen.case))
     done = submit(chosen, a.schedules, a.name, a.regime, results, a.workers)
-    bad = [row for row in done.rows if row.objective is None]
-    for row in bad[:10]:
-        say(f"{row.regime} {row.instance}: {row.error}")
     if done.unused:
         named = ", ".join(path.name for path in done.unused[:3])
         say(f"{counted(len(done.unused), 'file')} of other instances: {named}")
     if a.json:
         for row in done.rows:
             _print_row(results, row)
-    print(f"{counted(len(done.rows), 'row')} in {results.path} ({len(bad)} without a score)", file=sys.stderr)
-    return 1 if bad else 0
+    from ded_bench.cli.outcome import tell_solved
+
+    tell_solved(chosen.case, a.case, results, done.rows, sys.stderr if a.json else sys.stdout)
+    print(f"{counted(len(done.rows), 'row')} in {results.path}", file=sys.stderr)
+    return 1 if any(row.objective is None for row in done.rows) else 0
 
 
 def _chosen(a: argparse.Namespace) -> Selection:
@@ -302,6 +301,7 @@ def _chosen(a: argparse.Namespace) -> Selection:
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
     else:
+        a.instance = [instance_file(name, a.case) for name in a.instance]
         chosen = select_files(a.instance, Case.load(a.case) if a.case else None)
     problems = problem_folder(a.case or chosen.case.id, chosen.case)
     if not a.instance and SHIPPED_CASES in problems.parents:

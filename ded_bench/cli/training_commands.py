@@ -152,4 +152,4 @@ def _missing_named() -> Iterator[None]:
         package = str(error.name).partition(".")[0]
         if package not in ("cma", "torch"):
             raise
-        raise InputError(package, "", "training needs it: pip install 'ded-bench[train]'") from None
+        raise InputError(package, "", f"training needs it: pip install {package}") from None

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.strict import naming, write_atomically
 from ded_bench.files.table import Table, records
 
 K = TypeVar("K", bound=Hashable)
@@ -91,7 +91,7 @@ class KeyedTable(Generic[K, T]):
                 self._write_all()
                 return
             text = "".join(self._table.format_row(row, self._header) for row in rows).encode()
-            with open(self.path, "r+b") as file:
+            with naming(self.path), open(self.path, "r+b") as file:
                 file.truncate(self._seen.end)
                 file.seek(self._seen.end)
                 file.write(text)

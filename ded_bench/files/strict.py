@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import errno
 import functools
 import hashlib
 import json
 import os
+import stat
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ded_bench.files.errors import InputError
+
+#: No text that we read is larger; what is read of it takes ten times as much memory.
+MAX_BYTES = 64 * 2**20
 
 
 class Record(BaseModel):
@@ -54,7 +61,8 @@ def read_record(kind: type[R], path: str | Path) -> R:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the text of a UTF-8 file; InputError if it cannot be read."""
+    """Return the text of a UTF-8 file; InputError if it cannot be read, is no regular file or too large."""
+    check_readable(path)
     try:
         return Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError:
@@ -64,15 +72,30 @@ def read_text(path: str | Path) -> str:
         raise InputError(path, "", f"cannot be read ({reason})") from None
 
 
+def check_readable(path: str | Path, largest: int = MAX_BYTES) -> None:
+    """Raise InputError where `path` is there but no regular file, or larger than `largest` bytes."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return  # whoever opens it says why it cannot be
+    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+        raise InputError(path, "", "is no regular file")
+    if found.st_size > largest:
+        raise InputError(path, "", f"is larger than {largest >> 20} MiB")
+
+
 def parse_record(kind: type[R], text: str, source: str | Path) -> R:
     """Parse JSON text as a `kind`; `source` is the name that errors give."""
     try:
         json.loads(text, object_pairs_hook=_no_duplicates)
         return kind.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        found = error.errors(include_url=False)
+        first = next((wrong for wrong in found if wrong["type"] == "extra_forbidden"), found[0])
         field = ".".join(str(part) for part in first["loc"])
-        raise InputError(source, field, _plain(first["msg"])) from None
+        unknown = first["type"] == "extra_forbidden"
+        said = _unknown(kind, str(first["loc"][-1])) if unknown else _plain(first["msg"])
+        raise InputError(source, field, said) from None
     except _DuplicateKeyError as error:
         raise InputError(source, str(error), "appears twice") from None
     except (ValueError, RecursionError) as error:
@@ -89,7 +112,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with naming(path), os.fdopen(handle, "wb") as file:
             file.write(content if isinstance(content, bytes) else content.encode())
             file.flush()
             os.fsync(file.fileno())
@@ -97,6 +120,17 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an OSError that names no file, as that of a full disk, name this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
         raise
 
 
@@ -128,6 +162,16 @@ def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise _DuplicateKeyError(key)
         seen[key] = value
     return seen
+
+
+def _unknown(kind: type[Record], key: str) -> str:
+    """What to say of a key that is none, with the one that may be meant."""
+    schema = kind.model_json_schema()
+    known = {
+        name for part in (schema, *schema.get("$defs", {}).values()) for name in part.get("properties", ())
+    }
+    near = difflib.get_close_matches(key, sorted(known), n=1)
+    return "unknown field" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _plain(message: str) -> str:

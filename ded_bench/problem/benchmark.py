@@ -81,6 +81,10 @@ def scenario_folder(problem_folder: Path) -> Path:
 
 def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
+    if not (folder / MANIFEST).is_file():
+        case = folder.parent.name if SHIPPED_CASES in folder.parents else folder.parent
+        problem = f"holds no scenarios; `ded-bench scenarios --case {case}` draws some"
+        raise InputError(folder, "", problem)
     files = list(read_record(Manifest, folder / MANIFEST).files)
     return [folder / name for name in files[:limit]]
 
@@ -244,6 +248,21 @@ def validation_instances(
         instance.model_copy(update={"id": f"{case.id}-v{index:04d}"})
         for index, instance in enumerate(drawn, start=first)
     ]
+
+
+def instance_file(name: Path, case: str | None = None) -> Path:
+    """The file of an instance: the one given, or that of this id in a case's folder, or any shipped one's.
+
+    Raises:
+        InputError: it is a name without a folder, and neither a file nor the id of an instance.
+    """
+    if name.exists() or name.name != str(name) or name.suffix:
+        return name
+    folders = [problem_folder(case, Case.load(case))] if case else sorted(SHIPPED_CASES.glob("*"))
+    for folder in folders:
+        if (found := folder / "instances" / f"{name}.json").is_file():
+            return found
+    raise InputError("--instance", str(name), "is neither a file nor an instance's id")
 
 
 def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selection:

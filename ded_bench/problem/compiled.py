@@ -4,13 +4,32 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.event import Listener, register
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+class _Announced(Listener):
+    """Says once, to a person at a terminal, what the first call of a process waits for."""
+
+    told = False
+
+    def on_start(self, _: object) -> None:
+        if not self.told and sys.stderr.isatty():
+            print("ded-bench: compiling, once after installing: up to a minute", file=sys.stderr, flush=True)
+        self.told = True
+
+    def on_end(self, _: object) -> None:
+        pass
+
+
+register("numba:compile", _Announced())  # type: ignore[no-untyped-call]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

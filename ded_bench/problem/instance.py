@@ -16,6 +16,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.quantities import (
+    MAX_POINTS,
     Array,
     Extended,
     Name,
@@ -56,7 +57,7 @@ class LoadPoints(Record):
 
     points: Annotated[
         tuple[Annotated[tuple[NonNegative, Number], Field(strict=False)], ...],
-        Field(strict=False, min_length=2),
+        Field(strict=False, min_length=2, max_length=MAX_POINTS),
     ]
 
     @model_validator(mode="after")

@@ -21,6 +21,8 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Range = tuple[Number, Number]
 MAX_STEPS = 1_000_000
+#: Of a load in one file.
+MAX_POINTS = 100_000
 
 
 class Extended(Record):

@@ -14,7 +14,15 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
-from ded_bench.problem.quantities import Array, Name, NonNegative, Number, Positive, check_whole_steps
+from ded_bench.problem.quantities import (
+    MAX_POINTS,
+    Array,
+    Name,
+    NonNegative,
+    Number,
+    Positive,
+    check_whole_steps,
+)
 
 
 class ScenarioRamp(Record):
@@ -45,7 +53,7 @@ class Fluctuation(Record):
     """
 
     step_s: Positive
-    values: Annotated[tuple[Number, ...], Field(strict=False, min_length=2)]
+    values: Annotated[tuple[Number, ...], Field(strict=False, min_length=2, max_length=MAX_POINTS)]
     decay_s: Positive
 
     @functools.cached_property
@@ -63,7 +71,7 @@ class ScenarioLoad(Record):
     """A load that ramps several times and fluctuates; an injection in pu."""
 
     initial: Number
-    ramps: Annotated[tuple[ScenarioRamp, ...], Field(strict=False)]
+    ramps: Annotated[tuple[ScenarioRamp, ...], Field(strict=False, max_length=MAX_POINTS)]
     fluctuation: Fluctuation
 
     def at(self, t: Array) -> Array:

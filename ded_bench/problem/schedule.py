@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.strict import check_readable, write_atomically
 from ded_bench.files.table import records
 from ded_bench.problem.case import Array, Case
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 #: How far a schedule's last time may lie from the horizon, s.
 HORIZON_TOLERANCE = 1e-9
 MAX_BYTES = 200 * 2**20
+#: Ten rows for each step of a minute: more would cost memory, and no simulation sees them.
+MAX_ROWS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,7 @@ def as_schedule(given: Schedule | pd.DataFrame, case: Case) -> Schedule:
 
 def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Column names, and the other rows that are not blank, each with its line number."""
+    check_readable(path, MAX_BYTES)
     try:
         with open(path, "rb") as raw:
             stream = gzip.GzipFile(fileobj=raw) if str(path).endswith(".gz") else raw
@@ -140,6 +143,8 @@ def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]
         raise InputError(path, "", "is not a CSV text file") from None
     if len(data) > MAX_BYTES:
         raise InputError(path, "", "is too large for a schedule")
+    if text.count("\n") > MAX_ROWS:
+        raise InputError(path, "", f"has more than {MAX_ROWS} rows")
     rows = [(line, cells) for line, cells in records(text, path) if cells]
     if not rows:
         raise InputError(path, "t", "is empty")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -119,6 +119,16 @@ TABLE_VI = (
 )
 
 
+#: What became of the rows of every line, of `summary.outcome`.
+OUTCOME = (
+    *_HEAD,
+    Column("rows", "n"),
+    Column("solved", "solved"),
+    Column("feasible", "feasible"),
+    Column("gap_percent", "mean gap", "%"),
+    Column("largest", "largest violation"),
+    Column("seconds", "median time", "s"),
+)
 #: On islands, of `summary.island_summary`.
 ISLAND = (
     *_HEAD,
@@ -131,14 +141,6 @@ ISLAND = (
     N,
     FAILURES,
 )
-
-
-def without_paper(columns: Sequence[Column], reference: str) -> tuple[Column, ...]:
-    """Columns of Table V or VI where there is no paper to stand beside; `reference` is what gaps are to."""
-    kept = [column for column in columns if "paper" not in column.name]
-    return tuple(
-        replace(c, text=c.text.replace("DED", reference)) if c.name == "increase_percent" else c for c in kept
-    )
 
 
 _FREQUENCY = _spread("freq_violation_hz", "frequency", "Hz")

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ded_bench.analysis.findings import findings
 from ded_bench.analysis.lines import GROUP, groups, main_lines, records, titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.summary import summary
 from ded_bench.files.errors import InputError
+from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, TRAININGS, Column
 from ded_bench.report.figures.growth import growth_figure
 from ded_bench.report.figures.style import save_figure
-from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, write_page
+from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, write_page
 from ded_bench.report.sources import Sources, read_sources, trainings
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
@@ -53,7 +55,8 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     found = points(grids)
     made: list[Block] = [
         Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
-        Items(EXPLANATION),
+        *_findings(grids),
+        *folded("How to read this page", Items(EXPLANATION)),
     ]
     for heading, blocks in _parts(grids, found, out).items():
         made += [Heading(heading), *blocks] if blocks else []
@@ -65,6 +68,17 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]
     return write_page([*made, Heading("Where the rows come from"), Items(tuple(items))], out, "overview")
+
+
+def _findings(grids: Sequence[Sources]) -> list[Block]:
+    """What the results of every grid say of default settings, in its tightest regime."""
+    said = []
+    for grid in grids:
+        lines = grid.outcome[
+            (grid.outcome["regime"] == grid.tightest) & (grid.outcome["settings"] == DEFAULT)
+        ]
+        said += [f"{grid.case.id}: {text}" for text in findings(lines, grid.reference.title)]
+    return [Items(tuple(said))]
 
 
 def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str, list[Block]]:

@@ -10,12 +10,12 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench.analysis.certificate import Certificate, read_certificates
-from ded_bench.analysis.lines import judged_rows, named, newest
+from ded_bench.analysis.lines import judged_rows, named, newest, on_usual_model
 from ded_bench.analysis.online_summary import online_rows, practice_rows
 from ded_bench.analysis.paper_numbers import Paper, read_paper
 from ded_bench.analysis.referee import REFEREE
 from ded_bench.analysis.reference import Reference, choose_reference
-from ded_bench.analysis.summary import gaps, judged_elsewhere, summary
+from ded_bench.analysis.summary import gaps, judged_elsewhere, outcome, summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import SimulationError
@@ -77,6 +77,16 @@ class Sources:
     def summary(self) -> pd.DataFrame:
         """Of the judged rows: see `summary.summary`."""
         return summary(self.judged)
+
+    @property
+    def shown(self) -> pd.DataFrame:
+        """Judged rows that stand beside each other: with a paper's numbers, on usual surrogates alone."""
+        return on_usual_model(self.judged) if self.paper else self.judged
+
+    @cached_property
+    def outcome(self) -> pd.DataFrame:
+        """Of the rows shown: see `summary.outcome`."""
+        return outcome(self.shown, self.timing)
 
     @cached_property
     def online(self) -> pd.DataFrame:

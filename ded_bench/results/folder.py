@@ -41,6 +41,11 @@ class ResultsFolder:
         return self.path / "timing.csv"
 
     @property
+    def latency(self) -> Path:
+        """Times that `ded-bench online` took itself, of several runs."""
+        return self.path / "latency.csv"
+
+    @property
     def schedules(self) -> Path:
         """Folder of the schedules of the results' rows."""
         return self.path / "schedules"
@@ -48,6 +53,17 @@ class ResultsFolder:
     def archive(self, method: str, settings: str, regime: str) -> Path:
         """The schedules of some rows (see `results.archive`)."""
         return self.schedules / method / settings / f"{regime}.npz"
+
+    @property
+    def failures(self) -> Path:
+        """Log of what methods raised, with whole tracebacks."""
+        return self.path / "failures.log"
+
+    def log_failure(self, what: str, trace: str) -> None:
+        """Add a traceback to the log; the folder is made if there is none."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        with self.failures.open("a", encoding="utf-8", errors="replace") as log:
+            log.write(f"{what}\n{trace}\n")
 
     @property
     def validated(self) -> Path:

@@ -18,6 +18,7 @@ import itertools
 import os
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ from tqdm import tqdm
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import Method, get_method, registered
 from ded_bench.methods.solution import Settings, Solution, Solver, named
+from ded_bench.plants.plant import servable
+from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.rows import Row
@@ -40,6 +43,8 @@ from ded_bench.surrogates.find import MODELS
 
 #: Instances that are timed, unless the caller says otherwise.
 SAMPLE = 10
+#: Drawn instances that tell a latency where nobody timed the method.
+FEW = 3
 #: How many rounds a job takes part in, as in `timeit.Timer.autorange`: the least of these numbers whose
 #: calls come to so many seconds, the largest for a method that is faster still.
 ROUNDS, ENOUGH_S = (1, 2, 5, 10), 5.0
@@ -161,6 +166,15 @@ def _turn(
     for instance, call in zip([warm_up, *instances], calls, strict=True):
         number = WARM_UP if instance is warm_up else row.round
         yield _timed_row(dataclasses.replace(row, round=number, instance=instance.id), call)
+
+
+def measure(case: Case, job: Job, path: Path) -> list[TimingRow]:
+    """Time one job on drawn instances, and add its calls to a table of several runs; returns them."""
+    warm_up, *instances = validation_instances(case, 1 + FEW, servable=servable)
+    with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
+        rows = bench(case, instances, [job], Path(name) / "timing.csv", warm_up=warm_up, rounds=1)
+    TIMING.write(path, [*read_timing(path), *rows])
+    return rows
 
 
 def rounds_of(rows: Iterable[TimingRow]) -> int:

@@ -48,7 +48,7 @@ class Cluster(Workers):
         try:
             distributed = importlib.import_module("distributed")  # a second, and only needed here
         except ImportError:
-            problem = "needs Dask, which is not installed: pip install 'ded-bench[cluster]'"
+            problem = "needs Dask, which is not installed: pip install distributed"
             raise InputError("--scheduler", scheduler, problem) from None
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what counts is said in one line
         self._killed: type[Exception] = distributed.KilledWorker

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
@@ -239,6 +240,7 @@ def serve(file_descriptor: int) -> None:
                 connection.send_bytes(b"")
             answer = function(*arguments)
         except BaseException as error:  # even sys.exit() of a method is only its answer
+            error.add_note("".join(traceback.format_exception(error)))  # which does not travel by itself
             answer = error
         connection.send_bytes(_pickled(answer))
 

@@ -17,7 +17,7 @@ from ded_bench.results.rows import Results, Row
 from ded_bench.run.cluster import open_workers
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.scoring import scored_row
-from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score
+from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score, trace_of
 
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
 #: what comes before the first solve of a process, imports and the building of the model: some seconds.
@@ -61,8 +61,10 @@ def run(
         limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
         with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
             for task, answer in pool.imap(calls, todo, limits):
-                lost = Answered(failed(answer), None, host() if scheduler is None else "")
-                solution, verdict, where = answer if isinstance(answer, Answered) else lost
+                lost = Answered(failed(answer), None, "" if scheduler else host(), trace_of(answer))
+                solution, verdict, where, trace = answer if isinstance(answer, Answered) else lost
+                if trace:
+                    results.paths.log_failure(f"{task.method} {task.regime} {task.instance.id}", trace)
                 row = unscored_row(task, solution, plant, pool.count, problems_version, where)
                 row = row if solution.schedule is None else scored_row(row, verdict)
                 results.keep(row, solution.schedule, case)

@@ -9,8 +9,10 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import re
 import tempfile
 import time
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +36,10 @@ from ded_bench.solvers.status import Status
 Files = tuple[tuple[str, bytes], ...]
 #: Folder of files that the settings name by their paths.
 _GIVEN = "given"
+#: A call in a traceback: file, line, function, code.
+_CALL = re.compile(r'File "(.+)", line (\d+), in (.+)\n +(.+)')
+#: Errors that say all there is to know.
+_EXPLAINED = (InputError, SimulationError, NoAnswerError, WorkerDiedError)
 
 
 @dataclass(frozen=True)
@@ -104,15 +110,16 @@ def fingerprint_of(case: Case, instance: Instance, key: Key, content: str = "") 
 
 
 class Answered(NamedTuple):
-    """A method's answer, the scorer's verdict if there is a schedule, and the machine."""
+    """A method's answer, the scorer's verdict if there is a schedule, the machine, and what it raised."""
 
     solution: Solution
     verdict: Score | Exception | None
     host: str
+    trace: str = ""
 
 
-def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
-    """Solve one task in this process; returns the Solution and the machine.
+def solve_task(case: Case, task: Task) -> Answered:
+    """Solve one task in this process, without a verdict.
 
     A method that raises, or answers with something that is no Solution for this instance, gives a
     failed Solution that says so.
@@ -120,9 +127,9 @@ def solve_task(case: Case, task: Task) -> tuple[Solution, str]:
     started = time.perf_counter()
     try:
         answer = prepared(case, task.method, task.regime, task.settings, task.files)(task.instance)
-        return accept(answer, case, task.instance, time.perf_counter() - started), host()
+        return Answered(accept(answer, case, task.instance, time.perf_counter() - started), None, host())
     except Exception as error:  # the boundary to other people's methods: a failure is a row
-        return failed(error), host()
+        return Answered(failed(error), None, host(), trace_of(error))
 
 
 @functools.lru_cache(maxsize=4)
@@ -152,11 +159,11 @@ def score_all(case: Case, questions: Sequence[Question]) -> list[Score | Excepti
 
 def solve_and_score(case: Case, task: Task, plant: str) -> Answered:
     """Solve and score one task in this process."""
-    solution, where = solve_task(case, task)
-    verdict: Score | Exception | None = None
-    if solution.schedule is not None:
-        (verdict,) = score_all(case, [(task.instance, solution.schedule, task.regime, plant)])
-    return Answered(solution, verdict, where)
+    answered = solve_task(case, task)
+    if (schedule := answered.solution.schedule) is None:
+        return answered
+    (verdict,) = score_all(case, [(task.instance, schedule, task.regime, plant)])
+    return answered._replace(verdict=verdict)
 
 
 def failed(error: object) -> Solution:
@@ -166,11 +173,22 @@ def failed(error: object) -> Solution:
 
 
 def reason_of(error: object) -> str:
-    """One line that a person understands and any file can hold."""
+    """One line that a person understands and any file can hold: the error, and the call that raised it."""
     first = (str(error).strip().splitlines() or ["no message"])[0]
     if isinstance(error, BaseException) and not isinstance(error, NoAnswerError | WorkerDiedError):
         first = f"{type(error).__name__}: {first}"
+    if calls := _CALL.findall(trace_of(error)):
+        path, line, name, code = calls[-1]
+        first = f"{first[:200]} ({Path(path).name}, line {line}, in {name}: {code})"
     return first.encode("utf-8", "replace").decode()[:300]
+
+
+def trace_of(error: object) -> str:
+    """The traceback of what was raised here or in another process; empty where the input is at fault."""
+    if not isinstance(error, BaseException) or isinstance(error, _EXPLAINED):
+        return ""
+    notes = getattr(error, "__notes__", None)
+    return str(notes[-1]) if notes else "".join(traceback.format_exception(error))
 
 
 def pack(settings: Settings, artifacts: Iterable[Artifact]) -> Files:

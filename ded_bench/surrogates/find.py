@@ -83,6 +83,8 @@ def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | Non
             if model_file(folder, name).is_file():
                 return model_file(folder, name)
         problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
+        if case.plant_name != "lossless":
+            problem = f"is of lossless networks, and {case.id} is none; use --model {TRAJECTORY}"
         raise InputError("--model", name, problem)
     if Path(name).is_file():
         return Path(name)

@@ -28,10 +28,18 @@ def test_an_accurate_method_elsewhere_whichever_has_scored_rows() -> None:
         ((ded, slp, radau), "ded-radau"),
         ((ded, slp, row("b", "ded-radau")), "ded-slp"),
         ((ded, slp, coarse), "ded-slp"),
-        ((ded,), "ded-radau"),
+        ((row("a", "ded"),), "ded-radau"),
         ((), "ded-radau"),
     ):
         assert choose_reference(frame_of(*rows), None).method == method
+
+
+def test_the_best_feasible_row_where_nobody_ran_it() -> None:
+    """Of each instance; it says so, and what to run."""
+    wrong = row("a", "ded", 80.0, feasible=False)
+    found = choose_reference(frame_of(wrong, row("a", "ed", 100.0), row("b", "mine", 50.0)), None)
+    assert (found.title, found.wanted) == ("the best feasible schedule", "ded-slp")
+    assert found.objectives.to_dict() == {("a", "TO"): 100.0, ("b", "TO"): 50.0}
 
 
 def test_shipped_objectives_stand_in_where_the_reference_was_not_run() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ded_bench.analysis.inspect_case import check_case, suggested_knots
+from ded_bench.analysis.inspect_case import check_case, implausible, suggested_knots
 from ded_bench.cli import main
 from ded_bench.files.strict import write_record
 from ded_bench.methods import ed
@@ -92,6 +93,32 @@ def test_knots_lie_on_the_grid_however_fast_the_mode(threebus: Case, fastest: fl
     assert suggested_knots(threebus, fastest) == knots
 
 
+def test_implausible_data_are_named(threebus: Case, alter) -> None:
+    """Each by its bus or machine; a sound case has nothing to say."""
+    found = check_case(threebus, 2)
+    sound = dataclasses.replace(found, frequency_hz=np.array([1.0]), knots=3, violating={"NO": 0.5})
+    machine = json.loads(threebus.model_dump_json(by_alias=True))["machines"]["plant"]
+    slow = alter(
+        threebus, machines={"plant": machine | {"m": 10.0 * machine["p_max"] / (np.pi * threebus.f0_hz)}}
+    )
+    assert list(implausible(slow, sound)) == []
+    buses = json.loads(threebus.model_dump_json(by_alias=True))["buses"]
+    for bus in buses:
+        bus |= {"v": 1.3, "p_nominal": 0.4} if bus["id"] == "town" else {}
+    strange = dataclasses.replace(
+        found, frequency_hz=np.array([1.0, 7.0]), knots=1000, violating={"NO": 0.0, "TO": 1.0}
+    )
+    assert [line.split(":")[0] for line in implausible(alter(threebus, buses=buses), strange)] == [
+        "loads that feed in, pu (a load that draws is negative)",
+        "|V| of buses, pu, outside 0.8 to 1.2",
+        "inertia constants, s, outside 1 to 15",
+        "modes, Hz, outside 0.1 to 3",
+        "knots",
+        "regime NO",
+        "regime TO",
+    ]
+
+
 def test_the_command_checks_a_case(threebus: Case, alter, tmp_path: Path, capsys) -> None:
     """Exit code 0; 1 where the grid cannot work; 2 where the file is wrong."""
     write_record(threebus, tmp_path / "good" / "case.json")
@@ -99,6 +126,7 @@ def test_the_command_checks_a_case(threebus: Case, alter, tmp_path: Path, capsys
     printed = capsys.readouterr().out
     found = check_case(threebus, 3)
     assert f"{found.frequency_hz[0]:.3f}" in printed
+    assert "warning      inertia constants, s, outside 1 to 15: plant" in printed
     assert f"{found.peak_hz['omega'][-1]:.4g}" in printed
     assert "3 of 3 servable" in printed
     lines = json.loads(threebus.model_dump_json(by_alias=True))["lines"]

@@ -8,16 +8,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ded_bench.analysis.findings import findings
 from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
     gaps,
     judged_elsewhere,
+    largest_violation,
+    outcome,
     summary,
-    tradeoff,
 )
 from ded_bench.results.rows import ROWS, Row
 
 DED = ("ded", "default")
+BROKEN = {"freq_violation_hz": 0.003, "feasible": False}
 NO_TIMES = pd.DataFrame([], columns=[*GROUP, "solve_s", "failures"])
 
 
@@ -96,14 +99,43 @@ def test_claims_and_verdicts_are_separate_rates(table: pd.DataFrame) -> None:
     assert ko["strict_rate"] == pytest.approx(2 / 5)
 
 
+def test_the_largest_violation_names_its_limit() -> None:
+    """In units of its tolerance, which is stricter on an island."""
+    far = {"freq_violation_hz": 5e-5, "ramp_violation": 3e-6, "bound_violation": 1e-7}
+    assert largest_violation(frame_of(row("a", "ded", 1.0, **far))) == "3e-06 pu (ramp)"
+    assert (
+        largest_violation(frame_of(row("a", "ded", 1.0, **far, excess_mean_hz=0.0))) == "5e-05 Hz (frequency)"
+    )
+    assert largest_violation(frame_of(row("a", "ded", 1.0, freq_violation_hz=5e-5))) == "none"
+    assert largest_violation(frame_of(row("a", "ded"))) == "–"
+
+
 def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
-    points = tradeoff(
+    points = outcome(
         with_gaps(table), pd.DataFrame([["TO", "ded-ko", "default", "", 0.25, 0]], columns=NO_TIMES.columns)
     ).set_index("method")
+    assert points.loc["ded-ko", ["rows", "solved", "feasible"]].to_list() == [5, 4, 3]
     assert points.loc["ded-ko", "seconds"] == 0.25
     assert points.loc["ded-ko", "alone"]
     assert points.loc["ded", "seconds"] == 1.0
     assert not points.loc["ded", "alone"]
+
+
+def test_findings_name_the_limit_that_is_broken() -> None:
+    """Own methods and those that failed, too."""
+    mine = row("a", "mine", 101.0, ramp_violation=0.02, feasible=False)
+    frame = with_gaps(
+        frame_of(row("a", "ded", 100.0, solve_s=2.0), mine, row("a", "ed", 1.0, **BROKEN), row("b", "ed"))
+    )
+    said = list(findings(outcome(frame), "DED"))
+    assert said == [
+        "**TO:** 1 of 3 methods and settings keep every limit on every instance; the fastest of these is "
+        "DED (+0 % over DED, 2 s).",
+        "**mine TO:** mine (+1 % over DED, 1 s); it keeps every limit on 0 of 1 instances; "
+        "largest violation: 0.02 pu (ramp).",
+        "**ED TO** failed on 1 of 2 instances.",
+        "Limits are broken, on some instance, by up to: ED TO by 0.003 Hz (frequency).",
+    ]
 
 
 def test_other_judges_count_what_they_could_judge() -> None:

@@ -50,6 +50,24 @@ def test_solve_prints_one_object_per_row_and_score_agrees(
     assert len(Results(out).rows) == 2
 
 
+@pytest.mark.usefixtures("inline")
+def test_solve_ends_with_a_table(problem: Path, tmp_path: Path, capsys) -> None:
+    """One line for each method, own ones first; why one failed, and where the whole traceback is."""
+    methods = "ed,tests.run.online.faulty_methods:lost"
+    arguments = ["solve", "--method", methods, "--regime", "NO", "--case", str(problem), "--limit", "1"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 1
+    out, err = capsys.readouterr()
+    heading, lost, ed, note = out.splitlines()
+    assert heading.split()[:5] == ["Regime", "Method", "n", "solved", "feasible"]
+    assert lost.split() == ["NO", "tests.run.online.faulty_methods.lost", "1", "0", "0", "–", "–", "–"]
+    assert ed.split()[:4] == ["NO", "ED", "1", "1"]
+    assert "gaps are to the best feasible schedule" in note or "gaps are to DED (SLP)" in note
+    assert "faulty_methods.lost NO, 1 time: KeyError: 'power' (faulty_methods.py, line 31, in lost: " in err
+    log = (tmp_path / "failures.log").read_text()
+    assert log.startswith("tests.run.online.faulty_methods.lost NO threebus-")
+    assert "Traceback (most recent call last)" in log
+
+
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
     """First one of the workers is killed, then the main process, whose workers go with it."""
     out = tmp_path / "out"

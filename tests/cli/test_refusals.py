@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 
 from ded_bench.cli import main
+from ded_bench.problem.benchmark import instance_file as instance_file_of
 from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
@@ -169,7 +171,48 @@ def test_a_disk_that_is_full(monkeypatch: pytest.MonkeyPatch, instance_file, tmp
     monkeypatch.setattr(os, "fsync", full)
     assert main([*SOLVE, "--instance", str(instance_file), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert said == ["ded-bench: 1 row to solve", "ded-bench: No space left on device"]
+    place = tmp_path / "out" / "schedules" / "ded" / "default" / "NO" / "columns.npy"
+    assert said == ["ded-bench: 1 row to solve", f"ded-bench: {place}: No space left on device"]
+
+
+def test_what_would_fill_the_memory(instance_file: Path, tmp_path: Path, capsys) -> None:
+    """A pipe that never ends, a schedule of a hundred thousand rows, a load of as many points."""
+    pipe, rows = tmp_path / "pipe", tmp_path / "rows.csv"
+    os.mkfifo(pipe)
+    rows.write_text("t,P_plant\n" + "0,0.6\n" * 100_002)
+    judge = ("score", "--regime", "NO", "--instance", instance_file, "--schedule")
+    assert "pipe: is no regular file" in refused(capsys, *judge, pipe)
+    assert "pipe: is no regular file" in refused(capsys, *SOLVE, "--instance", pipe)
+    assert "rows.csv: has more than 100000 rows" in refused(capsys, *judge, rows)
+    text = json.loads(instance_file.read_text())
+    load = {name: {"points": [[0.0, -1.0]] * 100_001} for name in text["load"]}
+    (tmp_path / "points.json").write_text(json.dumps(text | {"schema": "ded-bench/instance/2", "load": load}))
+    assert "at most 100000 items" in refused(capsys, *SOLVE, "--instance", tmp_path / "points.json")
+    (tmp_path / "long.json").write_bytes(b" " * (2**26 + 1))
+    assert "long.json: is larger than 64 MiB" in refused(capsys, *SOLVE, "--instance", tmp_path / "long.json")
+
+
+def test_instances_and_scenarios_that_are_not_there(problem: Path, tmp_path: Path, capsys) -> None:
+    """An id is as good as a file; a case without scenarios says how to draw them."""
+    assert "neither a file nor" in refused(capsys, *SOLVE, "--instance", "threebus-0000")  # none is shipped
+    chosen = instance_file_of(Path("threebus-0000"), str(problem))
+    assert chosen == problem / "instances" / "threebus-0000.json"
+    assert instance_file_of(Path("9bus-0001")).is_file()
+    line = refused(capsys, "online", "--method", "ed", "--case", problem, "--out", tmp_path)
+    assert f"`ded-bench scenarios --case {problem}` draws some" in line
+
+
+def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """While libraries are imported, too: one line."""
+
+    class Impatient:
+        def find_spec(self, *_: object) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "ded_bench.cli.commands")
+    monkeypatch.setattr(sys, "meta_path", [Impatient(), *sys.meta_path])
+    assert main(["cases"]) == 130
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

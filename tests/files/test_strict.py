@@ -50,8 +50,10 @@ def _literal(path: str, literal: str) -> str:
 
 #: name: (text, field, part of the problem)
 BAD = {
-    "unknown field": (_with("colour", 1), "colour", "extra inputs"),
-    "unknown nested field": (_with("load.town.colour", 1), "load.town.colour", "extra inputs"),
+    "unknown field": (_with("colour", 1), "colour", "unknown field"),
+    "misspelt field": (_with("dt", 1), "dt", "did you mean dt_s?"),
+    "misspelt nested field": (_with("load.town.rat", 1), "load.town.rat", "did you mean rate?"),
+    "unknown nested field": (_with("load.town.colour", 1), "load.town.colour", "unknown field"),
     "missing field": (_with("dt_s", REMOVED), "dt_s", "required"),
     "missing nested field": (_with("load.town.rate", REMOVED), "load.town.rate", "required"),
     "null": (_with("horizon_s", None), "horizon_s", "valid number"),

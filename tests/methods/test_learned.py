@@ -60,7 +60,7 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
     chosen = select_split(problem)
     settings = Settings("slope=0.001", search=(out,))
     (task, *_) = make_tasks(chosen.case, chosen.instances, ["learned"], ["TO"], settings)
-    here, _ = solve_task(chosen.case, task)
+    here = solve_task(chosen.case, task).solution
     assert here.schedule is not None
     files = pack(settings, LEARNED.artifacts(chosen.case, "TO", settings))
     assert sorted(name for name, _ in files) == [
@@ -68,10 +68,10 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
         "policies/learned-TO.safetensors",
     ]
     elsewhere = dataclasses.replace(settings, search=(tmp_path / "nowhere",))
-    there, _ = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere, files=files))
+    there = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere, files=files)).solution
     assert there.schedule is not None, there.error
     np.testing.assert_array_equal(there.schedule.p, here.schedule.p)
-    alone, _ = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere))
+    alone = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere)).solution
     assert "train-dpc --method learned --regime TO" in alone.error
 
 

@@ -92,7 +92,7 @@ def _add_bus(**bus: object):
 @pytest.mark.parametrize(
     ("edit", "field", "problem"),
     [
-        (_set("colour", "red"), "colour", "extra inputs"),
+        (_set("colour", "red"), "colour", "unknown field"),
         (_drop("f0_hz"), "f0_hz", "required"),
         (_set("schema", "ded-bench/case/3"), "schema", "'ded-bench/case/1' or 'ded-bench/case/2'"),
         (_set("knots", 50), "", "knots: belongs to schema ded-bench/case/2"),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
+import pytest
+
 from ded_bench.plants.lossless.stepper import solve_angles
-from ded_bench.problem.compiled import sources_stamp
+from ded_bench.problem.compiled import _Announced, sources_stamp
 
 CALLED = "@compiled\ndef called(x):\n    return x + 1\n"
 CALLS = "from called import called\n@compiled\ndef calls(x):\n    return called(x)\n"
@@ -29,3 +32,13 @@ def test_a_change_in_any_compiled_file_counts(tmp_path: Path) -> None:
 
 def test_the_cache_of_a_function_has_the_stamp() -> None:
     assert solve_angles._cache._cache_file._version == sources_stamp()
+
+
+def test_a_person_is_told_once_what_is_waited_for(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """At a terminal; a log is not."""
+    for is_terminal, lines in ((False, 0), (True, 1)):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        announced = _Announced()
+        for _ in range(2):
+            announced.on_start(None)
+        assert capsys.readouterr().err.count("compiling, once after installing") == lines

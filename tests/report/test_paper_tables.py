@@ -13,7 +13,7 @@ from ded_bench.analysis.paper_numbers import Paper, read_paper, result_lines
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.report.columns import TABLE_V, TABLE_VI, Column, tabulate, without_paper
+from ded_bench.report.columns import TABLE_V, TABLE_VI, Column, tabulate
 from tests.analysis.test_summary import NO_TIMES, frame_of, row, table, with_gaps
 
 __all__ = ["table"]
@@ -30,14 +30,9 @@ def times(*rows: tuple[str, float, int]) -> pd.DataFrame:
     return pd.DataFrame(cells, columns=NO_TIMES.columns)
 
 
-def made(
-    columns: tuple[Column, ...],
-    frame: pd.DataFrame,
-    timing: pd.DataFrame = NO_TIMES,
-    paper: Paper | None = PAPER,
-) -> pd.DataFrame:
+def made(columns: tuple[Column, ...], frame: pd.DataFrame, timing: pd.DataFrame = NO_TIMES) -> pd.DataFrame:
     """A table by regime, method and settings."""
-    lines = result_lines(with_gaps(frame), timing, paper, "ded")
+    lines = result_lines(with_gaps(frame), timing, PAPER, "ded")
     return tabulate(columns, lines).set_index(["regime", "method", "settings"])
 
 
@@ -85,9 +80,6 @@ def test_the_papers_numbers_lie_beside_its_case_only(ninebus: Case, tmp_path: Pa
     assert PAPER.case_fingerprint == ninebus.fingerprint
     assert set(PAPER.regimes) == set(ninebus.regimes)
     assert read_paper(tmp_path) is None
-    columns = without_paper(TABLE_V, "DED (SLP)")
-    assert not [column for column in columns if "paper" in column.name]
-    assert made(columns, frame_of(), paper=None).empty
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,9 @@ def test_printed_numbers_are_the_csvs(report, finished: Path, name: str, columns
     table = pd.read_csv(finished / "tables" / f"{name}.csv", keep_default_na=False, na_values=[""])
     text = (finished / "report.md").read_text()
     printed = cells(text, {"table_v": "**Table V:", "table_vi": "**Table VI:"}[name])
-    assert len(printed) == len(table) == 8
+    assert len(table) == 8
+    table = table[table["n"] > 0]  # what was not run is folded away
+    assert len(printed) == len(table) == 6
     for row, (_, numbers) in zip(printed, table.iterrows(), strict=True):
         for cell, column in zip(row, columns, strict=True):
             value = numbers[column.name]

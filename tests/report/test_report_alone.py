@@ -9,9 +9,13 @@ import pandas as pd
 import pytest
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods.solution import Settings
+from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.report.report import write_report
 from ded_bench.results.rows import Results, Row
+from ded_bench.run.runner import run
+from ded_bench.run.tasks import make_tasks
 from tests.detailed_cases import MIXED
 
 
@@ -33,15 +37,31 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
     rows[1] = dataclasses.replace(rows[1], objective=103.0)
     Results(tmp_path).add([*rows, dataclasses.replace(rows[0], instance="y", case="elsewhere")])
     write_report(threebus, tmp_path, tmp_path / "no-problems")
-    made = pd.read_csv(tmp_path / "tables" / "table_v.csv")
-    assert not [name for name in made.columns if "paper" in name]
-    assert made.set_index("method").loc["ed", "increase_percent"] == pytest.approx(3.0)
-    assert "% increase in obj. over DED (SLP)" in (tmp_path / "report.md").read_text()
+    made = pd.read_csv(tmp_path / "tables" / "methods.csv").set_index("method")
+    assert made.loc["ed", "gap_percent"] == pytest.approx(3.0)
+    assert made.loc["ed", ["rows", "solved", "feasible"]].to_list() == [1, 1, 1]
+    text = (tmp_path / "report.md").read_text()
+    assert 0 < text.index("keep every limit") < text.index("The methods that were run")
+    assert "Table V" not in text
+
+
+@pytest.mark.usefixtures("sketched")
+def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path) -> None:
+    """The best feasible schedule is the yardstick, and the first kept schedule is drawn."""
+    instances = select_split(problem, "all").instances[:2]
+    tasks = make_tasks(threebus, instances, ["ed"], ["NO"], Settings())
+    run(threebus, tasks, Results(tmp_path))
+    said: list[str] = []
+    write_report(threebus, tmp_path, problem, said.append)
+    text = (tmp_path / "report.md").read_text()
+    assert "Nobody ran DED (SLP): gaps are to the best feasible schedule" in text
+    assert "(figures/schedule_NO.png)" in text
+    assert said[0].startswith("NO: 1 of 1 methods and settings keep every limit")
 
 
 @pytest.mark.usefixtures("sketched")
 def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
-    """Means of rows, in mHz, before the paper's tables; beside a slack there is no such table."""
+    """Means of rows, in mHz; beside a slack there is no such table."""
     case = Case.load(MIXED)
     facts = {"objective": 1.0, "feasible": True, "swing_max_hz": 0.001, "case": case.id, "plant": "detailed"}
     rows = [
@@ -65,7 +85,7 @@ def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
         [5.0, 1.0, 2.0]
     )
     text = (tmp_path / "report.md").read_text()
-    assert 0 < text.index("peak of the mean frequency") < text.index("Table V:")
+    assert 0 < text.index("The methods that were run") < text.index("peak of the mean frequency")
 
 
 def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_path: Path) -> None:

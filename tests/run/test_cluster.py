@@ -102,7 +102,7 @@ def test_rows_are_those_of_this_process(address: str, make, threebus: Case, tmp_
     linear_model(threebus).save(model_file(tmp_path / "mine", "koopman"))
     tasks = make("a", "b", method="ded-ko", settings=Settings(search=(tmp_path / "mine",)))
     for task, row in zip(tasks, run(threebus, tasks, Results(tmp_path), scheduler=address), strict=True):
-        solution, host = solve_task(threebus, task)
+        solution, _, host, _ = solve_task(threebus, task)
         assert solution.schedule is not None
         verdict = score(threebus, task.instance, solution.schedule, task.regime)
         assert row.objective == pytest.approx(verdict.objective, rel=1e-9)  # the CSV keeps 15 digits

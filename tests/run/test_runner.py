@@ -145,7 +145,9 @@ def test_failures_are_rows_and_the_run_goes_on(strange, make, threebus: Case, tm
     rows = run(threebus, tasks, Results(tmp_path / "out"), workers=2)
     by_name = {row.instance: row for row in rows}
     assert by_name["raise-1"].status == "Failed"
-    assert by_name["raise-1"].error == "ValueError: no idea how"
+    assert by_name["raise-1"].error.startswith("ValueError: no idea how (strange_methods.py, line ")
+    log = (tmp_path / "out" / "failures.log").read_text()
+    assert log.startswith("ded NO raise-1\nTraceback (most recent call last)")
     assert by_name["crash-1"].status == "Failed"
     assert f"died {ATTEMPTS} times" in by_name["crash-1"].error
     assert by_name["calm-1"].objective is not None

@@ -13,9 +13,8 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import Bbox
 
-from ded_bench.analysis.lines import on_usual_model, title
+from ded_bench.analysis.lines import title
 from ded_bench.analysis.paper_numbers import Paper
-from ded_bench.analysis.summary import tradeoff
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.figures.style import GREY, Drawn, colour, legend_below, marker, new_figure, plain
 from ded_bench.report.sources import Sources
@@ -31,9 +30,10 @@ SIDES = (
 
 def draw(sources: Sources) -> Iterator[Drawn]:
     """One point per line of the tables, where there is a gap."""
-    rows = on_usual_model(sources.judged) if sources.paper else sources.judged
-    points = tradeoff(rows[rows["regime"].isin(list(sources.case.regimes))], sources.timing)
-    points = points.dropna(subset=["gap_percent", "seconds"])
+    points = sources.outcome
+    points = points[points["regime"].isin(list(sources.case.regimes))].dropna(
+        subset=["gap_percent", "seconds"]
+    )
     if not len(points):
         return
     caption = (
@@ -59,7 +59,7 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
     """One panel per regime. A method's lines share its colour and marker, and a thin line joins them.
 
     Args:
-        points: see `summary.tradeoff`. Hollow markers: some schedules are infeasible.
+        points: see `summary.outcome`. Hollow markers: some schedules are infeasible.
         reference: its title.
         papers: see `paper_points`; drawn in grey.
     """

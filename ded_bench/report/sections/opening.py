@@ -1,20 +1,21 @@
-"""The paper's two tables, what they say and what to know first; then both in full, and the schedules."""
+"""Findings, the trade-off and the methods that were run; then the paper's tables, and the schedules."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import pandas as pd
 
-from ded_bench.analysis.lines import on_usual_model, title, titled
+from ded_bench.analysis.findings import findings, own_first
+from ded_bench.analysis.lines import title, titled
 from ded_bench.analysis.online_summary import practice_lines
-from ded_bench.analysis.paper_numbers import result_lines
+from ded_bench.analysis.paper_numbers import Paper, result_lines
 from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
 from ded_bench.problem.case import Case
-from ded_bench.report.columns import ISLAND, PRACTICE, TABLE_V, TABLE_VI, tabulate, without_paper
+from ded_bench.report.columns import ISLAND, OUTCOME, PRACTICE, TABLE_V, TABLE_VI, tabulate
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sources import Sources
 
@@ -33,17 +34,14 @@ EXPLANATION = (
     "**Success** is what a method claims, **feasible** what the scorer found: frequency within "
     f"{FEASIBLE_HZ:g} Hz (islands: {ISLAND_HZ:g} Hz), power limits within {FEASIBLE_PU:g} pu (strictly: "
     f"{STRICT_HZ:g} Hz and {STRICT_PU:g} pu).",
-    "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly instances weigh more "
-    "in it than in the mean of the gaps.",
-    "**Solution times** are those of `ded-bench bench` alone on one machine; times of the results table were "
-    "taken while several workers shared the machine and stand in no table here.",
+    "**The ratio of summed costs** is ΣJ / ΣJ_ref over the same `n` instances: costly ones weigh more in it.",
     "**Names** in brackets are options and surrogates that differ from a method's usual ones.",
 )
 
 
 def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """The first screen, and all methods folded away."""
-    case, reference, paper = sources.case, sources.reference, sources.paper
+    case, reference = sources.case, sources.reference
     regimes = "; ".join(f"{name} {limit.sentence}" for name, limit in case.regimes.items())
     slack = "on an island, all scheduled" if case.slack is None else "besides the slack bus"
     what = (
@@ -52,27 +50,24 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         f"Every objective and violation is re-simulated on {idealisation(case)}; "
         f"gaps are to {reference.title}."
     )
-    # Beside the paper's numbers, methods stand on their usual surrogates alone.
-    rows = on_usual_model(sources.judged) if paper else sources.judged
-    lines = result_lines(rows, sources.timing, paper, reference.method)
-    five, six = _paper_tables(sources, lines)
-    papers = lines["paper_solve_s"].notna()
-    shown = papers if papers.any() else lines["settings"] == DEFAULT
-    said = [*_against_paper(five.frame, six.frame)]
+    papers = _paper_tables(sources, sources.paper) if sources.paper else []
+    found = own_first(sources.outcome)
+    said = [*findings(found, reference.title), *_against_paper([table.frame for table in papers])]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
+    usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
     notes = (*data_notes(sources), *sources.notes)
     return [
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
         *(Text(text, note=True) for text in alarms(sources)),
+        Items(tuple(said)),
+        *pictures["tradeoff"],
+        *usual_first(PageTable(found, OUTCOME, _methods_caption(sources), "methods"), usual),
         *_on_island(sources),
         *_in_operation(sources),
         *pictures["practice"],
-        *usual_first(five, shown),
-        *usual_first(six, shown),
-        Items(tuple(said)),
-        *pictures["tradeoff"],
-        *folded(f"What is missing or mixed: {len(notes)}", *[Items(notes)] * bool(notes)),
+        *(block for table in papers for block in _beside_paper(table)),
+        *folded("What is missing or mixed", *[Items(notes)] * bool(notes)),
         *folded("How to read the tables", Items(EXPLANATION)),
         Heading("Schedules and frequencies"),
         *pictures["schedules"],
@@ -109,28 +104,41 @@ def _in_operation(sources: Sources) -> Iterator[PageTable]:
         yield PageTable(tabulate(PRACTICE, lines), PRACTICE, caption, "practice")
 
 
-def _paper_tables(sources: Sources, lines: pd.DataFrame) -> Iterator[PageTable]:
-    """Tables V and VI; without the paper's columns where it has no numbers."""
-    rows, timing = rows_caption(sources), sources.timing
-    timed = "times: not taken yet, run `ded-bench bench`"
+def _methods_caption(sources: Sources) -> str:
+    timing, timed = sources.timing, "of this run under load: `ded-bench bench` takes better ones"
     if len(timing):
         counts = "/".join(map(str, sorted(set(timing["instances"]))))
-        timed = f"times: median on {counts} instances, alone on {timing['host'].iloc[-1]}"
-    for file, columns, caption in (
-        ("table_v", TABLE_V, f"Table V: Average Solution Time and Change in Objective ({rows}; {timed})"),
-        ("table_vi", TABLE_VI, f"Table VI: Average maximum constraint violation ({rows})"),
-    ):
-        own = columns if sources.paper else without_paper(columns, sources.reference.title)
-        yield PageTable(tabulate(own, lines), own, caption, file)
+        timed = f"medians on {counts} instances, alone on {timing['host'].iloc[-1]}"
+    return f"The methods that were run ({rows_caption(sources)}; times: {timed})"
 
 
-def _against_paper(five: pd.DataFrame, six: pd.DataFrame) -> Iterator[str]:
+def _paper_tables(sources: Sources, paper: Paper) -> list[PageTable]:
+    """Tables V and VI."""
+    lines = result_lines(sources.shown, sources.timing, paper, sources.reference.method)
+    rows = rows_caption(sources)
+    five = f"Table V: Average Solution Time and Change in Objective ({rows})"
+    six = f"Table VI: Average maximum constraint violation ({rows})"
+    return [
+        PageTable(tabulate(TABLE_V, lines), TABLE_V, five, "table_v"),
+        PageTable(tabulate(TABLE_VI, lines), TABLE_VI, six, "table_vi"),
+    ]
+
+
+def _beside_paper(table: PageTable) -> list[Block]:
+    """A table of the paper's: its rows that were run in sight; folded away where it has none of them."""
+    papers = table.frame.filter(regex="^paper_").notna().any(axis=1) & (table.frame["n"] > 0)
+    return usual_first(table, papers) if papers.any() else folded(table.caption, table)
+
+
+def _against_paper(tables: Sequence[pd.DataFrame]) -> Iterator[str]:
     """How many cells of the paper's tables are ahead of its numbers."""
-    marks = pd.concat([table.filter(like="against_paper") for table in (five, six)], axis=1)
+    if not tables:
+        return
+    marks = pd.concat([table.filter(like="against_paper") for table in tables], axis=1)
     counts = marks.stack().value_counts()
     if total := int(counts.drop("", errors="ignore").sum()):
         behind = dict.fromkeys(
-            five[(marks == "behind").any(axis=1)][["title", "regime"]].agg(" ".join, axis=1)
+            tables[0][(marks == "behind").any(axis=1)][["title", "regime"]].agg(" ".join, axis=1)
         )
         yield (
             f"**Against the paper:** {counts.get('ahead', 0)} of {total} cells of both tables are ahead of "
@@ -153,18 +161,16 @@ def rows_caption(sources: Sources) -> str:
 def alarms(sources: Sources) -> list[str]:
     """Why a report has nothing to compare; empty if it has."""
     case, judged, reference = sources.case, sources.judged, sources.reference
-    solve = f"ded-bench solve --case {case.id} --method {reference.method} --regime {','.join(case.regimes)}"
+    method = reference.method or reference.wanted
+    solve = f"ded-bench solve --case {case.id} --method {method} --regime {','.join(case.regimes)}"
     if not len(sources.rows):
         return [f"No rows yet: `{solve}` makes some."]
     if not judged["objective"].notna().any():
         return ["No row has a score: every method failed, or nothing was scored yet (see the column error)."]
     if judged["gap_percent"].notna().any():
-        return []
-    return [
-        f"No gap can be given: gaps are to {reference.title}, which has no scored row in this folder, and "
-        "the reference run that ships holds no objective for these instances of problem version "
-        f"{_versions(judged)}. `{solve}` makes rows to compare with."
-    ]
+        missing = f"Nobody ran {title(method)}: gaps are to the best feasible schedule of each instance"
+        return [] if reference.method else [f"{missing}. `{solve}` makes rows of the usual reference."]
+    return [f"No gap can be given: no row keeps every limit, and nobody ran {title(method)}. `{solve}` does."]
 
 
 def data_notes(sources: Sources) -> list[str]:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import LARGEST
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, named
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.problem.case import Case
@@ -82,9 +82,7 @@ def make_operations(
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
             model, policy = named(artifacts, "model"), named(artifacts, "policy")
-            timed = method.canonical(settings, timed=True).options
-            job = regime, method.name, timed, model_name(model)
-            seconds, source = _latency(case, job, latency, timing)
+            seconds, source = _latency(case, timed_job(case, method, regime, settings), latency, timing)
             longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
             own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
             for scenario in scenarios:
@@ -160,7 +158,14 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     judgement = judge_operation(case, o.scenario, trajectory, asked.regime)
     keep_trajectory(files.trajectory(asked.key), trajectory)
     missing = [answer for answer in answers if answer.schedule is None]
-    row = _row(o, judgement, reason_of(missing[0].error) if missing else "")
+    for answer in missing[:1]:
+        what = f"online {asked.method} {asked.regime} {asked.scenario}"
+        ResultsFolder(files.folder).log_failure(what, answer.trace or answer.error)
+    reason = reason_of(missing[0].error) if missing else ""
+    if answers and len(missing) == len(answers):  # what happened then is no result of the method
+        row = _row(o, None, f"every plan failed: {reason}")
+    else:
+        row = _row(o, judgement, reason)
     method_s = sum(answer.seconds for answer in answers)
     loop_s = time.perf_counter() - started - method_s
     try:
@@ -250,8 +255,14 @@ def _latency(
     return seconds, "given"
 
 
+def timed_job(case: Case, method: Method, regime: str, settings: Settings) -> tuple[str, str, str, str]:
+    """What times of a method are found by (see `TimingRow.job`)."""
+    model = model_name(named(method.artifacts(case, regime, settings), "model"))
+    return regime, method.name, method.canonical(settings, timed=True).options, model
+
+
 def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[Path]) -> float:
-    """Median build and solve time in the `timing.csv` of the first folder that timed a method, s.
+    """Median build and solve time in the tables of the first folder that timed a method, s.
 
     Args:
         case: the grid.
@@ -262,7 +273,8 @@ def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[
         InputError: none of the folders has such times (names the command that makes them).
     """
     for folder in folders:
-        rows = read_timing(ResultsFolder(folder).timing)
+        paths = ResultsFolder(folder)
+        rows = [*read_timing(paths.timing), *read_timing(paths.latency)]
         times = [
             (row.build_s or 0.0) + (row.solve_s or 0.0)
             for row in rows

@@ -15,7 +15,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError, Workers
 from ded_bench.run.runner import GRACE_S
-from ded_bench.run.tasks import prepared
+from ded_bench.run.tasks import prepared, reason_of, trace_of
 from ded_bench.solvers.status import Status
 
 #: How long a method may take for one plan unless told otherwise, s of the clock.
@@ -32,6 +32,7 @@ class Planned:
     infeasible: bool = False  # no schedule meets every limit, says the method; this one, if any, comes near
     seconds: float = 0.0  # of the clock, with the way to the method's process and back
     error: str = ""
+    trace: str = ""  # of what it raised
 
 
 #: Asks for a plan; the second argument is the last one, on the time of the instance.
@@ -68,7 +69,8 @@ class Planner:
     def _none(self, error: object, started: float) -> Planned:
         self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
         late = isinstance(error, NoAnswerError)
-        return Planned(None, late, seconds=time.perf_counter() - started, error=str(error))
+        seconds = time.perf_counter() - started
+        return Planned(None, late, seconds=seconds, error=reason_of(error), trace=trace_of(error))
 
 
 def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:

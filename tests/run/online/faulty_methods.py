@@ -26,6 +26,11 @@ def raises(instance: Instance, regime: str, case: Case) -> Schedule:
     return ed.dispatch(case, instance, 1.0)
 
 
+def lost(instance: Instance, regime: str, case: Case) -> Schedule:
+    """Never knows."""
+    return {}["power"]  # type: ignore[no-any-return,index]
+
+
 def nonsense(instance: Instance, regime: str, case: Case) -> Schedule:
     """Answer with what is no number."""
     if _third(instance):

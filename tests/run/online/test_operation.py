@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from ded_bench.cli import main
+from ded_bench.cli.online_commands import _print_row
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import scenario_files, write_scenarios
 from ded_bench.problem.scenario import load_scenarios
-from ded_bench.results.online_results import OnlineKey, OnlineResults, read_trajectory
+from ded_bench.results.online_results import OnlineKey, OnlineResults, OnlineRow, read_trajectory
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions
 from ded_bench.run.online.operation import make_operations, operate
@@ -111,6 +112,39 @@ def test_faults_are_in_the_row(threebus, scenarios, tmp_path):
     assert row.objective is not None
 
 
+@pytest.mark.usefixtures("inline")
+def test_no_plan_is_no_result(threebus, scenarios, tmp_path, capsys):
+    """Exit code 1, the reason in a line, the traceback in a log; one that is not timed is timed first."""
+    line = ["online", "--case", str(CASE_FILES["threebus"]), "--regime", "TO", "--out", str(tmp_path)]
+    line += ["--scenario", str(scenarios[0]), "--method"]
+    assert main([*line, f"{FAULTY}:lost", "--latency", "0"]) == 1
+    (row,) = OnlineResults(tmp_path).table.rows.values()
+    assert (row.objective, row.failed) == (None, row.plans)
+    said = capsys.readouterr().err
+    assert "every plan failed: KeyError: 'power' (faulty_methods.py, line" in said
+    log = (tmp_path / "failures.log").read_text()
+    assert "Traceback (most recent call last)" in log
+    assert main([*line, f"{FAULTY}:lost"]) == 1
+    assert "has no answer to any of them: KeyError" in capsys.readouterr().err
+    assert main([*line, "ed"]) == 0
+    found = [r for r in OnlineResults(tmp_path).table.rows.values() if r.method == "ed"]
+    assert found[0].latency_source == "timing"
+    assert main([*line, "ed"]) == 0  # and not a second time
+    assert len(OnlineResults(tmp_path).table.rows) == 2
+
+
+def test_less_than_hindsight_says_why(capsys):
+    """Hindsight keeps the bound."""
+    row = OnlineRow(
+        "s", "TO", "ed", "default", 1.0, 0.0, "announced", True, True, objective=1.0, max_excess_hz=1e-3
+    )
+    for over in (-0.5, 0.5):
+        _print_row(dataclasses.replace(row, increase_percent=over))
+    first, second = capsys.readouterr().out.splitlines()
+    assert "-0.5000 % over hindsight (less than it, since the bound is exceeded)" in first
+    assert "exceeded" not in second
+
+
 def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_path):
     """Of the first folder that timed it; warm-ups, failures and other settings do not count."""
     times = [(0, 9.0, ""), (1, 0.1, ""), (2, 0.3, ""), (3, 0.2, ""), (4, 7.0, "failed")]
@@ -184,9 +218,11 @@ def test_the_command(scenarios, tmp_path, capsys):
     assert main([*line, "--latency", "zero"]) == 0
     assert "over hindsight" in capsys.readouterr().out
     assert main([*line, "--latency", "0"]) == 0
-    assert capsys.readouterr().out == ""
+    assert "% over hindsight" not in capsys.readouterr().out
     assert main([*line, "--latency", "0,1.5", "--forecast", "announced,perfect"]) == 0
-    assert capsys.readouterr().out.count("over hindsight") == 3
+    printed = capsys.readouterr().out
+    assert printed.count("% over hindsight") == 3
+    assert printed.splitlines()[-1].split()[:4] == ["TO", "ED", "[every=1]", "1.5"]  # a table ends it
     rows = OnlineResults(tmp_path).table.rows
     assert {(key.latency_s, key.forecast) for key in rows} == set(
         itertools.product((0.0, 1.5), ("announced", "perfect"))
@@ -198,7 +234,6 @@ def test_the_command(scenarios, tmp_path, capsys):
     ("change", "said"),
     [
         (["--latency", "soon"], "--latency"),
-        (["--latency", "timing"], "not timed"),
         (["--latency", "0,-1"], "neither timing nor zero nor a number"),
         (["--method", "nobody"], "unknown method"),
         (["--regime", "XX"], "unknown regime"),

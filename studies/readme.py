@@ -1,0 +1,119 @@
+"""Fill the tables of README.md from the reference runs: `python studies/readme.py`.
+
+Each table stands between `<!-- NAME -->` and `<!-- end -->`, and is made of the rows of the reference runs,
+`results/<case>-reference/`, in the tight regime TO unless a column says otherwise.
+"""
+
+import functools
+import re
+from pathlib import Path
+
+import pandas as pd
+
+from ded_bench.analysis.lines import titled
+from ded_bench.analysis.online_summary import own_latency
+from ded_bench.analysis.paper_numbers import result_lines
+from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.report.sources import Sources, read_sources
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+GRIDS = ("9bus", "two-area", "39bus", "68bus", "140bus")
+#: Heading and seconds of a time budget.
+BUDGETS = {"1 ms": 1e-3, "10 ms": 1e-2, "1 s": 1.0, "offline": float("inf")}
+#: A method is of use if it keeps every limit on so many instances.
+KEPT = 0.95
+
+
+@functools.cache
+def run(case: str) -> Sources:
+    """The reference run of a grid."""
+    folder = REPOSITORY / "results" / f"{case}-reference"
+    return read_sources(Case.load(SHIPPED_CASES / case), folder, SHIPPED_CASES / case)
+
+
+def markdown(heads: list[str], rows: list[list[str]]) -> str:
+    """A pipe table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def paper() -> str:
+    """The paper's Tables V and VI side by side, each number of ours before the paper's."""
+    sources = run("9bus")
+    both = result_lines(sources.shown, sources.timing, sources.paper, sources.reference.method)
+    both = both[both["paper_solve_s"].notna() & (both["settings"] == "default")]
+    both = both.rename(columns=lambda name: name.removesuffix("_mean"))
+    names = ("increase_percent", "solve_s", "freq_violation_hz", "ramp_violation")
+    rows = [
+        [line["regime"], line["title"], *(number(line[p + name]) for name in names for p in ("", "paper_"))]
+        for _, line in both.iterrows()
+    ]
+    heads = [
+        head
+        for name in ("% over DED", "time (s)", "frequency (Hz)", "ramp (pu)")
+        for head in (name, "paper's")
+    ]
+    return markdown(["Regime", "Method", *heads], rows)
+
+
+def methods() -> str:
+    """Of each grid and time budget the cheapest method that keeps every limit on nearly all instances."""
+    rows = []
+    for case in GRIDS:
+        found = run(case).outcome
+        useful = found[(found["regime"] == "TO") & (found["correct_rate"] >= KEPT) & found["alone"]]
+        cells = []
+        for seconds in BUDGETS.values():
+            able = useful[useful["seconds"] <= seconds].sort_values(["gap_percent", "seconds"])
+            cells.append(
+                f"{able['title'].iloc[0]} ({able['gap_percent'].iloc[0]:+.2g} %)" if len(able) else "–"
+            )
+        rows.append([case, *cells])
+    return markdown(["Grid", *BUDGETS], rows)
+
+
+def loop() -> str:
+    """Cost and excess in the closed loop: static dispatch, the cheapest plans, those that exceed least."""
+    rows = []
+    for case in GRIDS:
+        found = titled(own_latency(run(case).online))
+        found = found[found["regime"] == "TO"] if len(found) else found
+        planned = found[found["method"] != "ed"] if len(found) else found
+        if not len(planned):
+            continue
+        static = found[(found["method"] == "ed") & (found["settings"] == "every=1")]
+        chosen = [
+            static.iloc[0],
+            planned.loc[planned["increase_percent_mean"].idxmin()],
+            planned.loc[planned["max_excess_mhz_mean"].idxmin()],
+        ]
+        rows.append([case, *(operated(line) for line in chosen)])
+    return markdown(["Grid", "static dispatch every second", "cheapest plans", "least excess"], rows)
+
+
+def operated(line: pd.Series) -> str:
+    """A method in the loop: cost over hindsight and mean of the largest excess."""
+    cost, excess = line["increase_percent_mean"], line["max_excess_mhz_mean"]
+    often = "" if line["period_s"] == 1 else f" every {line['period_s']:.2g} s"
+    return f"{line['title']}{often}: {cost:+.2g} %, {excess:.2g} mHz"
+
+
+def number(value: float) -> str:
+    """Three digits; a dash for what is missing."""
+    return "–" if pd.isna(value) else f"{value:.3g}"
+
+
+def filled(text: str) -> str:
+    """A page whose tables are made anew."""
+    for make in (methods, loop, paper):
+        marks = rf"(<!-- {make.__name__} -->\n).*?(<!-- end -->)"
+        made = make()
+        text, count = re.subn(marks, lambda m, made=made: f"{m[1]}\n{made}\n{m[2]}", text, flags=re.S)
+        if count != 1:
+            raise SystemExit(f"README.md: no place for the table {make.__name__}")
+    return text
+
+
+if __name__ == "__main__":
+    page = REPOSITORY / "README.md"
+    page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")

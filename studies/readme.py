@@ -108,7 +108,7 @@ def filled(text: str) -> str:
     for make in (methods, loop, paper):
         marks = rf"(<!-- {make.__name__} -->\n).*?(<!-- end -->)"
         made = make()
-        text, count = re.subn(marks, lambda m, made=made: f"{m[1]}\n{made}\n{m[2]}", text, flags=re.S)
+        text, count = re.subn(marks, lambda m, made=made: f"{m[1]}\n{made}{m[2]}", text, flags=re.S)
         if count != 1:
             raise SystemExit(f"README.md: no place for the table {make.__name__}")
     return text

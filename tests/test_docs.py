@@ -137,3 +137,10 @@ def test_methods_are_documented() -> None:
     for table in (REPOSITORY / "results").glob("*-reference/tables/objectives.csv"):
         committed |= set(pd.read_csv(table)["method"])
     assert committed <= set(named)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_are_short(page: Path) -> None:
+    """README has two screens, every other page one reader."""
+    text = page.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120 if page.name == "README.md" else len(text.split()) <= 1500

@@ -26,7 +26,7 @@ from ded_bench.results.online_results import OnlineRow
 from ded_bench.results.rows import ROWS, Results, Row
 
 #: Of the closed loop's columns, those that a terminal has room for.
-_LOOP = (*HEAD, "latency_s", "n", "failures", "increase_percent_mean", "max_excess_mhz_max", "failed")
+_LOOP = (*HEAD, "latency_s", "n", "failures", "increase_percent_mean", "max_excess_mhz_mean", "failed")
 
 
 def tell_solved(case: Case, place: str | None, results: Results, rows: Sequence[Row], out: TextIO) -> None:

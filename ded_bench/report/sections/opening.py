@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import pandas as pd
 
 from ded_bench.analysis.findings import findings, own_first
-from ded_bench.analysis.lines import title, titled
+from ded_bench.analysis.lines import records, title, titled
 from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.paper_numbers import Paper, result_lines
 from ded_bench.analysis.summary import island_summary
@@ -137,9 +137,8 @@ def _against_paper(tables: Sequence[pd.DataFrame]) -> Iterator[str]:
     marks = pd.concat([table.filter(like="against_paper") for table in tables], axis=1)
     counts = marks.stack().value_counts()
     if total := int(counts.drop("", errors="ignore").sum()):
-        behind = dict.fromkeys(
-            tables[0][(marks == "behind").any(axis=1)][["title", "regime"]].agg(" ".join, axis=1)
-        )
+        rows = records(tables[0][(marks == "behind").any(axis=1)])
+        behind = dict.fromkeys(f"{row['title']} {row['regime']}" for row in rows)
         yield (
             f"**Against the paper:** {counts.get('ahead', 0)} of {total} cells of both tables are ahead of "
             f"its numbers, {counts.get('equal', 0)} equal; behind: {', '.join(behind) or 'none'}."

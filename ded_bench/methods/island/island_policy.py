@@ -1,0 +1,89 @@
+"""`ded-admm` on islands: learned penalties, iterations along simulations in coarse steps.
+
+From the loads' changes shared by all machines, sent through the governors' inverse filter, iterations with
+costs lead to a first answer; where its simulation comes too near a bound, iterations without costs lead to
+set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.island.island_iterations import SETTINGS, Asked, IslandGrid, IslandIterations, grid_of
+from ded_bench.methods.trained_policy import TrainedPolicy
+from ded_bench.plants.plant import SimulationError
+from ded_bench.problem.case import Array
+from ded_bench.problem.instance import Instance
+
+#: Simulations after which bounds are mended, at most.
+MENDED = 2
+#: What is as near a bound as this part of it is mended.
+NEAR = 0.05
+
+
+class IslandPolicy(TrainedPolicy):
+    """Learned settings; `training` has the iterations with costs, and those of each mending."""
+
+    method = "ded-admm"
+
+    @functools.cached_property
+    def grid(self) -> IslandGrid:
+        """The island as the policy sees it."""
+        return grid_of(self.scope.case, self.scope.regime, self.scope.horizon_s)
+
+    @functools.cached_property
+    def iterate(self) -> IslandIterations:
+        """The iterations."""
+        return IslandIterations(self.grid, self.weights["settings"])
+
+    def answers(self, instances: Sequence[Instance]) -> Array:
+        """See `TrainedPolicy.answers`."""
+        return np.stack([self.powers(instance) for instance in instances])
+
+    def powers(self, instance: Instance, further: int = 0) -> Array:
+        """Set-points at the knots, (n_knots, n_gen), pu.
+
+        Args:
+            instance: to answer.
+            further: iterations with costs along the answer, after which it is mended again.
+        """
+        self.scope.check([instance])
+        try:
+            asked = self.grid.ask(instance)
+        except SimulationError as error:
+            raise InputError(f"instance {instance.id}", "initial", str(error)) from None
+        counts = [self.training["iterations"], *([further] if further else [])]
+        answer = asked.start
+        for count in counts:
+            answer = self._improved(asked, answer, count)
+        return answer
+
+    def _improved(self, asked: Asked, start: Array, count: int) -> Array:
+        """The start, if nothing better can be simulated."""
+        answer = start
+        try:
+            answer = self.iterate(asked, self.grid.follow(asked, start), count, priced=True)
+            for _ in range(MENDED):
+                found = self.grid.follow(asked, answer)
+                if found.excess <= -NEAR:
+                    break
+                answer = self.iterate(asked, found, self.training["mending"], priced=False)
+        except SimulationError:
+            pass
+        return answer
+
+    @staticmethod
+    def shapes(
+        scope: Any, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[int, ...]]:
+        """See `TrainedPolicy.shapes`."""
+        for name in ("iterations", "mending"):
+            count = training.get(name)
+            if not (isinstance(count, int) and 0 < count < 1000):
+                raise ValueError(f"number of {name} is missing or mistyped")
+        return {"settings": (len(SETTINGS),)}

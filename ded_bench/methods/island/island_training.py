@@ -1,0 +1,96 @@
+"""Train `ded-admm` on an island: CMA-ES on its five settings, judged by simulations in coarse steps.
+
+Instances are not drawn afresh, since each would have to be simulated to see that it can be served: candidates
+are compared on a few of those given, others in every generation, and the last ones are held out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cma
+import numpy as np
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.island.island_iterations import FEW, SETTINGS, IslandGrid
+from ded_bench.methods.island.island_policy import IslandPolicy
+from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.training_record import TrainingOptions, write_history
+from ded_bench.plants.plant import SimulationError
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+
+#: Iterations with costs, and of each mending, on islands of few machines and of more.
+COUNTS, COUNTS_OF_MORE = (15, 6), (8, 4)
+#: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
+CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 6
+#: Where the search starts, and its first standard deviation.
+FIRST = np.log([1.0, 1.0, 1.0, 1.0, 10.0])
+SIGMA = 0.7
+#: Most instances that are held out.
+HELD_OUT = 40
+#: Cost, as a part of it, of what is beyond a bound by the whole of it; the most that counts for one instance.
+PRICE, HOPELESS = 0.2, 0.05
+#: Excess, as a part of the bound, below which the scorer sees none: between points peaks are higher.
+SAFE = -0.04
+
+
+def train(
+    case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
+) -> IslandPolicy:
+    """Train a policy; see `training_record.Trainer`.
+
+    Raises:
+        InputError: the case is no island of detailed machines, or training is to go on.
+    """
+    if options.resume or options.start is not None:
+        raise InputError("--resume", "", "policies of islands train in minutes, and start anew")
+    counts = COUNTS if len(case.generators) <= FEW else COUNTS_OF_MORE
+    facts = options.facts() | {"iterations": counts[0], "mending": counts[1]}
+    scope = Scope(case, regime, instances[0].horizon_s)
+    held = min(HELD_OUT, len(instances) // 2)
+    trained, check = instances[: len(instances) - held], instances[len(instances) - held :]
+
+    def policy(settings: Array) -> IslandPolicy:
+        return IslandPolicy(scope, {"settings": settings.astype(np.float32)}, facts)
+
+    random, began = np.random.default_rng(options.seed), time.perf_counter()
+    own = {"popsize": CANDIDATES, "randn": lambda *shape: random.standard_normal(shape)}
+    search = cma.CMAEvolutionStrategy(FIRST, SIGMA, own | {"seed": np.nan, "verbose": -9})
+    history: list[dict[str, float]] = []
+    best, best_loss = FIRST, loss(policy(FIRST), check)
+    batches = itertools.batched(itertools.cycle(trained), min(BATCH, len(trained)))
+    for epoch in range(options.epochs or EPOCHS):
+        for _ in range(GENERATIONS):
+            batch, candidates = next(batches), search.ask()
+            search.tell(candidates, [loss(policy(one), batch) for one in candidates])
+        found, spent = loss(policy(search.mean), check), time.perf_counter() - began
+        history.append({"epoch": epoch + 1, "seconds": spent, "held out": found})
+        if found < best_loss:
+            best, best_loss = search.mean.copy(), found
+        if options.seconds is not None and spent >= options.seconds:
+            break
+    write_history(out, history)
+    facts |= {"epochs": len(history), "seconds": time.perf_counter() - began, "held_out_loss": best_loss}
+    facts |= {"instances": len(trained), "held_out": held, "parameters": len(SETTINGS), "cma": cma.__version__}
+    made = policy(best)
+    made.save(out)
+    return made
+
+
+def loss(policy: IslandPolicy, instances: Sequence[Instance]) -> float:
+    """Mean of what answers cost beyond the schedules that they start from, as a part, and of excess."""
+    return float(np.mean([_one(policy, policy.grid, instance) for instance in instances]))
+
+
+def _one(policy: IslandPolicy, grid: IslandGrid, instance: Instance) -> float:
+    asked = grid.ask(instance)
+    try:
+        start, found = grid.follow(asked, asked.start), grid.follow(asked, policy.powers(instance))
+    except SimulationError:
+        return HOPELESS
+    excess = PRICE * max(found.excess - SAFE, 0.0)
+    return found.cost / start.cost - 1.0 + excess / (1.0 + excess / HOPELESS)

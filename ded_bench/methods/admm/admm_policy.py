@@ -1,7 +1,8 @@
 """Learned ADMM (`ded-admm`): a few iterations whose penalties are learned; see `admm_inference`.
 
 The weights are shared by generators and knots, so that they do not depend on the grid. Bounds, ramps
-and P_0 hold for any weights. More iterations, along the trajectory of the answer, improve it.
+and P_0 hold for any weights. More iterations, along the trajectory of the answer, improve it. Islands have
+iterations of their own, see `methods.island`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
 from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import Problems
+from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.policy_file import Scope
-from ded_bench.methods.solution import Settings, Solver
+from ded_bench.methods.solution import Artifact, Settings, Solver
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import PowerFlowError
 from ded_bench.problem.case import Array, Case
@@ -105,7 +107,9 @@ class AdmmPolicy(TrainedPolicy):
         return weight_shapes()
 
 
-artifacts = AdmmPolicy.artifacts
+def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
+    """The policy that answers."""
+    return (AdmmPolicy if case.slack is not None else IslandPolicy).artifacts(case, regime, settings)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -114,8 +118,15 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     Raises:
         InputError: there is no policy (names the command that trains one), or it does not fit.
     """
-    policy = AdmmPolicy.find(case, regime, settings)
     iterations = read_options(Options, settings.options).iterations
+    if case.slack is None:
+        island = IslandPolicy.find(case, regime, settings)
+
+        def set_points(instance: Instance) -> Schedule:
+            return Schedule(island.knots, island.powers(instance, iterations))
+
+        return as_solver(island.scope, set_points, iterations or None)
+    policy = AdmmPolicy.find(case, regime, settings)
     further = policy.further(iterations) if iterations else None
 
     def answer(instance: Instance) -> Schedule:

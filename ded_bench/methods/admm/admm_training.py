@@ -25,7 +25,9 @@ from ded_bench.methods.admm.admm_inference import CompiledIterations, schedule_l
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import Problems, draw
+from ded_bench.methods.island.island_training import train as train_on_island
 from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint
+from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.score import score
@@ -69,12 +71,14 @@ SIMULATED = 50
 
 def train(
     case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
-) -> AdmmPolicy:
+) -> TrainedPolicy:
     """Train a policy; see `training_record.Trainer`.
 
     Args:
-        instances: choose the best weights and the margin, and are never trained on.
+        instances: choose the best weights and the margin, and are never trained on, but for islands.
     """
+    if case.slack is None:
+        return train_on_island(case, regime, instances, out, options)
     horizon = instances[0].horizon_s
     grid = ModalGrid(case, case.omega_bound(regime), horizon)
     start = read_start(options.start) if options.start else None

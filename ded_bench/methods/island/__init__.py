@@ -1,1 +1,1 @@
-"""Learned ADMM on islands: iterations on the plant's own linearisation, between simulations in coarse steps."""
+"""Learned ADMM on islands: iterations on the plant's own linearisation, between coarse simulations."""

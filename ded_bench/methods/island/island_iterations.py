@@ -23,13 +23,14 @@ from ded_bench.methods.ramp_follower import track
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 
 Array32 = NDArray[np.float32]
 
-#: Distance of points, s, about, on islands of few machines and of more: what 5 ms have room for.
-FEW, SPACING_S, SPACING_OF_MORE_S = 6, 0.25, 0.5
+#: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
+SPACING_S = 0.25
+#: Which points limit outputs on islands of few machines, and of more: every one, or every second, to be fast.
+FEW, EVERY, EVERY_OF_MORE = 6, 1, 2
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
 MEAN_MARGIN, SWING_MARGIN = 0.4, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
@@ -45,7 +46,7 @@ SETTINGS = ("mean", "swing", "limit", "ramp", "price")
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class IslandProblem:
     """One instance, as iterations see it."""
 
     instance: Instance
@@ -75,8 +76,8 @@ class IslandGrid:
             raise InputError(f"case {case.id}", "plant", "is no island of detailed machines")
         self.case, self.bounds, self.plant = case, case.bounds(regime), plant_of(case)
         self.knots = case.knot_times(horizon_s)
-        spacing = SPACING_S if len(case.generators) <= FEW else SPACING_OF_MORE_S
-        between = max(round(float(self.knots[1]) / spacing), 1)
+        between = max(round(float(self.knots[1]) / SPACING_S), 1)
+        self.every = EVERY if len(case.generators) <= FEW else EVERY_OF_MORE
         self.points = np.linspace(0.0, horizon_s, between * (len(self.knots) - 1) + 1)
         self.coarse = CoarsePlant(self.plant.equations, float(self.points[1]))  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
@@ -97,35 +98,51 @@ class IslandGrid:
         self.room = 1.0 - np.where(self.is_mean, MEAN_MARGIN, SWING_MARGIN)
         self.step = case.ramp * float(self.knots[1])
         #: Swings in parts of their bound while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
-        ramps = np.tile(self.knots[1:, None, None] * np.eye(n_gen), 1).reshape(-1, n_gen)
-        swings = self.rows[: -self.bounds.at_end.sum() or None].reshape(len(self.points) - 1, -1, inputs.shape[2])
-        self.ramping = swings[-1][np.array(self.bounds.kinds)[~self.bounds.at_end] == "relative"] @ ramps
+        ramps = (self.knots[1:, None, None] * np.eye(n_gen)).reshape(-1, n_gen)
+        self.ramping = (outputs[-1] / self.bounds.limit[:, None])[~is_mean] @ ramps
 
     def _chosen(self, outputs: Array) -> Array:
-        """Outputs (n_points, n_out, ...) at the times that count, the first apart; (n_rows, ...)."""
-        always, last = outputs[1:, ~self.bounds.at_end], outputs[-1, self.bounds.at_end]
+        """Outputs (n_points, n_out, ...) where they are limited, (n_rows, ...)."""
+        always, last = outputs[self.every :: self.every, ~self.bounds.at_end], outputs[-1, self.bounds.at_end]
         return np.concatenate([always.reshape(-1, *outputs.shape[2:]), last])
 
-    def ask(self, instance: Instance) -> Asked:
+    def ask(self, instance: Instance) -> IslandProblem:
         """Read an instance.
 
         Raises:
             InputError, SimulationError: it has no start.
         """
         case, p_initial = self.case, instance.p_initial(self.case)
+        _, by_load, most = case.transfer_rows
         p_load = instance.p_load(case, self.knots)
         share = case.p_nominal / case.p_nominal.sum()
         served = p_initial + np.outer((p_load[0] - p_load).sum(axis=1), share)
         cost = instance.cost_gen(case)
-        demand = served.sum(axis=1)
-        moved = merit_order(case, cost, np.inf, -demand[:, None]) - served
+        moved = self._merit_order(cost, served.sum(axis=1), most - p_load @ by_load.T) - served
         pace = np.abs(self.ramping @ moved[-1]).max() / PACE
         moved *= np.minimum(self.knots / max(pace, float(self.knots[1])), 1.0)[:, None]
         start = self.plant.set_points_delivering(served + moved, float(self.knots[1]))
-        _, by_load, most = case.transfer_rows
         room = most - p_load[1:] @ by_load.T - TRANSFER_MARGIN
         begun = self.coarse.begin(instance)
-        return Asked(instance, begun, p_initial, cost, room, self.within(start, p_initial, room))
+        return IslandProblem(instance, begun, p_initial, cost, room, self.within(start, p_initial, room))
+
+    def _merit_order(self, cost: Array, demand: Array, room: Array) -> Array:
+        """Cheapest powers, whatever losses they cause; transfers are kept; (n_knots, n_gen)."""
+        powers = self._raised(cost, demand, np.ones(len(cost), dtype=bool))
+        for by_machine, most in zip(self.case.transfer_rows[0], room.T, strict=True):
+            group, beyond = by_machine > 0.0, powers @ by_machine > most
+            for part, total in ((group, most), (~group, demand - most)):
+                powers[np.ix_(beyond, part)] = self._raised(cost, total, part)[beyond]
+        return powers
+
+    def _raised(self, cost: Array, demand: Array, part: Array) -> Array:
+        """Some machines raised from their lower limits, one after another, (n_knots, n_part)."""
+        low, high, order = self.case.p_min[part], self.case.p_max[part], np.argsort(cost[part])
+        reach = (high - low)[order]
+        below = np.cumsum(reach) - reach
+        powers = np.tile(low, (len(demand), 1))
+        powers[:, order] += np.clip((demand - low.sum())[:, None] - below, 0.0, reach)
+        return powers
 
     def within(self, powers: Array, p_initial: Array, room: Array) -> Array:
         """Schedules that keep limits and ramps, and transfers as far as these let them; (n_knots, n_gen)."""
@@ -138,7 +155,7 @@ class IslandGrid:
         track(kept[None], self.case.p_min, self.case.p_max, self.step)
         return kept
 
-    def follow(self, asked: Asked, schedule: Array) -> Found:
+    def follow(self, asked: IslandProblem, schedule: Array) -> Found:
         """Simulate in coarse steps; SimulationError where the network has no voltages any more."""
         omega, delivered = self.coarse.follow(asked.begun, self.hat @ schedule)
         outputs = self._chosen(omega @ self.bounds.matrix.T / self.bounds.limit)
@@ -168,14 +185,25 @@ class IslandIterations:
         #: Set-points by the costs of machines.
         self.pull = (inverse @ grid.delivered.T).astype(np.float32)
 
-    def __call__(self, asked: Asked, near: Found, iterations: int, priced: bool) -> Array:
-        """Iterate from what was simulated; (n_knots, n_gen), pu.
+    def __call__(
+        self,
+        asked: IslandProblem,
+        near: Found,
+        iterations: int,
+        priced: bool,
+        dual: list[Array32] | None = None,
+    ) -> tuple[Array, list[Array32]]:
+        """Iterate from what was simulated.
 
         Args:
             asked: the instance.
             near: a schedule and its outputs.
             iterations: how many.
             priced: whether costs count.
+            dual: to go on from; None: zero.
+
+        Returns:
+            Set-points, (n_knots, n_gen), pu, and the dual variables.
         """
         grid, (n_knots, n_gen) = self.grid, near.schedule.shape
         x0 = near.schedule[1:].astype(np.float32)
@@ -199,8 +227,11 @@ class IslandIterations:
             return [self.rows @ x.ravel(), by_limit * x, change, x @ self.groups.T]
 
         at = images(x0)
-        z = [np.clip(a, lo, hi) for a, lo, hi in zip(at, low, high, strict=True)]
-        dual = [a - b for a, b in zip(at, z, strict=True)]
+        dual = [np.zeros_like(a) for a in at] if dual is None else list(dual)
+        z = []
+        for i, a in enumerate(at):
+            z.append(np.clip(a + dual[i], low[i], high[i]))
+            dual[i] = dual[i] + a - z[i]
         x = x0
         for _ in range(iterations):
             y, u, r, t = (b - d for b, d in zip(z, dual, strict=True))
@@ -213,7 +244,7 @@ class IslandIterations:
                 z[i] = np.clip(ahead, low[i], high[i])
                 dual[i] = ahead - z[i]
         found = np.concatenate([near.schedule[:1], x.astype(np.float64)])
-        return grid.within(found, asked.p_initial, asked.room)
+        return grid.within(found, asked.p_initial, asked.room), dual
 
 
 @functools.lru_cache(maxsize=8)

@@ -14,14 +14,20 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.island.island_iterations import SETTINGS, Asked, IslandGrid, IslandIterations, grid_of
+from ded_bench.methods.island.island_iterations import (
+    SETTINGS,
+    IslandGrid,
+    IslandIterations,
+    IslandProblem,
+    grid_of,
+)
 from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 
-#: Simulations after which bounds are mended, at most.
-MENDED = 2
+#: Simulations after which costs count, and after which bounds are mended, at most.
+PRICED, MENDED = 2, 2
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.05
 
@@ -63,16 +69,18 @@ class IslandPolicy(TrainedPolicy):
             answer = self._improved(asked, answer, count)
         return answer
 
-    def _improved(self, asked: Asked, start: Array, count: int) -> Array:
+    def _improved(self, asked: IslandProblem, start: Array, count: int) -> Array:
         """The start, if nothing better can be simulated."""
-        answer = start
+        answer, dual = start, None
         try:
-            answer = self.iterate(asked, self.grid.follow(asked, start), count, priced=True)
+            for _ in range(PRICED):
+                found = self.grid.follow(asked, answer)
+                answer, dual = self.iterate(asked, found, count, True, dual)
             for _ in range(MENDED):
                 found = self.grid.follow(asked, answer)
                 if found.excess <= -NEAR:
                     break
-                answer = self.iterate(asked, found, self.training["mending"], priced=False)
+                answer, _ = self.iterate(asked, found, self.training["mending"], False)
         except SimulationError:
             pass
         return answer

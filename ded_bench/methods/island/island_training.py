@@ -62,10 +62,10 @@ def train(
     search = cma.CMAEvolutionStrategy(FIRST, SIGMA, own | {"seed": np.nan, "verbose": -9})
     history: list[dict[str, float]] = []
     best, best_loss = FIRST, loss(policy(FIRST), check)
-    batches = itertools.batched(itertools.cycle(trained), min(BATCH, len(trained)))
+    drawn = itertools.cycle(trained)
     for epoch in range(options.epochs or EPOCHS):
         for _ in range(GENERATIONS):
-            batch, candidates = next(batches), search.ask()
+            batch, candidates = list(itertools.islice(drawn, BATCH)), search.ask()
             search.tell(candidates, [loss(policy(one), batch) for one in candidates])
         found, spent = loss(policy(search.mean), check), time.perf_counter() - began
         history.append({"epoch": epoch + 1, "seconds": spent, "held out": found})
@@ -75,7 +75,12 @@ def train(
             break
     write_history(out, history)
     facts |= {"epochs": len(history), "seconds": time.perf_counter() - began, "held_out_loss": best_loss}
-    facts |= {"instances": len(trained), "held_out": held, "parameters": len(SETTINGS), "cma": cma.__version__}
+    facts |= {
+        "instances": len(trained),
+        "held_out": held,
+        "parameters": len(SETTINGS),
+        "cma": cma.__version__,
+    }
     made = policy(best)
     made.save(out)
     return made

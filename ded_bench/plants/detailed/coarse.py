@@ -1,12 +1,13 @@
-"""The detailed plant in steps of a quarter of a second: exponentials of the equations linearised at nominal.
+"""An island of the detailed plant in coarse steps: exponentials of the equations linearised at nominal.
 
-With A the Jacobian at the nominal point and N(x) what rates differ by from A x and the linear answer to loads,
+With A the Jacobian at the nominal point, N(x) what rates are beyond A x and their linear answer to loads, and
+r the exact linear answer to set-points and loads over a step h,
 
-    x⁺ = exp(A h) x + h φ_1 N + h φ_2 (N - N⁻) + the exact linear answer to set-points and loads over the step,
+    x⁺ = exp(A h) x + h φ_1 N + h φ_2 (N - N⁻) + r,
 
 N⁻ being that of the step before (exponential Adams-Bashforth; Hochbruck and Ostermann, Acta Numerica 2010,
-section 2.5). N is small and changes slowly, so that frequencies along schedules that keep tight bounds err
-by some hundredths of a mHz, in a fiftieth of the time of an exact simulation. For planning, never for judging.
+section 2.5). N is small and changes slowly, so that a step may be a hundred times that of an exact
+simulation. For planning, never for judging.
 """
 
 from __future__ import annotations

@@ -1,0 +1,111 @@
+"""Learned ADMM on islands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from ded_bench.files.errors import InputError
+from ded_bench.methods.island.island_iterations import IslandGrid, IslandIterations
+from ded_bench.methods.island.island_policy import IslandPolicy
+from ded_bench.methods.island.island_training import FIRST, train
+from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings
+from ded_bench.methods.training_record import TrainingOptions
+from ded_bench.plants.score import score
+from ded_bench.problem.case import Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+from tests.detailed_cases import MIXED
+
+HORIZON = 8.0
+
+
+@pytest.fixture(scope="module")
+def island() -> Case:
+    return Case.load(MIXED)
+
+
+@pytest.fixture
+def instance(island: Case, quiet_instance: Any) -> Instance:
+    """Loads that ramp one after another, and machines of different costs."""
+    load = {
+        bus: {"initial": value, "start": 0.5 + i, "duration": 3.0, "rate": 0.01 * value * (-1) ** i}
+        for i, (bus, value) in enumerate(zip(island.loads, island.load_nominal.tolist(), strict=True))
+    }
+    cost = {name: 0.2 + 0.1 * i for i, name in enumerate(island.generators)}
+    return quiet_instance(island, horizon_s=HORIZON, load=load, cost=cost)
+
+
+def policy(case: Case, settings: Any = FIRST, regime: str = "TO") -> IslandPolicy:
+    facts = {"iterations": 15, "mending": 6}
+    return IslandPolicy(Scope(case, regime, HORIZON), {"settings": np.float32(settings)}, facts)
+
+
+def test_many_iterations_solve_the_linear_program(island: Case, instance: Instance) -> None:
+    """HiGHS on the same rows; single precision and a thousand iterations leave a thousandth of the gain."""
+    grid = IslandGrid(island, "TO", HORIZON)
+    asked = grid.ask(instance)
+    near = grid.follow(asked, asked.start)
+    found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))(asked, near, 1500, True)
+    n, n_gen = grid.rows.shape[1], len(island.generators)
+    x0 = near.schedule[1:].ravel()
+    change = np.eye(n) - np.eye(n, k=-n_gen)
+    reach = 0.98 * np.tile(grid.step, n // n_gen)
+    first = np.concatenate([asked.p_initial, np.zeros(n - n_gen)])
+    free = near.outputs - grid.rows @ x0
+    rows = np.vstack([grid.rows, -grid.rows, change, -change])
+    most = np.concatenate([grid.room - free, grid.room + free, reach + first, reach - first])
+    cost = asked.cost @ grid.delivered
+    limits = list(zip(np.tile(island.p_min, n // n_gen), np.tile(island.p_max, n // n_gen), strict=True))
+    best = linprog(cost, A_ub=rows, b_ub=most, bounds=limits)
+    assert best.status == 0
+    gain = cost @ x0 - best.fun
+    assert gain > 0.0
+    assert abs(cost @ found[1:].ravel() - best.fun) < 0.02 * gain
+    outputs = near.outputs + grid.rows @ (found[1:].ravel() - x0)
+    assert (np.abs(outputs) < grid.room + 0.01).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_limits_hold_for_any_settings(island: Case, instance: Instance, seed: int) -> None:
+    settings = np.random.default_rng(seed).normal(size=len(FIRST))
+    powers = policy(island, settings).powers(instance)
+    found = score(island, instance, Schedule(island.knot_times(HORIZON), powers), "TO")
+    assert max(found.ramp_violation, found.bound_violation, found.initial_violation) <= 1e-8
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_a_trained_policy_keeps_the_bounds(
+    island: Case, instance: Instance, regime: str, tmp_path: Path
+) -> None:
+    """What a file holds is what was trained; its answers are feasible, and near the optimum."""
+    out = tmp_path / f"ded-admm-{regime}.safetensors"
+    made = train(island, regime, [instance] * 2, out, TrainingOptions(epochs=1))
+    assert out.with_suffix(".history.csv").is_file()
+    solve = get_method("ded-admm").prepare(island, regime, Settings(policy=out))
+    schedule = solve(instance).schedule
+    assert schedule is not None
+    np.testing.assert_array_equal(schedule.p, made.powers(instance))
+    found = score(island, instance, schedule, regime)
+    assert found.feasible
+    best = get_method("ded-slp").prepare(island, regime, Settings())(instance).solver_objective
+    assert found.objective < 1.005 * best
+
+
+def test_further_iterations_are_no_dearer(island: Case, instance: Instance) -> None:
+    made = policy(island)
+    own, further = (Schedule(made.knots, made.powers(instance, count)) for count in (0, 60))
+    cost, more = (score(island, instance, one, "TO") for one in (own, further))
+    assert more.feasible
+    assert more.objective <= cost.objective * (1.0 + 1e-5)
+
+
+def test_no_island_is_refused(threebus: Case) -> None:
+    with pytest.raises(InputError, match="is no island"):
+        IslandGrid(threebus, "TO", 60.0)

@@ -29,6 +29,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from tests.detailed_cases import MIXED
 
+#: `ded-admm` needs a policy, and says so (`test_island_policy`).
 PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots")
 HORIZON = 8.0
 

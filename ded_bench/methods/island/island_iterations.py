@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods.knots import case_knots, transfer_room
 from ded_bench.methods.ramp_follower import track
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
@@ -29,10 +30,8 @@ Array32 = NDArray[np.float32]
 
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
-#: Which points limit outputs on islands of few machines, and of more: every one, or every second, to be fast.
-FEW, EVERY, EVERY_OF_MORE = 6, 1, 2
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
-MEAN_MARGIN, SWING_MARGIN = 0.4, 0.1
+MEAN_MARGIN, SWING_MARGIN = 0.3, 0.08
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of squares of set-points, beside the penalties.
@@ -77,7 +76,6 @@ class IslandGrid:
         self.case, self.bounds, self.plant = case, case.bounds(regime), plant_of(case)
         self.knots = case.knot_times(horizon_s)
         between = max(round(float(self.knots[1]) / SPACING_S), 1)
-        self.every = EVERY if len(case.generators) <= FEW else EVERY_OF_MORE
         self.points = np.linspace(0.0, horizon_s, between * (len(self.knots) - 1) + 1)
         self.coarse = CoarsePlant(self.plant.equations, float(self.points[1]))  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
@@ -103,7 +101,7 @@ class IslandGrid:
 
     def _chosen(self, outputs: Array) -> Array:
         """Outputs (n_points, n_out, ...) where they are limited, (n_rows, ...)."""
-        always, last = outputs[self.every :: self.every, ~self.bounds.at_end], outputs[-1, self.bounds.at_end]
+        always, last = outputs[1:, ~self.bounds.at_end], outputs[-1, self.bounds.at_end]
         return np.concatenate([always.reshape(-1, *outputs.shape[2:]), last])
 
     def ask(self, instance: Instance) -> IslandProblem:
@@ -122,7 +120,9 @@ class IslandGrid:
         pace = np.abs(self.ramping @ moved[-1]).max() / PACE
         moved *= np.minimum(self.knots / max(pace, float(self.knots[1])), 1.0)[:, None]
         start = self.plant.set_points_delivering(served + moved, float(self.knots[1]))
-        room = most - p_load[1:] @ by_load.T - TRANSFER_MARGIN
+        room = np.empty((len(self.knots) - 1, 0))
+        if case.transfers:
+            room = transfer_room(case, instance, case_knots(case, instance)) - TRANSFER_MARGIN
         begun = self.coarse.begin(instance)
         return IslandProblem(instance, begun, p_initial, cost, room, self.within(start, p_initial, room))
 

@@ -27,9 +27,9 @@ from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 
 #: Simulations after which costs count, and after which bounds are mended, at most.
-PRICED, MENDED = 2, 2
+PRICED, MENDED = 3, 2
 #: What is as near a bound as this part of it is mended.
-NEAR = 0.05
+NEAR = 0.04
 
 
 class IslandPolicy(TrainedPolicy):

@@ -15,7 +15,7 @@ import cma
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.island.island_iterations import FEW, SETTINGS, IslandGrid
+from ded_bench.methods.island.island_iterations import IslandGrid
 from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.training_record import TrainingOptions, write_history
@@ -23,12 +23,12 @@ from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
-#: Iterations with costs, and of each mending, on islands of few machines and of more.
-COUNTS, COUNTS_OF_MORE = (15, 6), (8, 4)
+#: Iterations of each round with costs, and of each mending.
+ITERATIONS, MENDING = 12, 6
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
-CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 6
+CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.
-FIRST = np.log([1.0, 1.0, 1.0, 1.0, 10.0])
+FIRST = np.log([0.3, 0.3, 1.0, 0.3, 20.0])
 SIGMA = 0.7
 #: Most instances that are held out.
 HELD_OUT = 40
@@ -48,8 +48,7 @@ def train(
     """
     if options.resume or options.start is not None:
         raise InputError("--resume", "", "policies of islands train in minutes, and start anew")
-    counts = COUNTS if len(case.generators) <= FEW else COUNTS_OF_MORE
-    facts = options.facts() | {"iterations": counts[0], "mending": counts[1]}
+    facts = options.facts() | {"iterations": ITERATIONS, "mending": MENDING}
     scope = Scope(case, regime, instances[0].horizon_s)
     held = min(HELD_OUT, len(instances) // 2)
     trained, check = instances[: len(instances) - held], instances[len(instances) - held :]
@@ -78,7 +77,6 @@ def train(
     facts |= {
         "instances": len(trained),
         "held_out": held,
-        "parameters": len(SETTINGS),
         "cma": cma.__version__,
     }
     made = policy(best)

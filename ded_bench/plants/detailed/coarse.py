@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed.case_system import CaseSystem
@@ -30,11 +31,11 @@ from ded_bench.plants.detailed.equations import (
     solve_voltages,
     sources,
 )
-from ded_bench.plants.detailed.machine_arrays import DELTA, GATE, SPEED, TURBINE, MachineArrays
+from ded_bench.plants.detailed.machine_arrays import DELTA, GATE, SPEED, MachineArrays
 from ded_bench.plants.detailed.power_system import DIFFERENCE, interleaved
 from ded_bench.plants.detailed.start import start
 from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.time_varying import Indices, series_step
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 
@@ -115,15 +116,12 @@ class CoarsePlant:
         return x, v, point.p_drawn[: system.network.n_load_port].copy(), point.power.real.copy(), v_ref
 
     def _holds(self, duration: float) -> tuple[Array, Array, Array]:
-        """exp(A dt), dt φ_1 and dt φ_2; by halves of halves, where the series is short."""
-        a = self._linear[0]
-        halvings = max(int(np.ceil(np.log2(np.abs(a).sum(axis=1).max() * duration))), 0)
-        z = a * duration / 2**halvings
-        f, first, second = (part[0] for part in series_step(lambda m: z @ m, 1, len(a), 1.0))
-        eye = np.eye(len(a))
-        for _ in range(halvings):
-            first, second, f = (f + eye) @ first / 2.0, (f @ second + first + second) / 4.0, f @ f
-        return f, duration * first, duration * second
+        """exp(A dt), dt φ_1 and dt φ_2: the first row of blocks of one exponential."""
+        n = len(self._linear[0])
+        blocks = np.zeros((3 * n, 3 * n))
+        blocks[:n, :n] = self._linear[0] * duration
+        blocks[: 2 * n, n:] += np.eye(2 * n)
+        return tuple(np.hsplit(expm(blocks)[:n] * np.repeat([1.0, duration, duration], n), 3))
 
     @functools.cached_property
     def maps(self) -> CoarseMaps:
@@ -215,24 +213,21 @@ class CoarsePlant:
         Returns:
             Frequencies, (n_points, n_gen, n_changes), rad/s; delivered powers likewise, pu.
         """
-        maps, system, machines = self.maps, self.equations.system, self.equations.scheduled
-        n, n_machine, size = len(maps.moving), len(system.data), np.prod(maps.x.shape)
-        f, (first, second) = maps.onward[:, :n], self._inputs
-        x, held = np.zeros((n, p_set.shape[2])), np.zeros(p_set.shape[2])
-        places = np.full(size, -1)
-        places[maps.moving] = np.arange(n)
-        places = places.reshape(-1, n_machine)
+        maps, data, machines = self.maps, self.equations.system.data, self.equations.scheduled
+        n, n_changes = len(maps.moving), p_set.shape[2]
+        first, second = (part[:, machines] for part in self._inputs)
+        x, held = np.zeros((n, n_changes)), np.zeros(n_changes)
+        states = np.zeros((n_changes, *maps.x.shape))
         omega, delivered = np.empty(p_set.shape), np.empty(p_set.shape)
-        reheat = system.data.reheat[machines, None]
         for k in range(len(p_set)):
-            omega[k] = x[places[SPEED, machines]] * system.data.omega_0[machines, None]
-            delivered[k] = reheat * x[places[GATE, machines]] + (1.0 - reheat) * x[places[TURBINE, machines]]
-            if k + 1 == len(p_set):
-                break
+            states.reshape(n_changes, -1)[:, maps.moving] = x.T
+            omega[k] = (states[:, SPEED, machines] * data.omega_0[machines]).T
+            delivered[k] = self.equations.turbines(states)[:, machines].T
             if k and k % maps.period == 0:
-                held = -maps.gain * (system.data.inertia @ x[places[DELTA]])
-            x = f @ x + np.outer(maps.held, held)
-            x += first[:, machines] @ p_set[k] + second[:, machines] @ (p_set[k + 1] - p_set[k])
+                held = -maps.gain * (states[:, DELTA] @ data.inertia)
+            after = p_set[min(k + 1, len(p_set) - 1)]
+            x = maps.onward[:, :n] @ x + np.outer(maps.held, held)
+            x += first @ p_set[k] + second @ (after - p_set[k])
         return omega, delivered
 
 

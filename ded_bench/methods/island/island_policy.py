@@ -27,7 +27,9 @@ from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 
 #: Simulations after which costs count, and after which bounds are mended, at most.
-PRICED, MENDED = 3, 2
+PRICED, MENDED = 3, 4
+#: Settings of mending; the price is not used.
+MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.04
 
@@ -46,6 +48,11 @@ class IslandPolicy(TrainedPolicy):
     def iterate(self) -> IslandIterations:
         """The iterations."""
         return IslandIterations(self.grid, self.weights["settings"])
+
+    @functools.cached_property
+    def mend(self) -> IslandIterations:
+        """Iterations without costs."""
+        return IslandIterations(self.grid, MENDING)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
@@ -80,7 +87,7 @@ class IslandPolicy(TrainedPolicy):
                 found = self.grid.follow(asked, answer)
                 if found.excess <= -NEAR:
                     break
-                answer, _ = self.iterate(asked, found, self.training["mending"], False)
+                answer, _ = self.mend(asked, found, self.training["mending"], False)
         except SimulationError:
             pass
         return answer

@@ -24,7 +24,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Iterations of each round with costs, and of each mending.
-ITERATIONS, MENDING = 12, 6
+ITERATIONS, MENDING = 12, 12
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.

@@ -121,7 +121,8 @@ class CoarsePlant:
         blocks = np.zeros((3 * n, 3 * n))
         blocks[:n, :n] = self._linear[0] * duration
         blocks[: 2 * n, n:] += np.eye(2 * n)
-        return tuple(np.hsplit(expm(blocks)[:n] * np.repeat([1.0, duration, duration], n), 3))
+        f, first, second = np.hsplit(expm(blocks)[:n], 3)
+        return f, duration * first, duration * second
 
     @functools.cached_property
     def maps(self) -> CoarseMaps:

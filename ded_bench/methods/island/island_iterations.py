@@ -31,7 +31,7 @@ Array32 = NDArray[np.float32]
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
-MEAN_MARGIN, SWING_MARGIN = 0.3, 0.08
+MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of squares of set-points, beside the penalties.
@@ -147,11 +147,12 @@ class IslandGrid:
     def within(self, powers: Array, p_initial: Array, room: Array) -> Array:
         """Schedules that keep limits and ramps, and transfers as far as these let them; (n_knots, n_gen)."""
         by_machine = self.case.transfer_rows[0]
-        kept = powers.copy()
+        kept = np.clip(powers, self.case.p_min, self.case.p_max)
         kept[0] = p_initial
         for group, most in zip(by_machine, room.T, strict=True):
             beyond = np.maximum(kept[1:] @ group - most - TRANSFER_MARGIN / 2.0, 0.0)
-            kept[1:] -= np.outer(beyond, group / group.sum())
+            above = np.maximum(kept[1:] - self.case.p_min, 0.0) * group
+            kept[1:] -= above * (beyond / np.maximum(above.sum(axis=1), 1e-12))[:, None]
         track(kept[None], self.case.p_min, self.case.p_max, self.step)
         return kept
 

@@ -52,7 +52,7 @@ class IslandPolicy(TrainedPolicy):
     @functools.cached_property
     def mend(self) -> IslandIterations:
         """Iterations without costs."""
-        return IslandIterations(self.grid, MENDING)
+        return mending_of(self.grid)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
@@ -102,3 +102,9 @@ class IslandPolicy(TrainedPolicy):
             if not (isinstance(count, int) and 0 < count < 1000):
                 raise ValueError(f"number of {name} is missing or mistyped")
         return {"settings": (len(SETTINGS),)}
+
+
+@functools.lru_cache(maxsize=8)
+def mending_of(grid: IslandGrid) -> IslandIterations:
+    """Iterations without costs, made once for all settings."""
+    return IslandIterations(grid, MENDING)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.knots import case_knots, transfer_room
+from ded_bench.methods.knots import knot_points, transfer_room
 from ded_bench.methods.ramp_follower import track
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
@@ -122,7 +122,7 @@ class IslandGrid:
         start = self.plant.set_points_delivering(served + moved, float(self.knots[1]))
         room = np.empty((len(self.knots) - 1, 0))
         if case.transfers:
-            room = transfer_room(case, instance, case_knots(case, instance)) - TRANSFER_MARGIN
+            room = transfer_room(case, instance, knot_points(self.knots, instance.dt_s)) - TRANSFER_MARGIN
         begun = self.coarse.begin(instance)
         return IslandProblem(instance, begun, p_initial, cost, room, self.within(start, p_initial, room))
 

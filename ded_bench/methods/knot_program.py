@@ -112,8 +112,8 @@ class KnotProgram:
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
-        self._condensed = case.slack is None if condensed is None else condensed
-        n_state = 0 if self._condensed else model.slack.shape[1]
+        self.condensed = case.slack is None if condensed is None else condensed
+        n_state = 0 if self.condensed else model.slack.shape[1]
         at_end = self._n_gen + n_state
         self._s = np.arange(len(self.pieces)) + at_end * owner
         power = (own + at_end * np.arange(self._n))[:, None]
@@ -129,10 +129,10 @@ class KnotProgram:
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded
-        if self._condensed:
+        if self.condensed:
             self._held = bounded & (np.abs(model.omega[model.points[1:]]) > HELD * bounds.limit)
         self._basis: BasisByPlaces | None = None
-        if before is not None and self._condensed:
+        if before is not None and self.condensed:
             self._held, self._basis = self._held | before._held, before._basis
         self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
@@ -148,7 +148,7 @@ class KnotProgram:
             form = self._unlimited()
             low, high = self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
-            if isinstance(self.model.speed, slice) and not self._condensed:
+            if isinstance(self.model.speed, slice) and not self.condensed:
                 speed = self._x[:, self.model.speed]
                 rows = self._frequency_rows(limits)
                 form.lower[speed], form.upper[speed] = least.reshape(speed.shape), most.reshape(speed.shape)
@@ -156,7 +156,7 @@ class KnotProgram:
                 held, rows = self._held.ravel(), self._rows_held(limits)
                 low, high = np.append(least[held], low), np.append(most[held], high)
             form, none = form.with_rows(rows, low, high), np.zeros(self._n)
-            if not self._condensed:
+            if not self.condensed:
                 return self._answer(form, left_s), none
             places = self._output_rows.places(self._held, limits)
             start = None if self._basis is None else self._basis.start(places)
@@ -217,7 +217,7 @@ class KnotProgram:
             if self._reserve is not None:
                 form, moved = self._with_reserve(self._reserve, form, place, excess)
                 place, excess = moved[place], moved[excess]
-            if self._condensed:
+            if self.condensed:
                 answer = self._answer(form, left_s)
             else:
                 answer = solve_form(form, left_s, True, REGULARISATION, RESIDUAL)
@@ -267,15 +267,15 @@ class KnotProgram:
             outputs: shape (n_points, n_out), rad/s.
             left_open: excess that needs no row, rad/s.
         """
-        parts = FEW_PARTS if self._condensed else PARTS
-        least = left_open if self._condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
+        parts = FEW_PARTS if self.condensed else PARTS
+        least = left_open if self.condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
         size, points, beyond = np.abs(outputs.T), self.model.points, self.bounds.beyond(outputs).T
         chosen = np.zeros(size.shape, dtype=bool)
         peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
         chosen[:, 1:-1] = peak
         # A peak that is cut off moves to the points beside it.
         over = peak & (beyond[:, 1:-1] > 0.0)
-        if not self._condensed:
+        if not self.condensed:
             chosen[:, :-2] |= over
             chosen[:, 2:] |= over
         chosen[:, divided(points, np.full(len(points) - 1, parts))] = True
@@ -303,7 +303,7 @@ class KnotProgram:
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         """PIQP's, by the next factorisation where one stalls."""
-        if self._condensed:
+        if self.condensed:
             return solve_by_highs(form, max(time_limit_s, 0.0))
         deadline, iterations = time.perf_counter() + time_limit_s, 0
         is_short = self._n == len(self.model.omega) - 1 and self._n_columns < LONG * self._n
@@ -388,7 +388,7 @@ class KnotProgram:
             cost[self._u] = self._generation[1:]
             return cost
         rows = self.model.cost_rows(self._instance.cost_gen(self._case))
-        if self._condensed:
+        if self.condensed:
             cost[self._u] = self.model.by_set_points(rows).sum(axis=0)[1:]
             return cost
         cost[self._u] = rows.end
@@ -397,7 +397,7 @@ class KnotProgram:
         return cost
 
     def _dynamics_rows(self) -> sp.csc_matrix:
-        if self._condensed:
+        if self.condensed:
             return self._matrix(0, [])
         across = self.model.across
         end = across.h / self.model.lengths[:, None, None]
@@ -449,7 +449,7 @@ class KnotProgram:
 
     def _rows_held(self, limits: Indices) -> sp.csc_matrix:
         """Outputs at knots and between them whose limits have rows."""
-        if self._condensed:  # the only columns are those of set-points
+        if self.condensed:  # the only columns are those of set-points
             return self._output_rows.matrix(self._output_rows.places(self._held, limits))
         return sp.csc_matrix(sp.vstack([self._all_knots, self._frequency_rows(limits)]))
 

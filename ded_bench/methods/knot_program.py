@@ -89,7 +89,8 @@ class KnotProgram:
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
         radius: most that a set-point may move, pu (trust region).
-        condensed: whether states are substituted; None: on islands.
+        condensed: whether states are substituted; None: on islands. An interior point with rows at many
+            points of every interval leaves less excess between them where its price is all that limits it.
         before: the program along the trajectory before, near whose end to start.
     """
 
@@ -124,8 +125,7 @@ class KnotProgram:
         self._price = instance.cost_slack(case)
         self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
         self._cost = self._columns_cost()
-        # By set-points, whichever columns pay for what they lead to.
-        self._all_costs = (self._cost if model.delivered is None else self._generation[1:]).sum()
+        self._all_costs = (self._generation[1:] if self.condensed else self._cost).sum()
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded

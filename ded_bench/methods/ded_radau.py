@@ -1,7 +1,8 @@
 """Full DED by orthogonal collocation: Radau's scheme on elements that end at the loads' kinks.
 
 The same problem as `ded`, with the DAE discretised to high order (see `radau_program`). What it
-costs, in time and accuracy, to use backward Euler instead shows when both are re-simulated.
+costs, in time and accuracy, to use backward Euler instead shows when both are re-simulated. On the detailed
+plant set-points bend at the case's knots (see `radau_detailed`): an optimum that owes nothing to `ded-slp`.
 """
 
 from __future__ import annotations
@@ -12,14 +13,20 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import pyomo.environ as pyo
 from numpy.typing import NDArray
 
+from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.options import option, read_options
+from ded_bench.methods.radau_detailed import DetailedProgram, mesh
 from ded_bench.methods.radau_program import POINTS, RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
+from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.solvers.ipopt import CasadiIpopt
+from ded_bench.solvers.status import Status
 
 #: Raised when answers change.
 VERSION = 1
@@ -29,6 +36,10 @@ LONGEST_S, LONGEST_PERIODS = 0.1, 0.125
 #: process that solves one instance in TO, less what imports take: 21 bytes on 39bus (0.7 GiB in all), 13 on
 #: 68bus (1.4 GiB); on 9bus and two-area over 90, but 0.3 GiB in all. Larger grids are extrapolated.
 BYTES_PER_ENTRY = 20
+#: Longest element on the detailed plant, s, and the memory of its Pyomo model and IPOPT (two-area-agc).
+DETAILED_S, BYTES_PER_DETAILED_ENTRY = 1.0, 300
+#: Part of the cost that IPOPT's last barrier may be worth at a bound: on two-area-agc about 1e-5 in all.
+CLOSE = 2e-7
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,7 @@ class Options:
 
     element_s: float | None = option(
         None,
-        "mean length of an element, s; none: 0.1, or an eighth of the fastest period",
+        "mean length of an element, s; none: 0.1, or an eighth of the fastest period; islands: longest, 1",
         lowest=1e-3,
     )
 
@@ -45,7 +56,10 @@ class Options:
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one program per process serves them all."""
     case.check_regimes([regime])
-    length_s = read_options(Options, settings.options).element_s or default_element(case)
+    length_s = read_options(Options, settings.options).element_s
+    if case.plant_name == "detailed":
+        return functools.partial(_on_detailed, case, regime, length_s or DETAILED_S, settings.time_limit_s)
+    length_s = length_s or default_element(case)
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
@@ -61,6 +75,30 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         return answer(outcome, build_s, lambda: None if x is None else program.schedule(x, instance, ends))
 
     return solve
+
+
+def _on_detailed(
+    case: Case, regime: str, longest_s: float, time_limit_s: float | None, instance: Instance
+) -> Solution:
+    """Solve on the detailed plant; a program for each instance, since elements end at its kinks."""
+    started = time.perf_counter()
+    plant = DetailedPlant(case)
+    state = plant.initial(instance)
+    points = mesh(plant, instance, state, longest_s)
+    elements, system = len(points.ends) - 1, plant.equations.system
+    columns = len(POINTS) * (len(system.moving) + len(state.v)) + len(case.generators)
+    needed = BYTES_PER_DETAILED_ENTRY * elements * columns**2
+    if refusal := too_large(needed, f"the Pyomo model of {elements} elements", "`ded-slp` takes less"):
+        return refusal
+    if not is_reachable(case, instance, points.knots):
+        return Solution(Status.INFEASIBLE, error=Status.INFEASIBLE.sentence)
+    program = DetailedProgram(plant, instance, regime, state, points)
+    program.start()
+    build_s = time.perf_counter() - started
+    close = CLOSE * abs(pyo.value(program.model.cost_total))
+    options = {"tol": close, "compl_inf_tol": close, "constr_viol_tol": 1e-6}
+    outcome = CasadiIpopt(program.model, options).solve(time_limit_s)
+    return answer(outcome, build_s, program.schedule)
 
 
 @functools.lru_cache(maxsize=1)

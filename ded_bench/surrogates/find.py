@@ -60,10 +60,13 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
 
     Raises:
         InputError: there is no such model yet (names the command that makes it), its file is wrong, or the
-            surrogate of this name is made for each instance.
+            surrogate of this name is made for each instance, or for lossless grids only.
     """
     if name == TRAJECTORY:
         raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
+    if name in MODELS and case.plant_name != "lossless":
+        problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {TRAJECTORY}"
+        raise InputError("--model", name, problem)
     path = find_model_file(case, name, search)
     if path is None:
         return nominal_model(case)

@@ -5,20 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyomo.environ as pyo
 import pytest
 from scipy.signal import lsim
 
+from ded_bench import load_instances
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
 from ded_bench.methods.ded_slp import OPEN
 from ded_bench.methods.first_schedules import slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import case_knots
+from ded_bench.methods.radau_detailed import DetailedProgram, mesh
+from ded_bench.methods.radau_program import POINTS
 from ded_bench.methods.registry import METHODS, get_method
 from ded_bench.methods.slp import Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
-from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S
+from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S, DetailedPlant
 from ded_bench.plants.plant import plant_of
 from ded_bench.plants.score import score
 from ded_bench.plants.simulate import simulate
@@ -26,11 +30,13 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Transfer
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
 from tests.detailed_cases import MIXED
 
 #: `ded-admm` needs a policy, and says so (`test_island_policy`).
 PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots")
+PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots", "ded-radau")
 HORIZON = 8.0
 
 
@@ -167,3 +173,44 @@ def test_others_refuse_with_one_line(island: Case, instance: Instance, method: s
     with pytest.raises(InputError) as refusal:
         get_method(method).prepare(island, "TO", Settings())(instance)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("regime", ["NO", "TO"])
+def test_collocation_and_linear_programs_find_the_same_optimum(
+    island: Case, instance: Instance, regime: str
+) -> None:
+    """They share the plant's data and nothing else; IPOPT's barrier and the grid's trapezoids cost 1e-5."""
+    answer = get_method("ded-radau").prepare(island, regime, Settings("element_s=0.5"))(instance)
+    assert answer.status == Status.OPTIMAL
+    found = score(island, instance, answer.schedule, regime)
+    assert found.freq_violation_hz < 0.02 * island.regimes[regime].relative_hz
+    assert max(found.ramp_violation, found.bound_violation, found.initial_violation) <= 1e-8
+    assert answer.solver_objective == pytest.approx(found.objective, rel=1e-6)
+    best = get_method("ded-slp").prepare(island, regime, Settings())(instance)
+    assert found.objective == pytest.approx(best.solver_objective, rel=2e-5)
+
+
+def test_collocated_equations_are_the_plants(island: Case, instance: Instance) -> None:
+    """Where set-points are given, what the equations say is what is simulated: free variables are states."""
+    plant = DetailedPlant(island)
+    state = plant.initial(instance)
+    points = mesh(plant, instance, state, 0.25)
+    program = DetailedProgram(plant, instance, "NO", state, points)
+    program.start()
+    program.model.p_set.fix()
+    for name in ("ramps", "transfers", "frequencies"):
+        program.model.component(name).deactivate()
+    assert CasadiIpopt(program.model, {"tol": 1e-10}).solve().status == Status.OPTIMAL
+    simulated = simulate(island, instance, program.schedule())
+    omega, held = program.speeds()[:: len(POINTS)], program.model.held
+    np.testing.assert_allclose(omega, simulated.omega[points.ends], atol=2e-7 * 2 * np.pi)
+    assert held[1].value == pytest.approx(simulated.columns["agc"][points.acts[0]], abs=1e-8)
+    total = simulated.cost(instance.cost_gen(island), 0.0)
+    assert pyo.value(program.model.cost_total) == pytest.approx(total, rel=1e-8)
+
+
+def test_collocation_refuses_what_memory_does_not_hold() -> None:
+    case = Case.load("39bus-agc")
+    answer = get_method("ded-radau").prepare(case, "TO", Settings())(load_instances("39bus-agc", limit=1)[0])
+    assert answer.schedule is None
+    assert "GiB" in answer.error

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ded_bench.methods.admm.admm_inference import weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
 from ded_bench.methods.admm.problems import draw
+from ded_bench.methods.admm.torch_iterations import TorchIterations
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
@@ -79,6 +79,15 @@ def started(grid: ModalGrid, count: int = 6, seed: int = 0) -> tuple[Start, Moda
     return start, grid.along_first(start)
 
 
+def torch_iterations(grid: ModalGrid, size: float = 0.3) -> TorchIterations:
+    """Iterations of `ded-admm` whose weights are not zero."""
+    torch.manual_seed(0)
+    network = TorchIterations(grid, ITERATIONS)
+    with torch.no_grad():
+        network.nodes.add_(size * torch.randn_like(network.nodes))
+    return network
+
+
 def random_policy(method: str, case: Case, size: float = 0.3, horizon: float = HORIZON) -> TrainedPolicy:
     """A policy of the last regime."""
     scope = Scope(case, list(case.regimes)[-1], horizon)
@@ -86,7 +95,7 @@ def random_policy(method: str, case: Case, size: float = 0.3, horizon: float = H
         staged = staged_network(case, size, horizon)
         return DispatchPolicy(scope, weights_of(staged), {"seed": 0} | staged.shape)
     if method == "ded-admm":
-        nodes = size * np.random.default_rng(0).standard_normal(weight_shapes()["nodes"])
-        return AdmmPolicy(scope, {"nodes": nodes.astype(np.float32)}, {"seed": 0, "iterations": ITERATIONS})
+        network = torch_iterations(modal_grid(case, horizon), size)
+        return AdmmPolicy(scope, weights_of(network), {"seed": 0, "iterations": ITERATIONS})
     torch.manual_seed(0)
     return PaperPolicy(scope, weights_of(PaperNetwork(n_channels(case), case.p_min, case.p_max)), {"seed": 0})

@@ -26,8 +26,6 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.policies import in_operation, random_policy, short_instances
 
-#: Where each training's checkpoint is written.
-RUNS = {"ded-dpc": TrainingRun, "ded-dpc-paper": TrainingRun, "ded-admm": admm_training.Search}
 TRAINERS = {"ded-dpc": dpc_training, "ded-dpc-paper": paper_training, "ded-admm": admm_training}
 CONSTRUCTED = ("ded-dpc", "ded-dpc refine=30", "ded-admm", "ded-admm iterations=5")
 
@@ -127,7 +125,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Little is drawn, and epochs are short."""
     monkeypatch.setattr(dpc_training, "FRESH", 300)
     monkeypatch.setattr(admm_training, "STEPS", 4)
-    monkeypatch.setattr(admm_training, "BATCH", 4)
+    monkeypatch.setattr(admm_training, "ROWS", 400)
     monkeypatch.setattr(admm_training, "iterations_of", lambda grid: 6)
 
 
@@ -156,16 +154,16 @@ def test_training_keeps_the_best_repeats_and_goes_on(
     assert (whole.training["version"], whole.training["seed"]) == ("1.2.3", 3)
     loaded = type(whole).load(tmp_path / "a.safetensors", threebus, whole.scope.regime)
     assert loaded.fingerprint == whole.fingerprint
-    save = RUNS[method].save
+    save = TrainingRun.save
 
-    def interrupted(run: TrainingRun | admm_training.Search) -> None:
+    def interrupted(run: TrainingRun) -> None:
         save(run)
         if run.epoch == 2:
             raise KeyboardInterrupt
 
     out = tmp_path / "b.safetensors"
     with monkeypatch.context() as patch:
-        patch.setattr(RUNS[method], "save", interrupted)
+        patch.setattr(TrainingRun, "save", interrupted)
         with pytest.raises(KeyboardInterrupt):
             trained(module, threebus, out)
     resumed = trained(module, threebus, out, resume=True)

@@ -20,7 +20,6 @@ import numpy as np
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
 from ded_bench.methods.admm.modal_kernels import (
     Array32,
-    Floats,
     MeanModes,
     Modes,
     mean_modes,
@@ -142,14 +141,11 @@ def mean_modes_of(grid: ModalGrid, linear: ModalLinearisation) -> MeanModes:
 
 
 class CompiledIterations:
-    """All iterations for one case, bound on |ω| (rad/s), horizon and weights."""
+    """The same function as `TorchIterations`, with its weights as an array; powers in float64."""
 
-    def __init__(
-        self, grid: ModalGrid, bound: float, nodes: np.ndarray, iterations: int, *, only_better: bool = True
-    ) -> None:
-        """Answer with the last schedules, or, where these are no better, with the first ones if asked."""
-        self._grid, self._limits, self._only_better = grid, limits_of(grid, bound), only_better
-        modes = grid.modes
+    def __init__(self, grid: ModalGrid, bound: float, nodes: np.ndarray, iterations: int) -> None:
+        """Iterations for a bound on |ω|, rad/s."""
+        self._grid, self._limits, modes = grid, limits_of(grid, bound), grid.modes
         self.settings = settings_of(nodes, iterations)
         self.settings[:, :PENALTIES] *= self._limits.price
         self._modes = modes._replace(
@@ -170,20 +166,15 @@ class CompiledIterations:
             state=start.state.astype(np.float32),
             mean=mean_modes_of(grid, linear),
         )
-        iterate(powers, given, self._limits, self._modes, self.settings, self._only_better)
+        iterate(powers, given, self._limits, self._modes, self.settings)
         return powers
 
 
 @compiled
-def iterate(
-    powers: Array,
-    given: AdmmProblems,
-    limits: AdmmLimits,
-    modes: Modes,
-    settings: Array,
-    only_better: bool,
-) -> None:
-    """Turn first schedules into answers by iterations of ADMM; see the top. Answers are within their limits.
+def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes, settings: Array) -> None:
+    """Turn first schedules into answers by iterations of ADMM; see the top.
+
+    An answer is the last schedule within its limits, or the first if that is better.
 
     Args:
         powers: (batch, n_knots, n_gen), pu; receives the answers.
@@ -191,10 +182,9 @@ def iterate(
         limits: of the case.
         modes: of the case.
         settings: of each iteration, (n_iterations, 8); the columns are those of `SETTINGS`.
-        only_better: whether the first schedule stays where the last is no better.
     """
     batch, n, n_gen = powers.shape
-    n_points, spacing = given.offset.shape[1], 2.0 * modes.half
+    n_points = given.offset.shape[1]
     omega, p_slack = np.empty((n_points, n_gen), np.float32), np.empty(n_points, np.float32)
     p, gradient = np.empty((n, n_gen)), np.empty((n, n_gen))
     # copies and duals
@@ -203,7 +193,7 @@ def iterate(
     for b in range(batch):
         p[:] = powers[b]
         _respond(p, given, b, limits, modes, omega, p_slack)
-        first = sum(schedule_loss(p, omega, p_slack, given.cost[b], limits.bound, spacing))
+        first = _loss(p, omega, p_slack, given, b, limits, modes)
         bounded[0], speeds[0], slack[0] = p, omega, p_slack
         moved[0, 0], moved[0, 1:] = 0.0, p[1:] - p[:-1]
         bounded[1], moved[1], speeds[1], slack[1] = 0.0, 0.0, 0.0, 0.0
@@ -217,8 +207,7 @@ def iterate(
             _improve(p, gradient, given, b, limits, settings[i])
         track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
         _respond(p, given, b, limits, modes, omega, p_slack)
-        last = sum(schedule_loss(p, omega, p_slack, given.cost[b], limits.bound, spacing))
-        if last <= first or not only_better:
+        if _loss(p, omega, p_slack, given, b, limits, modes) <= first:
             powers[b] = p
 
 
@@ -317,33 +306,24 @@ def _improve(
 
 
 @compiled
-def schedule_loss(
-    p: Array, omega: Floats, p_slack: Floats, cost: Array, bound: float, spacing: float
-) -> tuple[float, float]:
-    """Mean cost of a schedule, and its penalty for what exceeds the bound; all else holds by construction.
-
-    Args:
-        p: at the knots, (n_knots, n_gen), pu.
-        omega: what it leads to on the time grid, (n_points, n_gen), rad/s.
-        p_slack: likewise, (n_points,), pu.
-        cost: (slack, generators), as parts of `Start.scale`, (1 + n_gen,), 1/pu.
-        bound: on |ω|, rad/s.
-        spacing: of the time grid, s.
-    """
-    total, penalty, (n, n_gen), n_points = 0.0, 0.0, p.shape, len(p_slack)
+def _loss(
+    p: Array, omega: Array32, p_slack: Array32, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes
+) -> float:
+    """Cost as a part of `Start.scale`, and the penalty; see `ScheduleLoss`."""
+    cost, penalty, (n, n_gen), n_points = 0.0, 0.0, p.shape, len(p_slack)
     for j in range(n):
         for g in range(n_gen):
             share = 0.5 if j == 0 or j == n - 1 else 1.0
-            total += share * cost[1 + g] * p[j, g] / (n - 1)
+            cost += share * given.cost[b, 1 + g] * p[j, g] / (n - 1)
     for k in range(n_points):
         share = 0.5 if k == 0 or k == n_points - 1 else 1.0
-        total += share * cost[0] * abs(p_slack[k]) / (n_points - 1)
+        cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_points - 1)
         for g in range(n_gen):
-            if abs(omega[k, g]) > bound:
-                excess = abs(omega[k, g]) / bound - 1.0
+            if abs(omega[k, g]) > limits.bound:
+                excess = abs(omega[k, g]) / limits.bound - 1.0
                 bent = min(excess, STRAIGHT)
                 penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
-    return float(total), float(PRICE * penalty * spacing)
+    return float(cost + PRICE * penalty * 2.0 * modes.half)
 
 
 @compiled

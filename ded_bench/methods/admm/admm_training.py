@@ -1,37 +1,32 @@
-"""Train `ded-admm` by CMA-ES on problems drawn afresh; no solution, no surrogate, no gradient is needed.
-
-The covariance matrix adaptation evolution strategy (Hansen and Ostermeier 2001) compares candidates by
-their loss on the same few problems, which are others in every generation. A running mean of its
-distribution's mean averages that out; the policy keeps the one with the least loss on problems held out.
-"""
+"""Train `ded-admm` on problems drawn afresh for every step; no solution is needed, and no surrogate."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import cma
 import numpy as np
-from tqdm import tqdm
+import torch
+from torch import Tensor
 
-from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.admm.admm_inference import CompiledIterations, schedule_loss, weight_shapes
+from ded_bench.methods.admm.admm_inference import PRICE, weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
-from ded_bench.methods.admm.modal_grid import ModalGrid
+from ded_bench.methods.admm.modal_grid import ModalGrid, Start
 from ded_bench.methods.admm.problems import Problems, draw
+from ded_bench.methods.admm.torch_iterations import ScheduleLoss, TorchIterations
 from ded_bench.methods.island.island_training import train as train_on_island
-from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint
+from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint, weights_of
 from ded_bench.methods.trained_policy import TrainedPolicy
-from ded_bench.methods.training_record import TrainingOptions, checkpoint_file, write_history
+from ded_bench.methods.training_record import TrainingOptions
+from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.score import score
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
@@ -42,16 +37,11 @@ TAKES_START = True
 TIGHT, LOOSE = (14, 60), (3, 30)
 #: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
 RAMPING = 0.1
-#: Generations of an epoch, epochs.
-STEPS, EPOCHS = 10, 24
-#: Candidates of a generation, and problems on which they are compared.
-CANDIDATES, BATCH = 14, 16
-#: First standard deviation of the weights: penalties change by factors of e^±0.5.
-SIGMA = 0.5
-#: What a running mean keeps from one generation to the next.
-KEEP = 0.9
-#: Of candidates that lead to no number.
-WORST = 1e3
+#: Steps of an epoch, epochs.
+STEPS, EPOCHS = 100, 8
+#: Problems of a step: so many that generators times knots of all are near the first number.
+ROWS, SMALLEST_BATCH = 4000, 8
+LEARNING_RATE = 0.1
 #: The policy is trained on a bound tighter by this fraction, so that small excesses stay within the true one.
 MARGIN = 0.015
 #: Penalty, as a part of an instance's cost, of which half counts: a few instances have no feasible schedule,
@@ -69,6 +59,7 @@ PATIENCE = 3
 SIMULATED = 50
 
 
+@repeatable()
 def train(
     case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
 ) -> TrainedPolicy:
@@ -81,12 +72,22 @@ def train(
         return train_on_island(case, regime, instances, out, options)
     horizon = instances[0].horizon_s
     grid = ModalGrid(case, case.omega_bound(regime), horizon)
+    network = TorchIterations(grid, iterations_of(grid))
     start = read_start(options.start) if options.start else None
-    run = Search(grid, start, Problems.of(case, instances[:HELD_OUT], grid.points), out, options)
+    if start is not None:
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
+    check = grid.start(Problems.of(case, instances[:HELD_OUT], grid.points))
+    run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
-        facts = run.train(f"{AdmmPolicy.method} {regime}")
-    weights = {"nodes": run.best_weights.astype(np.float32)}
-    policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights, facts), instances)
+        facts = run.train(options, EPOCHS, f"{AdmmPolicy.method} {regime}")
+    facts |= {
+        "batch": run.batch,
+        "instances": run.step * run.batch,
+        "held_out": len(check.served),
+        "start": weights_fingerprint(start) if start is not None else "",
+        "iterations": len(network.start),
+    }
+    policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights_of(network), facts), instances)
     policy.save(out)
     return policy
 
@@ -110,156 +111,39 @@ def read_start(path: Path) -> Weights:
     return checked_weights(arrays, weight_shapes(), path)
 
 
-class Judge:
-    """What weights are worth on some problems; what does not depend on weights is prepared once."""
+class _AdmmTraining(TrainingRun):
+    def __init__(self, network: TorchIterations, check: Start, seed: int, out: Path) -> None:
+        optimiser = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99))
+        super().__init__(network, optimiser, seed, out)
+        case = network.grid.case
+        self.grid, self.check, self.seed = network.grid, check, seed
+        self.batch = max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
+        self.judge = ScheduleLoss(network.grid)
 
-    def __init__(self, grid: ModalGrid, iterations: int, problems: Problems) -> None:
-        self.grid, self.iterations, self.start = grid, iterations, grid.start(problems)
-        self.linear = grid.along_first(self.start)
-        self.served = self.start.served.copy()
-        self.cost = problems.cost / self.start.scale[:, None]
+    def batches(self) -> Sequence[int]:
+        """Seeds of the steps: a training that goes on draws what it would have drawn."""
+        return range(self.step, self.step + STEPS)
 
-    def __call__(self, weights: Array) -> Array:
-        """Cost, penalty, excess over the bound as a part of it, of the last schedules, (n_served, 3).
+    def loss(self, step: int, progress: float) -> Tensor | None:
+        """Cost and priced penalty of fresh draws."""
+        grid, drawn = self.grid, (POLICY_SEED + self.seed, step * self.batch, self.batch)
+        start = grid.start(draw(grid.case, grid.bound, grid.points, *drawn))
+        judged = self.judge(start, self.network(start), MARGIN)
+        used = torch.as_tensor(start.served)
+        penalty = PRICE * judged.penalty
+        return (judged.cost + penalty / (1.0 + penalty / HOPELESS))[used].mean() if used.any() else None
 
-        First schedules, which the policy answers with where the last are no better, would hide what weights
-        do: where that is so on all problems, all weights would be worth the same.
-        """
-        grid, start = self.grid, self.start
-        start.served[:] = self.served  # whatever weights before these led to
-        iterate = CompiledIterations(grid, grid.bound, weights, self.iterations, only_better=False)
-        powers = iterate(start, self.linear, start.schedule)
-        x = grid.respond(powers, start, self.linear)[0]
-        _, omega, p_slack = grid.respond(powers, start, grid.along(start, x))
-        bound, spacing = (1.0 - MARGIN) * grid.bound, float(grid.points[1])
-        given = zip(powers, omega, p_slack, self.cost, strict=True)
-        found = [schedule_loss(*one, bound, spacing) for one in given]
-        excess = np.maximum(np.abs(omega).max(axis=(1, 2)) / grid.bound - 1.0, 0.0)
-        return np.column_stack([found, excess])[self.served]
-
-    def loss(self, weights: Array) -> float:
-        """Mean cost and penalty, of which large ones count less."""
-        cost, penalty, _ = self(weights).T
-        return _number((cost + penalty / (1.0 + penalty / HOPELESS)).mean()) if len(cost) else WORST
-
-
-class Search:
-    """The state of one training; a checkpoint holds the losses, from which the search is replayed."""
-
-    def __init__(
-        self, grid: ModalGrid, start: Weights | None, check: Problems, out: Path, options: TrainingOptions
-    ) -> None:
-        self.grid, self.iterations, self.out, self.options = grid, iterations_of(grid), out, options
-        self.shape = weight_shapes()["nodes"]
-        first = np.zeros(self.shape) if start is None else start["nodes"].astype(np.float64)
-        random = np.random.default_rng(options.seed)
-        own = {"popsize": CANDIDATES, "randn": lambda *shape: random.standard_normal(shape)}
-        self.strategy = cma.CMAEvolutionStrategy(first.ravel(), SIGMA, own | {"seed": np.nan, "verbose": -9})
-        self.check = Judge(grid, self.iterations, check)
-        #: What a checkpoint must agree in.
-        self.facts = {
-            "seed": options.seed,
-            "start": weights_fingerprint(start) if start is not None else "",
-            "iterations": self.iterations,
-            "batch": BATCH,
-            "held_out": int(self.check.served.sum()),
+    def look(self) -> dict[str, float]:
+        """Loss of the average, its cost, and what it exceeds, Hz."""
+        answer = self.average(self.check)
+        tight, own = (self.judge(self.check, answer, margin) for margin in (MARGIN, 0.0))
+        hertz = own.excess * self.grid.bound / (2 * math.pi)
+        return {
+            "held out": float((tight.cost + PRICE * tight.penalty).mean()),
+            "cost": float(own.cost.mean()),
+            "mean excess": float(hertz.mean()),
+            "max excess": float(hertz.max()),
         }
-        self.losses: list[list[float]] = []
-        self.history: list[dict[str, float]] = []
-        self.mean, self.best_weights, self.best = first.copy(), first.copy(), math.inf
-        self.spent, self.busy = 0.0, 0.0
-
-    @property
-    def epoch(self) -> int:
-        """How many are done."""
-        return len(self.history)
-
-    def train(self, title: str) -> dict[str, Any]:
-        """Train, from the checkpoint if asked; returns facts for the policy's file.
-
-        Raises:
-            InputError: the checkpoint is none, or one of another training.
-        """
-        options, epochs = self.options, self.options.epochs or EPOCHS
-        if options.resume and checkpoint_file(self.out).is_file():
-            self.load()
-        began, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
-        with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
-            while self.epoch < epochs:
-                for _ in range(STEPS):
-                    self._step()
-                    self.spent, self.busy = time.perf_counter() - began, time.process_time() - busy
-                    if options.seconds is not None and self.spent >= options.seconds:
-                        epochs = self.epoch + 1
-                        break
-                self._look()
-                bar.update()
-                bar.set_postfix_str(f"loss {self.history[-1]['held out']:.6g}")
-                self.save()
-        write_history(self.out, self.history)
-        done = {"epochs": self.epoch, "steps": len(self.losses), "instances": len(self.losses) * BATCH}
-        spent = {"seconds": self.spent, "cpu_seconds": self.busy, "held_out_loss": self.best}
-        made = {"parameters": self.mean.size, "cma": cma.__version__}
-        return options.facts() | self.facts | done | spent | made
-
-    def _step(self, losses: list[float] | None = None) -> None:
-        """One generation; its losses are taken unless they are known."""
-        candidates, grid = self.strategy.ask(), self.grid
-        if losses is None:
-            drawn = (POLICY_SEED + self.options.seed, len(self.losses) * BATCH, BATCH)
-            judge = Judge(grid, self.iterations, draw(grid.case, grid.bound, grid.points, *drawn))
-            losses = [judge.loss(one.reshape(self.shape)) for one in candidates]
-        self.strategy.tell(candidates, losses)
-        self.losses.append(losses)
-        share = max(1.0 - KEEP, 1.0 / len(self.losses))
-        self.mean += share * (self.strategy.mean.reshape(self.shape) - self.mean)
-
-    def _look(self, row: dict[str, float] | None = None) -> None:
-        """Judge the running mean on what is held out, unless that is known; the best so far is kept."""
-        if row is None:
-            cost, penalty, excess = self.check(self.mean).T
-            hertz = excess * self.grid.bound / (2 * math.pi)
-            row = {"epoch": self.epoch + 1, "step": len(self.losses), "seconds": self.spent}
-            row |= {"held out": _number((cost + penalty).mean()), "cost": _number(cost.mean())}
-            row |= {"mean excess": _number(hertz.mean()), "max excess": _number(hertz.max())}
-        self.history.append(row)
-        if row["held out"] < self.best:
-            self.best, self.best_weights = row["held out"], self.mean.copy()
-
-    def save(self) -> None:
-        """Write the checkpoint."""
-        rows = np.array([list(row.values()) for row in self.history])
-        arrays = {
-            "losses": np.array(self.losses),
-            "history": rows,
-            "spent": np.array([self.spent, self.busy]),
-        }
-        write_arrays(checkpoint_file(self.out), arrays, self.facts | {"columns": list(self.history[0])})
-
-    def load(self) -> None:
-        """Replay the search of the checkpoint, which is read without trust.
-
-        Raises:
-            InputError: it is no checkpoint, or one of another training.
-        """
-        path = checkpoint_file(self.out)
-        try:
-            arrays, header = read_arrays(path)
-            if any(header[name] != value for name, value in self.facts.items()):
-                raise ValueError
-            rows = [dict(zip(header["columns"], row, strict=True)) for row in arrays["history"].tolist()]
-            for losses in arrays["losses"].tolist():
-                self._step(losses)
-                if len(self.losses) == rows[self.epoch]["step"]:
-                    self._look(rows[self.epoch])
-            self.spent, self.busy = arrays["spent"].tolist()
-        except (InputError, LookupError, TypeError, ValueError):
-            problem = "is no checkpoint of this training; remove it, or train without --resume"
-            raise InputError(path, "", problem) from None
-
-
-def _number(value: Any) -> float:
-    return float(np.nan_to_num(value, nan=WORST, posinf=WORST))
 
 
 def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy:

@@ -142,6 +142,9 @@ def main(name: str, regime: str, count: int) -> None:
 def print_row(label: str, planned: int, scores: dict[str, Score], best: dict[str, float], count: int) -> None:
     """Medians over what can be followed."""
     found = list(scores.values())
+    if not found:
+        print(f"| {label} | {planned} | 0 | – | – | – | – | 0 % |", flush=True)
+        return
     mean, swing, excess = (
         1e3 * np.median([getattr(s, field) for s in found])
         for field in ("mean_freq_max_hz", "swing_max_hz", "freq_violation_hz")

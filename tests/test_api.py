@@ -59,11 +59,10 @@ sys.meta_path.insert(0, NoTorch())
 
 
 def test_answers_need_no_torch() -> None:
-    """Of any method, our policies among them; only training imports it, and that of `ded-admm` does not."""
+    """Of any method, our policies among them; only training imports it."""
     code = "from ded_bench.cli import commands\n"
     code += "from ded_bench.methods.registry import METHODS\n"
     code += "[m.options for m in METHODS.values()]\n"
-    code += "import ded_bench.methods.admm.admm_training\n"
     code += "import ded_bench.run.runner, ded_bench.analysis.certificate, ded_bench.report.report\n"
     assert "torch" not in loaded_after(code)
 

@@ -77,7 +77,7 @@ def classical(files: Files) -> None:
 #: None: nobody plans, static dispatch goes through the governors' inverse filter.
 PLANTS: dict[str, Callable[[Files], None] | None] = {
     "true plant": lambda files: None,
-    "static dispatch": None,
+    "static dispatch, led": None,
     "no governor lag": no_lag,
     "no losses": no_losses,
     "E' constant": constant_flux,

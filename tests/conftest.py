@@ -17,6 +17,7 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.pool import Workers
+from tests.detailed_cases import MIXED
 
 #: Generic properties are tested on every case here: the paper's; a chain slack - load - generator whose power
 #: flow, load angle and modes have closed forms; and a meshed grid with all that a case may have: junctions, a
@@ -90,6 +91,12 @@ def _quiet_instance(case: Case, **changes: Any) -> Instance:
 def quiet_instance() -> Callable[..., Instance]:
     """`quiet_instance(case, **fields)`: at rest at nominal power, no load ramps, unless fields say so."""
     return _quiet_instance
+
+
+@pytest.fixture(scope="session")
+def island() -> Case:
+    """The mixed island of `detailed_cases`."""
+    return Case.load(MIXED)
 
 
 @pytest.fixture(scope="module")

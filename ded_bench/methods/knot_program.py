@@ -29,10 +29,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.knots import divided, knot_weights, piece_starts, power_limits, transfer_room
-from ded_bench.methods.output_rows import ROUND_OFF, BasisByPlaces, OutputRows
+from ded_bench.methods.knot_columns import KnotColumns
+from ded_bench.methods.knots import divided, knot_weights
+from ded_bench.methods.output_rows import BasisByPlaces, OutputRows
 from ded_bench.methods.reserve import Reserve
-from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
+from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
@@ -62,8 +63,6 @@ HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
 
 #: (output, grid point) of a limit between knots.
 Limit = tuple[int, int]
-#: Row numbers, column numbers and values of dense blocks, stacked or single.
-Block = tuple[Indices, Indices, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +78,8 @@ class Prediction:
 class KnotProgram:
     """The program around one trajectory. P_0 and x_0 are given: the first knot has no columns.
 
-    Columns of an interval, one after another: s of its pieces, then u and x at its end; an island has no s.
-    Where limits of outputs may be exceeded, how much follows, then what a reserve needs.
+    After an interval's columns (`knot_columns`) come, where limits of outputs may be exceeded, how much, then
+    what a reserve needs.
 
     Args:
         case: the grid.
@@ -107,25 +106,11 @@ class KnotProgram:
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
         self.bounds, self._reserve, self._radius = bounds, reserve, radius
-        self._case, self._instance = case, instance
-        self._n, self._n_gen = len(model.lengths), len(case.generators)
-        self.pieces = piece_starts(model.points) if case.slack is not None else np.empty(0, dtype=int)
-        first = np.searchsorted(self.pieces, model.points[:-1])
-        owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
-        own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
+        self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
-        n_state = 0 if self.condensed else model.slack.shape[1]
-        at_end = self._n_gen + n_state
-        self._s = np.arange(len(self.pieces)) + at_end * owner
-        power = (own + at_end * np.arange(self._n))[:, None]
-        self._u, self._x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
-        self._last = power[:, 0] + at_end - 1  # of each interval
-        self._n_columns = len(self.pieces) + at_end * self._n
-        self._durations = model.lengths * instance.dt_s
-        self._price = instance.cost_slack(case)
-        self._generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
-        self._cost = self._columns_cost()
-        self._all_costs = (self._generation[1:] if self.condensed else self._cost).sum()
+        self._columns = KnotColumns(case, instance, model, self.condensed)
+        generation = self._columns.generation[1:]
+        self._all_costs = (generation if self.condensed else self._columns.cost).sum()
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded
@@ -134,7 +119,6 @@ class KnotProgram:
         self._basis: BasisByPlaces | None = None
         if before is not None and self.condensed:
             self._held, self._basis = self._held | before._held, before._basis
-        self._dynamics, self._slack = self._dynamics_rows(), self._slack_rows()
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with outputs limited at all knots and at the points chosen.
@@ -145,11 +129,11 @@ class KnotProgram:
         """
 
         def once(left_s: float) -> tuple[FormAnswer, Array]:
-            form = self._unlimited()
+            form = self._columns.program(self._radius)
             low, high = self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
             if isinstance(self.model.speed, slice) and not self.condensed:
-                speed = self._x[:, self.model.speed]
+                speed = self._columns.x[:, self.model.speed]
                 rows = self._frequency_rows(limits)
                 form.lower[speed], form.upper[speed] = least.reshape(speed.shape), most.reshape(speed.shape)
             else:
@@ -202,7 +186,7 @@ class KnotProgram:
         return self._at_all_knots(once, time_limit_s), widest
 
     def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with a priced excess of outputs in every interval, and with the reserve.
+        """Solve with a priced excess of outputs in every interval, and with the reserve; not condensed.
 
         Args:
             limits, time_limit_s: see `solve`.
@@ -211,25 +195,17 @@ class KnotProgram:
             As `solve`; the objective is not that of the plan alone.
         """
 
-        def once(left_s: float) -> tuple[FormAnswer, Array]:
-            deadline = time.perf_counter() + left_s
-            form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-            if self._reserve is not None:
-                form, moved = self._with_reserve(self._reserve, form, place, excess)
-                place, excess = moved[place], moved[excess]
-            if self.condensed:
-                answer = self._answer(form, left_s)
-            else:
-                answer = solve_form(form, left_s, True, REGULARISATION, RESIDUAL)
-            if answer.status == Status.FAILED:
-                answer = self._answer(form, deadline - time.perf_counter())
-            if answer.status == Status.FAILED:
-                answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
-            if answer.status != Status.OPTIMAL:
-                return answer, np.zeros(self._n)
-            return replace(answer, x=answer.x[place]), answer.x[excess]
-
-        return self._at_all_knots(once, time_limit_s)
+        deadline = time.perf_counter() + time_limit_s
+        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
+        if self._reserve is not None:
+            form, moved = self._with_reserve(self._reserve, form, place, excess)
+            place = moved[place]
+        answer = solve_form(form, time_limit_s, True, REGULARISATION, RESIDUAL)
+        if answer.status == Status.FAILED:
+            answer = self._answer(form, deadline - time.perf_counter())
+        if answer.status == Status.FAILED:
+            answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
+        return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
 
     def _at_all_knots(
         self, once: Callable[[float], tuple[FormAnswer, Array]], time_limit_s: float
@@ -256,7 +232,7 @@ class KnotProgram:
     def _beyond_at_knots(self, columns: Array) -> Array:
         """How far outputs are beyond their bounds at all knots but the first, (n_intervals, n_out), rad/s."""
         u = np.zeros_like(self.model.p_gen)
-        u[1:] = columns[self._u]
+        u[1:] = columns[self._columns.u]
         change = (self._speed_at_knots @ self.model.states(u)[1:, :, None])[..., 0]
         return np.abs(self.model.omega[self.model.points[1:]] + change) - self.bounds.limit
 
@@ -291,22 +267,24 @@ class KnotProgram:
         """All grid points at a solution, shape (n_columns,)."""
         model = self.model
         p_gen = np.array(model.p_gen)
-        p_gen[1:] = np.clip(p_gen[1:] + columns[self._u], self._case.p_min, self._case.p_max)
+        p_gen[1:] = np.clip(p_gen[1:] + columns[self._columns.u], self._case.p_min, self._case.p_max)
         outputs, p_slack = model.outputs(p_gen - model.p_gen)
         if model.delivered is None:
-            generation = float((self._generation * p_gen).sum())
+            generation = float((self._columns.generation * p_gen).sum())
         else:
-            paid = np.append(self._u, self._x)
+            paid = np.append(self._columns.u, self._columns.x)
             along = model.delivered.p_gen @ self._instance.cost_gen(self._case)
-            generation = float(along.sum() + self._cost[paid] @ columns[paid])
-        return Prediction(p_gen, outputs, p_slack, generation + self._price * float(np.abs(p_slack).sum()))
+            generation = float(along.sum() + self._columns.cost[paid] @ columns[paid])
+        return Prediction(
+            p_gen, outputs, p_slack, generation + self._columns.slack_price * float(np.abs(p_slack).sum())
+        )
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         """PIQP's, by the next factorisation where one stalls."""
         if self.condensed:
             return solve_by_highs(form, max(time_limit_s, 0.0))
         deadline, iterations = time.perf_counter() + time_limit_s, 0
-        is_short = self._n == len(self.model.omega) - 1 and self._n_columns < LONG * self._n
+        is_short = self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
         for staged, regularisation in SPARSE if is_short else DENSE:
             answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
             iterations += answer.iterations
@@ -315,34 +293,12 @@ class KnotProgram:
                 break
         return replace(answer, iterations=iterations)
 
-    def _unlimited(self) -> FreeForm:
-        """The program without limits of outputs."""
-        case, model = self._case, self.model
-        ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
-        slack = np.add.reduceat(model.p_slack, self.pieces)
-        p_min, p_max = power_limits(case, self._instance, model.lengths)
-        transfers, room = self._transfer_rows()
-        lower, upper = np.full((2, self._n_columns), np.inf) * [[-1.0], [1.0]]
-        lower[self._s] = 0.0
-        lower[self._u] = np.maximum(p_min - model.p_gen[1:], -self._radius)
-        upper[self._u] = np.minimum(p_max - model.p_gen[1:], self._radius)
-        return FreeForm(
-            cost=self._cost,
-            equal=self._dynamics,
-            right=np.zeros(self._x.size),
-            between=sp.csc_matrix(sp.vstack([self._ramp_rows(), self._slack, transfers])),
-            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack) + room.size, -np.inf)]),
-            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack, room]),
-            lower=lower,
-            upper=upper,
-        )
-
     def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""
-        form = self._unlimited()
+        form = self._columns.program(self._radius)
         held = self._held.ravel()
         own = np.append(np.nonzero(self._held)[0], self._interval_of(limits[:, 1]))
-        after = self._last if by_interval else self._last[-1:]
+        after = self._columns.last if by_interval else self._columns.last[-1:]
         none = np.zeros(len(after))
         form, place, new = form.with_columns(
             after, none + price * max(self._all_costs, 1.0), none, none + np.inf
@@ -365,7 +321,7 @@ class KnotProgram:
         near = slice(0, int(np.searchsorted(self.model.points[1:], reserve.ahead_s / self._instance.dt_s)))
         mean = float(np.mean(list(self._instance.cost.values())))
         shortage = reserve.price * mean * knot_weights(self.model.lengths)[1:] / reserve.limit
-        power, p_gen = place[self._u][near], self.model.p_gen[1:][near]
+        power, p_gen = place[self._columns.u][near], self.model.p_gen[1:][near]
         return reserve.required(form, power, p_gen, excess[near], shortage[near])
 
     def _room(self, points: Indices, outputs: Indices | None = None) -> tuple[Array, Array]:
@@ -379,62 +335,6 @@ class KnotProgram:
 
     def _interval_of(self, points: Indices) -> Indices:
         return np.searchsorted(self.model.points, points) - 1
-
-    def _columns_cost(self) -> Array:
-        """Cost of all columns: of what generators deliver, and of |P_s|."""
-        cost = np.zeros(self._n_columns)
-        cost[self._s] = self._price
-        if self.model.delivered is None:
-            cost[self._u] = self._generation[1:]
-            return cost
-        rows = self.model.cost_rows(self._instance.cost_gen(self._case))
-        if self.condensed:
-            cost[self._u] = self.model.by_set_points(rows).sum(axis=0)[1:]
-            return cost
-        cost[self._u] = rows.end
-        cost[self._u[:-1]] += rows.start[1:]
-        cost[self._x[:-1]] = rows.x[1:]
-        return cost
-
-    def _dynamics_rows(self) -> sp.csc_matrix:
-        if self.condensed:
-            return self._matrix(0, [])
-        across = self.model.across
-        end = across.h / self.model.lengths[:, None, None]
-        row = np.arange(self._x.size).reshape(self._n, -1)
-        one = np.broadcast_to(np.eye(row.shape[1]), across.f.shape)
-        blocks = [
-            (row, self._x, one),
-            (row, self._u, -end),
-            (row[1:], self._x[:-1], -across.f[1:]),
-            (row[1:], self._u[:-1], (end - across.g)[1:]),
-        ]
-        return self._matrix(row.size, blocks)
-
-    def _ramp_rows(self) -> sp.csc_matrix:
-        """Ramps in pu/s: what the solver leaves open is as little in a short interval as in a long one."""
-        row = np.arange(self._u.size).reshape(self._n, -1)
-        one = np.eye(self._n_gen) / self._durations[:, None, None]
-        return self._matrix(row.size, [(row, self._u, one), (row[1:], self._u[:-1], -one[1:])])
-
-    def _transfer_rows(self) -> tuple[sp.csc_matrix, Array]:
-        """What the machines of each transfer deliver at all knots but the first, and how far it may go up."""
-        by_machine = self._case.transfer_rows[0]
-        room = transfer_room(self._case, self._instance, self.model.points)
-        row = np.arange(room.size).reshape(room.shape)
-        blocks = [(row, self._u, np.broadcast_to(by_machine, (self._n, *by_machine.shape)))]
-        return self._matrix(room.size, blocks), (room - self.model.p_gen[1:] @ by_machine.T).ravel()
-
-    def _slack_rows(self) -> sp.csc_matrix:
-        """Σ δP_s - s over every piece, then -Σ δP_s - s."""
-        n = len(self.pieces)
-        if not n:
-            return self._matrix(0, [])
-        rows, place = self.model.slack_rows(self.pieces), np.arange(n)
-        one = np.ones((n, 1, 1))
-        blocks = self._local(rows, place) + self._local(rows, place + n, -1.0)
-        blocks += [(p[:, None], self._s[:, None], -one) for p in (place, place + n)]
-        return self._matrix(2 * n, blocks)
 
     @functools.cached_property
     def _speed_at_knots(self) -> Array:
@@ -460,29 +360,9 @@ class KnotProgram:
     @functools.cached_property
     def _all_knots(self) -> sp.csc_matrix:
         row = np.arange(self._held.size).reshape(self._held.shape)
-        every = self._matrix(row.size, [(row, self._x, self._speed_at_knots)])
+        every = self._columns.matrix(row.size, [(row, self._columns.x, self._speed_at_knots)])
         return every[np.flatnonzero(self._held)]
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
         rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])
-        return self._matrix(len(limits), self._local(rows, np.arange(len(limits))))
-
-    def _local(self, rows: LocalRows, place: Indices, sign: float = 1.0) -> list[Block]:
-        """Rows of intervals as blocks of one row each; the first knot has no columns."""
-        later = rows.interval > 0
-        before = rows.interval[later] - 1
-        return [
-            (place[:, None], self._u[rows.interval], sign * rows.end[:, None]),
-            (place[later, None], self._u[before], sign * rows.start[later, None]),
-            (place[later, None], self._x[before], sign * rows.x[later, None]),
-        ]
-
-    def _matrix(self, n_rows: int, blocks: list[Block]) -> sp.csc_matrix:
-        if not blocks:
-            return sp.csc_matrix((n_rows, self._n_columns))
-        rows = [np.broadcast_to(row[..., :, None], value.shape).ravel() for row, _, value in blocks]
-        columns = [np.broadcast_to(column[..., None, :], value.shape).ravel() for _, column, value in blocks]
-        values = np.concatenate([value.ravel() for _, _, value in blocks])
-        kept = np.abs(values) > ROUND_OFF
-        place = np.concatenate(rows)[kept], np.concatenate(columns)[kept]
-        return sp.csc_matrix((values[kept], place), (n_rows, self._n_columns))
+        return self._columns.matrix(len(limits), self._columns.local(rows, np.arange(len(limits))))

@@ -21,25 +21,8 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from tests.detailed_cases import MIXED
 
 HORIZON = 8.0
-
-
-@pytest.fixture(scope="module")
-def island() -> Case:
-    return Case.load(MIXED)
-
-
-@pytest.fixture
-def instance(island: Case, quiet_instance: Any) -> Instance:
-    """Loads that ramp one after another, and machines of different costs."""
-    load = {
-        bus: {"initial": value, "start": 0.5 + i, "duration": 3.0, "rate": 0.01 * value * (-1) ** i}
-        for i, (bus, value) in enumerate(zip(island.loads, island.load_nominal.tolist(), strict=True))
-    }
-    cost = {name: 0.2 + 0.1 * i for i, name in enumerate(island.generators)}
-    return quiet_instance(island, horizon_s=HORIZON, load=load, cost=cost)
 
 
 def policy(case: Case, settings: Any = FIRST, regime: str = "TO") -> IslandPolicy:

@@ -14,14 +14,8 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from tests.detailed_cases import MIXED
 
 HORIZON = 8.0
-
-
-@pytest.fixture(scope="module")
-def island() -> Case:
-    return Case.load(MIXED)
 
 
 @pytest.fixture

@@ -38,8 +38,9 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         return
     caption = (
         f"Mean gap to {sources.reference.title} against time per schedule; words name unusual settings and "
-        "surrogates. Hollow: some schedules are infeasible; * timed under parallel load, not by "
-        "`ded-bench bench`; grey: the paper's numbers. The vertical scale is linear within ±0.01 %."
+        "surrogates. Hollow: some schedules are infeasible; with an asterisk: timed under parallel load, not by "
+        f"`ded-bench bench`{'; grey: numbers of the paper' if sources.paper else ''}. The vertical scale is linear "
+        "within ±0.01 %."
     )
     papers = paper_points(sources.paper) if sources.paper else pd.DataFrame(columns=["regime"])
     yield Drawn("tradeoff", caption, tradeoff_figure(points, sources.reference.title, papers))

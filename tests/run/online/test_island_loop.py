@@ -34,12 +34,6 @@ AGC_CASES = ("two-area-agc", "39bus-agc", "68bus-agc", "140bus-agc")
 
 
 @pytest.fixture(scope="module")
-def island() -> Case:
-    """An island with everything that a grid may have."""
-    return Case.load(MIXED)
-
-
-@pytest.fixture(scope="module")
 def scenario(island) -> Scenario:
     """More than a horizon of it."""
     return sample_scenario(island, 0, 0, servable, 26.0)

@@ -1,0 +1,155 @@
+"""Columns of a program over schedules linear between knots, and its rows but those of outputs.
+
+See `knot_program` for the program.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import scipy.sparse as sp
+
+from ded_bench.methods.knots import knot_weights, piece_starts, power_limits, transfer_room
+from ded_bench.methods.output_rows import ROUND_OFF
+from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.solvers.linear_program import FreeForm
+
+#: Row numbers, column numbers and values of dense blocks, stacked or single.
+Block = tuple[Indices, Indices, Array]
+
+
+class KnotColumns:
+    """Columns of an interval, one after another: s of its pieces, then u and x at its end.
+
+    The first knot has none: P_0 and x_0 are given. An island has no s, a condensed program no x.
+
+    Args:
+        case: the grid.
+        instance: costs and P_0.
+        model: a linear model along a trajectory that starts at P_0.
+        condensed: states are substituted.
+    """
+
+    def __init__(self, case: Case, instance: Instance, model: TimeVarying, condensed: bool) -> None:
+        self._case, self._instance, self._model = case, instance, model
+        self._condensed = condensed
+        self._n, self._n_gen = len(model.lengths), len(case.generators)
+        self.pieces = piece_starts(model.points) if case.slack is not None else np.empty(0, dtype=int)
+        first = np.searchsorted(self.pieces, model.points[:-1])
+        owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
+        own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
+        n_state = 0 if condensed else model.slack.shape[1]
+        at_end = self._n_gen + n_state
+        self.s = np.arange(len(self.pieces)) + at_end * owner
+        power = (own + at_end * np.arange(self._n))[:, None]
+        self.u, self.x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
+        self.last = power[:, 0] + at_end - 1  # of each interval
+        self.count = len(self.pieces) + at_end * self._n
+        self._durations = model.lengths * instance.dt_s
+        self.slack_price = instance.cost_slack(case)
+        self.generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
+        self.cost = self._cost_of_all()
+
+    def program(self, radius: float) -> FreeForm:
+        """The program without limits of outputs, in which no set-point moves by more than the radius, pu."""
+        case, model = self._case, self._model
+        ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
+        slack = np.add.reduceat(model.p_slack, self.pieces)
+        p_min, p_max = power_limits(case, self._instance, model.lengths)
+        transfers, room = self._transfers()
+        lower, upper = np.full((2, self.count), np.inf) * [[-1.0], [1.0]]
+        lower[self.s] = 0.0
+        lower[self.u] = np.maximum(p_min - model.p_gen[1:], -radius)
+        upper[self.u] = np.minimum(p_max - model.p_gen[1:], radius)
+        return FreeForm(
+            cost=self.cost,
+            equal=self._dynamics,
+            right=np.zeros(self.x.size),
+            between=sp.csc_matrix(sp.vstack([self._ramps(), self._slack_sums, transfers])),
+            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack) + room.size, -np.inf)]),
+            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack, room]),
+            lower=lower,
+            upper=upper,
+        )
+
+    def local(self, rows: LocalRows, place: Indices, sign: float = 1.0) -> list[Block]:
+        """Rows of intervals as blocks of one row each; the first knot has no columns."""
+        later = rows.interval > 0
+        before = rows.interval[later] - 1
+        return [
+            (place[:, None], self.u[rows.interval], sign * rows.end[:, None]),
+            (place[later, None], self.u[before], sign * rows.start[later, None]),
+            (place[later, None], self.x[before], sign * rows.x[later, None]),
+        ]
+
+    def matrix(self, n_rows: int, blocks: list[Block]) -> sp.csc_matrix:
+        """Rows of dense blocks in all columns."""
+        if not blocks:
+            return sp.csc_matrix((n_rows, self.count))
+        rows = [np.broadcast_to(row[..., :, None], value.shape).ravel() for row, _, value in blocks]
+        columns = [np.broadcast_to(column[..., None, :], value.shape).ravel() for _, column, value in blocks]
+        values = np.concatenate([value.ravel() for _, _, value in blocks])
+        kept = np.abs(values) > ROUND_OFF
+        place = np.concatenate(rows)[kept], np.concatenate(columns)[kept]
+        return sp.csc_matrix((values[kept], place), (n_rows, self.count))
+
+    def _cost_of_all(self) -> Array:
+        """Cost of all columns: of what generators deliver, and of |P_s|."""
+        cost = np.zeros(self.count)
+        cost[self.s] = self.slack_price
+        if self._model.delivered is None:
+            cost[self.u] = self.generation[1:]
+            return cost
+        rows = self._model.cost_rows(self._instance.cost_gen(self._case))
+        if self._condensed:
+            cost[self.u] = self._model.by_set_points(rows).sum(axis=0)[1:]
+            return cost
+        cost[self.u] = rows.end
+        cost[self.u[:-1]] += rows.start[1:]
+        cost[self.x[:-1]] = rows.x[1:]
+        return cost
+
+    @functools.cached_property
+    def _dynamics(self) -> sp.csc_matrix:
+        if self._condensed:
+            return self.matrix(0, [])
+        across = self._model.across
+        end = across.h / self._model.lengths[:, None, None]
+        row = np.arange(self.x.size).reshape(self._n, -1)
+        one = np.broadcast_to(np.eye(row.shape[1]), across.f.shape)
+        blocks = [
+            (row, self.x, one),
+            (row, self.u, -end),
+            (row[1:], self.x[:-1], -across.f[1:]),
+            (row[1:], self.u[:-1], (end - across.g)[1:]),
+        ]
+        return self.matrix(row.size, blocks)
+
+    def _ramps(self) -> sp.csc_matrix:
+        """Ramps in pu/s: what the solver leaves open is as little in a short interval as in a long one."""
+        row = np.arange(self.u.size).reshape(self._n, -1)
+        one = np.eye(self._n_gen) / self._durations[:, None, None]
+        return self.matrix(row.size, [(row, self.u, one), (row[1:], self.u[:-1], -one[1:])])
+
+    def _transfers(self) -> tuple[sp.csc_matrix, Array]:
+        """What the machines of each transfer deliver at all knots but the first, and how far it may go up."""
+        by_machine = self._case.transfer_rows[0]
+        room = transfer_room(self._case, self._instance, self._model.points)
+        row = np.arange(room.size).reshape(room.shape)
+        blocks = [(row, self.u, np.broadcast_to(by_machine, (self._n, *by_machine.shape)))]
+        return self.matrix(room.size, blocks), (room - self._model.p_gen[1:] @ by_machine.T).ravel()
+
+    @functools.cached_property
+    def _slack_sums(self) -> sp.csc_matrix:
+        """Σ δP_s - s over every piece, then -Σ δP_s - s."""
+        n = len(self.pieces)
+        if not n:
+            return self.matrix(0, [])
+        rows, place = self._model.slack_rows(self.pieces), np.arange(n)
+        one = np.ones((n, 1, 1))
+        blocks = self.local(rows, place) + self.local(rows, place + n, -1.0)
+        blocks += [(p[:, None], self.s[:, None], -one) for p in (place, place + n)]
+        return self.matrix(2 * n, blocks)

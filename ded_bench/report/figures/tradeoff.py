@@ -36,11 +36,11 @@ def draw(sources: Sources) -> Iterator[Drawn]:
     )
     if not len(points):
         return
+    grey = "; grey: the paper's numbers" if sources.paper else ""
     caption = (
         f"Mean gap to {sources.reference.title} against time per schedule; words name unusual settings and "
-        "surrogates. Hollow: some schedules are infeasible; with an asterisk: timed under parallel load, not by "
-        f"`ded-bench bench`{'; grey: numbers of the paper' if sources.paper else ''}. The vertical scale is linear "
-        "within ±0.01 %."
+        "surrogates. Hollow: some schedules are infeasible; with an asterisk: timed under parallel load, not "
+        f"by `ded-bench bench`{grey}. The vertical scale is linear within ±0.01 %."
     )
     papers = paper_points(sources.paper) if sources.paper else pd.DataFrame(columns=["regime"])
     yield Drawn("tradeoff", caption, tradeoff_figure(points, sources.reference.title, papers))

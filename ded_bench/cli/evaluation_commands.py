@@ -161,10 +161,10 @@ def _report(a: argparse.Namespace) -> int:
     if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
         say(f"tables and figures of {counted(rows, 'row')} in {folder}")
     from ded_bench.report.report import write_report
-    from ded_bench.results.objectives import OBJECTIVES, objectives_file, objectives_of
+    from ded_bench.results.objectives import OBJECTIVES, objectives_of
 
     written = write_report(case, folder, problem_folder(a.case, case), print)
-    OBJECTIVES.write(objectives_file(folder), objectives_of(Results(folder).rows.values()))
+    OBJECTIVES.write(ResultsFolder(folder).objectives, objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0
 

@@ -6,8 +6,8 @@ and the table of objectives (`results.objectives`), so that every method answers
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ded_bench.problem.case import REPOSITORY, Case
 
@@ -18,67 +18,61 @@ REFERENCE_RUNS = next(
 )
 
 
-@dataclass(frozen=True)
+#: The plant of rows of the closed loop that name none.
+PLANT = "lossless"
+
+
+class OnlineKey(NamedTuple):
+    """What makes a row of `online.csv` unique. `model` and `policy` are `name@fingerprint`, or empty."""
+
+    scenario: str
+    regime: str
+    method: str
+    settings: str
+    model: str
+    policy: str
+    period_s: float
+    latency_s: float
+    forecast: str
+    predicted: bool
+    warm: bool
+    plant: str = PLANT
+
+
 class ResultsFolder:
     """Where a results folder keeps what; it need not exist."""
 
-    path: Path
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.results = path / "results.csv"  # rows of instance × regime × method × settings
+        self.schedules = path / "schedules"  # of the results' rows, see `archive`
+        self.failures = path / "failures.log"  # what methods raised, with whole tracebacks
+        self.validated = path / "validated.csv"  # kept schedules on plants other than those of their rows
+        self.referee = path / "referee.csv"  # what the field's simulator says of kept schedules
+        self.timing = path / "timing.csv"  # times of methods alone on the machine
+        self.latency = path / "latency.csv"  # times that `ded-bench online` took itself, of several runs
+        self.online = path / "online.csv"  # rows of scenario × regime × method × settings × loop
+        self.hindsight = path / "hindsight.csv"  # rows of scenario × regime, with full knowledge
+        self.koopman = path / "koopman"  # identified models, see `model`
+        self.certificates = path / "certificate.json"  # certificates of policies
+        self.tables, self.figures = path / "tables", path / "figures"  # of the report
+        self.objectives = self.tables / "objectives.csv"  # see `results.objectives`
 
     @property
     def contents(self) -> tuple[Path, ...]:
         """What makes a folder one of results: at least one of these is there."""
-        names = ("results.csv", "timing.csv", "online.csv", "certificate.json", "koopman", "policies")
-        return tuple(self.path / name for name in names)
-
-    @property
-    def results(self) -> Path:
-        """Rows of instance × regime × method × settings."""
-        return self.path / "results.csv"
-
-    @property
-    def timing(self) -> Path:
-        """Times of methods alone on the machine."""
-        return self.path / "timing.csv"
-
-    @property
-    def latency(self) -> Path:
-        """Times that `ded-bench online` took itself, of several runs."""
-        return self.path / "latency.csv"
-
-    @property
-    def schedules(self) -> Path:
-        """Folder of the schedules of the results' rows."""
-        return self.path / "schedules"
+        tables = self.results, self.timing, self.online
+        return *tables, self.certificates, self.koopman, self.path / "policies"
 
     def archive(self, method: str, settings: str, regime: str) -> Path:
         """The schedules of some rows (see `results.archive`)."""
         return self.schedules / method / settings / f"{regime}.npz"
-
-    @property
-    def failures(self) -> Path:
-        """Log of what methods raised, with whole tracebacks."""
-        return self.path / "failures.log"
 
     def log_failure(self, what: str, trace: str) -> None:
         """Add a traceback to the log; the folder is made if there is none."""
         self.path.mkdir(parents=True, exist_ok=True)
         with self.failures.open("a", encoding="utf-8", errors="replace") as log:
             log.write(f"{what}\n{trace}\n")
-
-    @property
-    def validated(self) -> Path:
-        """Kept schedules on plants other than those of their rows."""
-        return self.path / "validated.csv"
-
-    @property
-    def referee(self) -> Path:
-        """What the field's simulator says of kept schedules."""
-        return self.path / "referee.csv"
-
-    @property
-    def koopman(self) -> Path:
-        """Folder of identified models."""
-        return self.path / "koopman"
 
     def model(self, kind: str) -> Path:
         """An identified model."""
@@ -98,24 +92,21 @@ class ResultsFolder:
         """The policies that are there, by name."""
         return sorted((self.path / "policies").glob("*.safetensors"))
 
-    @property
-    def certificates(self) -> Path:
-        """Certificates of policies."""
-        return self.path / "certificate.json"
-
     def certificate_rows(self, *name: str) -> Path:
         """What one certificate counts, one row per instance; `name` is what makes it unique."""
         return self.path / "certificates" / f"{'-'.join(filter(None, name))}.csv"
 
-    @property
-    def tables(self) -> Path:
-        """Folder of the report's tables."""
-        return self.path / "tables"
+    def trajectory(self, key: OnlineKey) -> Path:
+        """The trajectory of a row of the closed loop."""
+        loop = f"{key.period_s:g}s-{key.latency_s:g}s-{key.forecast}"
+        loop += ("" if key.predicted else "-present") + ("" if key.warm else "-cold")
+        made_with = "+".join(filter(None, (key.settings, key.model, key.policy)))
+        place = self.path / "online" / key.plant / key.method / made_with / key.regime
+        return place / loop / f"{key.scenario}.safetensors"
 
-    @property
-    def figures(self) -> Path:
-        """Folder of the report's figures."""
-        return self.path / "figures"
+    def hindsight_trajectory(self, scenario: str, regime: str, plant: str) -> Path:
+        """The trajectory of a scenario's hindsight."""
+        return self.path / "online" / plant / "hindsight" / regime / f"{scenario}.safetensors"
 
 
 def default_results(case: Case) -> Path:

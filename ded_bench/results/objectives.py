@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 from ded_bench.files.table import Table, cell
 from ded_bench.problem.case import Case
@@ -30,11 +29,6 @@ class Objective:
 OBJECTIVES = Table(Objective)
 
 
-def objectives_file(folder: Path) -> Path:
-    """Where a results folder keeps the table."""
-    return ResultsFolder(folder).tables / "objectives.csv"
-
-
 def objectives_of(rows: Iterable[Row]) -> list[Objective]:
     """The scored rows with default settings and nothing trained, by regime, method and instance."""
     found = [
@@ -54,5 +48,5 @@ def reference_objectives(case: Case) -> list[Objective]:
     Raises:
         InputError: the table is wrong.
     """
-    path = objectives_file(reference_run(case))
+    path = ResultsFolder(reference_run(case)).objectives
     return OBJECTIVES.read(path) if path.is_file() else []

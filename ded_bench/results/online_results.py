@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,29 +13,11 @@ from ded_bench.files.table import Table, cell, plain_name
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.trajectory import Trajectory
+from ded_bench.results.folder import PLANT, OnlineKey, ResultsFolder
 from ded_bench.results.legacy import upgraded
 
 #: Trajectories are kept at points this far apart, s.
 KEPT_S = 0.1
-#: The plant of rows that name none.
-PLANT = "lossless"
-
-
-class OnlineKey(NamedTuple):
-    """What makes a row of `online.csv` unique. `model` and `policy` are `name@fingerprint`, or empty."""
-
-    scenario: str
-    regime: str
-    method: str
-    settings: str
-    model: str
-    policy: str
-    period_s: float
-    latency_s: float
-    forecast: str
-    predicted: bool
-    warm: bool
-    plant: str = PLANT
 
 
 def _quality(text: str) -> str:
@@ -141,35 +122,6 @@ ONLINE = Table(OnlineRow, since="method_version", upgrade=upgraded)
 HINDSIGHT = Table(HindsightRow, since="method_version", upgrade=upgraded)
 
 
-@dataclass(frozen=True)
-class OnlineFiles:
-    """Where a results folder keeps what of the closed loop; it need not exist."""
-
-    folder: Path
-
-    @property
-    def table(self) -> Path:
-        """Rows of scenario × regime × method × settings × loop."""
-        return self.folder / "online.csv"
-
-    @property
-    def hindsight(self) -> Path:
-        """Rows of scenario × regime, with full knowledge."""
-        return self.folder / "hindsight.csv"
-
-    def trajectory(self, key: OnlineKey) -> Path:
-        """The trajectory of a row."""
-        loop = f"{key.period_s:g}s-{key.latency_s:g}s-{key.forecast}"
-        loop += ("" if key.predicted else "-present") + ("" if key.warm else "-cold")
-        made_with = "+".join(filter(None, (key.settings, key.model, key.policy)))
-        place = self.folder / "online" / key.plant / key.method / made_with / key.regime
-        return place / loop / f"{key.scenario}.safetensors"
-
-    def hindsight_trajectory(self, scenario: str, regime: str, plant: str = PLANT) -> Path:
-        """The trajectory of a scenario's hindsight."""
-        return self.folder / "online" / plant / "hindsight" / regime / f"{scenario}.safetensors"
-
-
 class OnlineResults:
     """The tables of the closed loop in a results folder, and where the files beside them lie.
 
@@ -178,8 +130,8 @@ class OnlineResults:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.files = OnlineFiles(folder)
-        self.table = KeyedTable[OnlineKey, OnlineRow](self.files.table, ONLINE)
+        self.files = ResultsFolder(folder)
+        self.table = KeyedTable[OnlineKey, OnlineRow](self.files.online, ONLINE)
         self.hindsight = KeyedTable[tuple[str, str, str], HindsightRow](self.files.hindsight, HINDSIGHT)
 
 

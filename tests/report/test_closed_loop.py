@@ -44,7 +44,7 @@ def folder(threebus, tmp_path_factory):
         )
         keep_trajectory(results.files.trajectory(row.key), trajectory)
         results.table.add([row])
-    return results.files.folder
+    return results.files.path
 
 
 @pytest.mark.usefixtures("sketched")
@@ -77,7 +77,7 @@ def test_an_island_s_report_sets_plans_beside_practice(tmp_path):
         keep_trajectory(results.files.trajectory(row.key), trajectory)
         failed = OnlineRow(**known | {"scenario": "lost", "plans": 0}, error="the system cannot follow")
         results.table.add([row, failed])
-    write_report(case, results.files.folder, tmp_path / "no-problems")
+    write_report(case, results.files.path, tmp_path / "no-problems")
     practice, static = pd.read_csv(tmp_path / "island" / "tables" / "practice.csv").to_dict("records")
     rows = {row.settings: row for row in results.table.rows.values() if not row.error}
     assert (practice["n"], practice["failures"], practice["minutes"]) == (1, 1, 2)

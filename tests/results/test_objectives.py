@@ -10,10 +10,10 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.results import folder
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import (
     OBJECTIVES,
     Objective,
-    objectives_file,
     objectives_of,
     reference_objectives,
 )
@@ -43,7 +43,7 @@ def test_default_settings_only_and_no_instances_that_served_choices() -> None:
 def test_a_case_has_those_of_its_reference_run(threebus: Case, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(folder, "REFERENCE_RUNS", tmp_path)
     assert reference_objectives(threebus) == []
-    path = objectives_file(tmp_path / "threebus-reference")
+    path = ResultsFolder(tmp_path / "threebus-reference").objectives
     OBJECTIVES.write(path, objectives_of([ROW]))
     assert reference_objectives(threebus) == objectives_of([ROW])
     path.write_text(path.read_text().replace("2.5", "cheap"))
@@ -53,7 +53,7 @@ def test_a_case_has_those_of_its_reference_run(threebus: Case, tmp_path: Path, m
 
 @pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
 def test_committed_tables_follow_from_the_rows(folder: Path) -> None:
-    assert OBJECTIVES.read(objectives_file(folder)) == objectives_of(Results(folder).rows.values())
+    assert OBJECTIVES.read(ResultsFolder(folder).objectives) == objectives_of(Results(folder).rows.values())
 
 
 @pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)

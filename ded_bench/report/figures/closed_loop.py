@@ -18,7 +18,7 @@ from ded_bench.report.figures.panels import (
 )
 from ded_bench.report.figures.style import Drawn
 from ded_bench.report.sources import Sources
-from ded_bench.results.online_results import OnlineFiles, read_trajectory
+from ded_bench.results.online_results import read_trajectory
 
 #: At most so many methods and generators are drawn of a scenario.
 METHODS_SHOWN, GENERATORS_SHOWN = 3, 3
@@ -43,7 +43,7 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     Of the scenarios with most methods, the one whose worst excess is the median; static dispatch of every
     second, and of the other methods those of least excess, each with its best line.
     """
-    files, rows = OnlineFiles(sources.folder), sources.online
+    files, rows = sources.results.paths, sources.online
     rows = rows[(rows["regime"] == sources.tightest) & (rows["period_s"] == 1)]
     rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
     if not len(rows):
@@ -58,7 +58,7 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
         (row["method"], f"{row['title']}, {row['latency_s']:.2g} s"): files.trajectory(row["key"])
         for row in chosen.to_dict("records")
     }
-    hindsight = files.hindsight_trajectory(scenario, sources.tightest)
+    hindsight = files.hindsight_trajectory(scenario, sources.tightest, sources.case.plant_name)
     if hindsight.is_file():  # first, below the others
         paths = {("", "hindsight"): hindsight} | paths
     read = [(*key, read_trajectory(path)) for key, path in paths.items()]

@@ -14,7 +14,7 @@ from ded_bench.problem.case import Array
 from ded_bench.report.figures.panels import RAD_TO_HZ, Curve, Panel, time_figure
 from ded_bench.report.figures.style import PALETTE, Drawn
 from ded_bench.report.sources import Sources
-from ded_bench.results.online_results import OnlineFiles, read_trajectory
+from ded_bench.results.online_results import read_trajectory
 
 #: Static dispatch that is drawn, method and settings: practice twice, and every second; then one more method.
 STATICS = ((PRACTICE[0], "every=300"), PRACTICE, STATIC)
@@ -27,7 +27,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
     rows = sources.practice
     if sources.case.slack is not None or not len(rows):
         return
-    files = OnlineFiles(sources.folder)
+    files = sources.results.paths
     rows = rows[(rows["regime"] == sources.tightest) & rows["objective"].notna()]
     rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
     if not len(rows):

@@ -23,7 +23,6 @@ from ded_bench.problem.scenario import Scenario
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import (
     HindsightRow,
-    OnlineFiles,
     OnlineResults,
     OnlineRow,
     keep_trajectory,
@@ -149,7 +148,7 @@ def operate(
     return [table.rows[o.row.key] for o in operations]
 
 
-def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineRow:
+def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> OnlineRow:
     """Operate one scenario in this process, and keep its trajectory."""
     o, asked, started = operation, operation.row, time.perf_counter()
     plant = plant_of(case, asked.plant)
@@ -160,7 +159,7 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     missing = [answer for answer in answers if answer.schedule is None]
     for answer in missing[:1]:
         what = f"online {asked.method} {asked.regime} {asked.scenario}"
-        ResultsFolder(files.folder).log_failure(what, answer.trace or answer.error)
+        files.log_failure(what, answer.trace or answer.error)
     reason = reason_of(missing[0].error) if missing else ""
     if answers and len(missing) == len(answers):  # what happened then is no result of the method
         row = _row(o, None, f"every plan failed: {reason}")
@@ -185,7 +184,7 @@ def operate_one(case: Case, operation: Operation, files: OnlineFiles) -> OnlineR
     )
 
 
-def find_hindsight(case: Case, scenario: Scenario, row: HindsightRow, files: OnlineFiles) -> HindsightRow:
+def find_hindsight(case: Case, scenario: Scenario, row: HindsightRow, files: ResultsFolder) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
     found = hindsight(case, scenario, row.regime, plant_of(case, row.plant))
     keep_trajectory(files.hindsight_trajectory(*row.key), found.trajectory)

@@ -15,7 +15,8 @@ from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import scenario_files, write_scenarios
 from ded_bench.problem.scenario import load_scenarios
-from ded_bench.results.online_results import OnlineKey, OnlineResults, OnlineRow, read_trajectory
+from ded_bench.results.folder import OnlineKey
+from ded_bench.results.online_results import OnlineResults, OnlineRow, read_trajectory
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions
 from ded_bench.run.online.operation import make_operations, operate
@@ -69,7 +70,7 @@ def test_rows_hold_all_that_is_judged(threebus, first_run):
         kept = read_trajectory(results.files.trajectory(row.key))
         np.testing.assert_allclose(kept["t"], np.arange(61) * 0.1, atol=1e-12)
         assert kept["omega"].shape == (61, len(threebus.generators))
-        look = read_trajectory(results.files.hindsight_trajectory(row.scenario, "TO"))
+        look = read_trajectory(results.files.hindsight_trajectory(row.scenario, "TO", "lossless"))
         assert np.abs(look["omega"]).max() <= threebus.omega_bound("TO") + 1e-5
 
 
@@ -90,8 +91,8 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
     results, made, wanted = OnlineResults(tmp_path), [], operations(threebus, scenarios)
     assert operate(threebus, wanted, results, on_row=made.append) == first_run[0]
     assert made == []
-    text = results.files.table.read_text()
-    results.files.table.write_text(text[:-20])
+    text = results.files.online.read_text()
+    results.files.online.write_text(text[:-20])
     results = OnlineResults(tmp_path)
     assert len(results.table.rows) == 1
     again = operate(threebus, wanted, results, on_row=made.append)

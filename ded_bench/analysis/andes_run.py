@@ -1,10 +1,9 @@
-"""Runs of the field's simulator ANDES, in a process of its own that imports nothing of this package.
+"""One run of the field's simulator ANDES, in a process of its own that imports nothing of this package.
 
-`python andes_run.py GRID.json` reads the grid, prints `{"andes": version}`, and then reads names of files
-from its standard input, one a line: each is a run. It writes the speeds to a file of the same name that ends
-in `.npy`, (n, n_machine), rad/s from nominal at equidistant times from 0 to the horizon, machines in the
-order of the grid's file, and prints a line of JSON: `{"error": ""}`, or why there are none. The module
-`referee` beside it writes those files and describes them.
+`python andes_run.py SPEEDS.npy` reads `{"grid": ..., "run": ...}` from its standard input. It writes the
+speeds to the file, (n, n_machine), rad/s from nominal at equidistant times from 0 to the horizon, machines in
+the order of the grid's file, and prints `{"andes": version, "error": ""}`, or why there are none. The module
+`referee` beside it describes grid and run.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ SETTLING = 20
 
 
 class Simulator:
-    """ANDES's model of one grid for one run; what its own reset leaves does not start again."""
+    """ANDES's model of one grid for one run."""
 
     def __init__(self, andes: Any, grid: dict[str, Any], run: dict[str, Any]) -> None:
         self.column = andes.shared.matrix
@@ -220,25 +219,18 @@ def _exciter(exciter: dict[str, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Answer one line for every run that is named on standard input."""
+    """Answer what is asked on standard input."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # whatever ANDES prints is none
+    os.dup2(2, 1)  # whatever ANDES prints is no answer
     import andes
 
     andes.config_logger(stream_level=50)
-    with open(sys.argv[1], encoding="utf-8") as file:
-        grid = json.load(file)
-    print(json.dumps({"andes": andes.__version__}), file=answers, flush=True)
-    for line in sys.stdin:
-        place = line.strip()
-        with open(place, encoding="utf-8") as file:
-            run = json.load(file)
-        try:
-            np.save(place.removesuffix(".json") + ".npy", Simulator(andes, grid, run).speeds())
-            answer = {"error": ""}
-        except (ArithmeticError, ValueError) as error:
-            answer = {"error": str(error)}
-        print(json.dumps(answer), file=answers, flush=True)
+    asked, error = json.load(sys.stdin), ""
+    try:
+        np.save(sys.argv[1], Simulator(andes, asked["grid"], asked["run"]).speeds())
+    except (ArithmeticError, ValueError) as failure:
+        error = str(failure)
+    print(json.dumps({"andes": andes.__version__, "error": error}), file=answers, flush=True)
 
 
 if __name__ == "__main__":

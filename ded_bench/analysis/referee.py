@@ -1,8 +1,8 @@
 """The field's simulator as the last judge: kept schedules through ANDES, in a process of its own.
 
-ANDES is under the GPL and an optional tool. This package writes plain files and starts a script
-(`andes_run`) with a Python that has ANDES; nothing else passes between them. A schedule is confirmed if
-its peaks there keep the bounds of its regime, with an allowance for what two simulators may differ by.
+ANDES is under the GPL and an optional tool. For every schedule this package starts a script (`andes_run`)
+with a Python that has ANDES; only plain data pass between them. A schedule is confirmed if its peaks there
+keep the bounds of its regime, with an allowance for what two simulators may differ by.
 """
 
 from __future__ import annotations
@@ -10,14 +10,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import queue
 import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,80 +134,39 @@ def run_data(case: Case, instance: Instance, schedule: Schedule) -> dict[str, An
     }
 
 
-class Andes:
-    """A process that runs ANDES on one grid; ends with its `with` block.
+def speeds(python: str, grid: Mapping[str, Any], run: Mapping[str, Any]) -> tuple[Array, str]:
+    """Run ANDES once, in a process of its own.
 
-    Attributes:
-        version: of ANDES.
+    Args:
+        python: an interpreter that has ANDES.
+        grid: see `grid_data`.
+        run: see `run_data`.
+
+    Returns:
+        Deviations of all machines, in the order of the grid's file, (n, n_machine), rad/s, at points that are
+        equidistant from 0 to the horizon, and the version of ANDES.
+
+    Raises:
+        InputError: there is no such interpreter, or it has no ANDES.
+        SimulationError: ANDES finds no equilibrium, or no solution later.
     """
-
-    def __init__(self, python: str, grid: Mapping[str, Any]) -> None:
-        """Start it.
-
-        Raises:
-            InputError: there is no such interpreter, or it has no ANDES.
-        """
-        self._python, self._count = python, 0
-        with ExitStack() as stack:
-            self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ded-bench-")))
-            place = self._folder / "grid.json"
-            place.write_text(json.dumps(grid), encoding="utf-8")
-            self._said = stack.enter_context((self._folder / "said.txt").open("w+", encoding="utf-8"))
-            told, pipe = [python, str(SCRIPT), str(place)], subprocess.PIPE
-            try:
-                self._process = subprocess.Popen(told, stdin=pipe, stdout=pipe, stderr=self._said, text=True)
-            except OSError as error:
-                raise InputError(python, "", f"cannot be started ({error.strerror or error})") from None
-            stack.callback(self._end)
-            self.version = str(self._answer()["andes"])
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> Andes:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def _end(self) -> None:
-        self._process.kill()
-        self._process.communicate()
-
-    def speeds(self, run: Mapping[str, Any]) -> Array:
-        """Deviations of all machines, in the order of the grid's file, (n, n_machine), rad/s.
-
-        Points are equidistant from 0 to the horizon.
-
-        Raises:
-            SimulationError: ANDES finds no equilibrium, or no solution later.
-        """
-        self._count += 1
-        place = self._folder / f"{self._count}.json"
-        place.write_text(json.dumps(run), encoding="utf-8")
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{place}\n")
-        self._process.stdin.flush()
-        answer = self._answer()
-        place.unlink()
+    with tempfile.TemporaryDirectory(prefix="ded-bench-") as folder:
+        place, asked = Path(folder) / "speeds.npy", json.dumps({"grid": grid, "run": run})
+        told = [python, str(SCRIPT), str(place)]
+        try:
+            done = subprocess.run(told, input=asked, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise InputError(python, "", f"cannot be started ({error.strerror or error})") from None
+        if not done.stdout:
+            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            if last.startswith("ModuleNotFoundError"):
+                hint = "skipped; `pip install andes` there, or name another by --python"
+                raise InputError(python, "", f"has no ANDES ({last}): {hint}")
+            raise InputError(python, "", f"ANDES ended without an answer ({last})")
+        answer = json.loads(done.stdout)
         if answer["error"]:
             raise SimulationError(answer["error"])
-        found = place.with_suffix(".npy")
-        speeds: Array = np.load(found, allow_pickle=False)
-        found.unlink()
-        return speeds
-
-    def _answer(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        if line := self._process.stdout.readline():
-            answer: dict[str, Any] = json.loads(line)
-            return answer
-        self._said.seek(0)
-        last = (self._said.read().strip().splitlines() or ["it said nothing"])[-1]
-        if last.startswith("ModuleNotFoundError"):
-            problem = (
-                f"has no ANDES ({last}): skipped; `pip install andes` there, or name another by --python"
-            )
-            raise InputError(self._python, "", problem)
-        raise InputError(self._python, "", f"ANDES ended without an answer ({last})")
+        return np.load(place, allow_pickle=False), answer["andes"]
 
 
 def referee(
@@ -255,26 +212,6 @@ def referee(
             found.append(table.rows[row.key])
         else:
             todo.append((row, name))
-    with tqdm(total=len(todo), unit="row", disable=None, desc="referee") as bar:
-        for new in _judged(case, instances, results, todo, grid, python, min(workers, len(todo))):
-            table.add([new])
-            found.append(new)
-            bar.update()
-    table.compact()
-    return found
-
-
-def _judged(
-    case: Case,
-    instances: Mapping[str, Instance],
-    results: Results,
-    todo: Sequence[tuple[Row, str]],
-    grid: Mapping[str, Any],
-    python: str,
-    workers: int,
-) -> Iterator[RefereeRow]:
-    """Rows as they are judged, by so many processes at a time."""
-    idle: queue.SimpleQueue[Andes] = queue.SimpleQueue()
 
     def judge(row: Row, name: str) -> RefereeRow:
         instance = instances[row.instance]
@@ -282,34 +219,34 @@ def _judged(
         made = RefereeRow(
             **row.key._asdict(), plant=PLANT, fingerprint=name, method_version=row.method_version
         )
-        andes = idle.get()
-        try:
-            cells = judged(case, instance, schedule, row.regime, andes)
-        finally:
-            idle.put(andes)
-        return dataclasses.replace(made, **cells, andes=andes.version)
+        return dataclasses.replace(made, **judged(case, instance, schedule, row.regime, grid, python))
 
-    with ExitStack() as stack:
-        for _ in range(workers):
-            idle.put(stack.enter_context(Andes(python, grid)))
-        pool = stack.enter_context(ThreadPoolExecutor(max(workers, 1)))
+    with ThreadPoolExecutor(workers) as pool:
         waiting = [pool.submit(judge, *asked) for asked in todo]
         try:
-            for done in as_completed(waiting):
-                yield done.result()
+            for done in tqdm(
+                as_completed(waiting), total=len(todo), unit="row", disable=None, desc="referee"
+            ):
+                found.append(done.result())
+                table.add(found[-1:])
         finally:
             pool.shutdown(cancel_futures=True)
+    table.compact()
+    return found
 
 
-def judged(case: Case, instance: Instance, schedule: Schedule, regime: str, andes: Andes) -> dict[str, Any]:
+def judged(
+    case: Case, instance: Instance, schedule: Schedule, regime: str, grid: Mapping[str, Any], python: str
+) -> dict[str, Any]:
     """The cells that ANDES's run of a schedule fills: `verdict`, and the difference from our plant."""
     order = list(case.detailed.machines)
     columns = [order.index(case.machine_of(name)) for name in case.generators]
     try:
-        omega = andes.speeds(run_data(case, instance, schedule))[:, columns]
+        found, version = speeds(python, grid, run_data(case, instance, schedule))
     except SimulationError as error:
         return {"error": str(error)}
-    cells = verdict(case.bounds(regime), omega)
+    omega = found[:, columns]
+    cells = verdict(case.bounds(regime), omega) | {"andes": version}
     try:
         ours = simulate(case, instance, schedule, plant_of(case, PLANT)).omega
     except SimulationError:

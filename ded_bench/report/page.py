@@ -1,50 +1,43 @@
-"""A page as a list of blocks, and its two renderings: Markdown, and one self-contained HTML file."""
+"""A page as a list of blocks, as Markdown, and that as one self-contained HTML file."""
 
 from __future__ import annotations
 
 import base64
 import html
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+from markdown_it import MarkdownIt
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.report.columns import Column, computed
 
-#: Cells with more characters may be broken into lines.
-_LONG, _WORDS = 32, ' class="words"'
-#: The first line of a regime.
-_FIRST = ' class="first"'
+#: What the text of a page may hold; links and pictures in it would be strangers'.
+MARKDOWN = MarkdownIt("commonmark").enable("table").disable(["link", "autolink", "image"])
 STYLE = """
 body { margin: 0 auto; max-width: 78rem; padding: 0.5rem 1.25rem 4rem; background: #fff; color: #1b1f24;
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, Arial, sans-serif; }
 h1 { font-size: 1.5rem; margin: 0.25rem 0; }
 h2 { font-size: 1.3rem; margin: 2rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid #d0d7de; }
-p, ul, figcaption { max-width: 60rem; }
+p, ul { max-width: 60rem; }
 nav ul { display: flex; flex-wrap: wrap; gap: 0 1rem; list-style: none; padding: 0; font-size: 0.85rem; }
 a, summary { color: #0b5cad; }
 summary { cursor: pointer; padding: 0.35rem 0; }
 details { margin: 0.6rem 0; border: 1px solid #d0d7de; border-radius: 4px; padding: 0 0.8rem; }
 code { font: 0.9em ui-monospace, Menlo, Consolas, monospace; background: #f2f4f6; overflow-wrap: anywhere; }
-figure { margin: 1rem 0; }
-figcaption { color: #57606a; font-size: 0.9rem; margin: 0.5rem 0; }
-.table figcaption { color: inherit; font-weight: 600; }
-.scroll { overflow-x: auto; }
-.note { background: #fff8e5; border-left: 4px solid #bf8700; padding: 0.25rem 1rem; }
+blockquote { background: #fff8e5; border-left: 4px solid #bf8700; margin: 1rem 0; padding: 0.05rem 1rem; }
 img { display: block; max-width: min(100%, 56rem); height: auto; }
-table { border-collapse: collapse; font-size: 0.8rem; line-height: 1.3; font-variant-numeric: tabular-nums;
-  border-top: 2px solid; border-bottom: 2px solid; }
+table { display: block; overflow-x: auto; margin: 1rem 0; border-collapse: collapse; font-size: 0.8rem;
+  line-height: 1.3; font-variant-numeric: tabular-nums; }
 th { text-align: left; vertical-align: bottom; border-bottom: 1px solid; }
 th, td { padding: 0.2rem 0.5rem 0.2rem 0; }
-td { vertical-align: top; white-space: nowrap; }
-.words { white-space: normal; min-width: 14rem; }
-.number { text-align: right; }
-tr.first td { border-top: 1px solid #d0d7de; }
+td { vertical-align: top; }
+td[style] { white-space: nowrap; }
 @media (max-width: 40rem) { body { font-size: 15px; padding: 0.75rem 0.9rem 3rem; } }
-@media print { .scroll { overflow: visible; } figure { break-inside: avoid; } }
 """
 
 
@@ -54,11 +47,6 @@ class Heading:
 
     text: str
     level: int = 2
-
-    @property
-    def anchor(self) -> str:
-        """Name of the heading in links."""
-        return re.sub(r"[^a-z0-9]+", "-", self.text.lower()).strip("-")
 
 
 @dataclass(frozen=True)
@@ -164,26 +152,22 @@ def _each(blocks: Sequence[Block]) -> Iterator[Block]:
         yield from _each(block.blocks) if isinstance(block, Details) else (block,)
 
 
-def to_markdown(table: PageTable) -> str:
-    """A pipe table; numbers are right-aligned."""
-    marks = ["---:" if numeric else "---" for numeric in table.numeric]
-    lines = [[column.heading for column in table.columns], marks, *table.cells]
-    text = [
-        [cell.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;") for cell in line] for line in lines
-    ]
-    return "".join(f"| {' | '.join(line)} |\n" for line in text)
+def render_markdown(blocks: Sequence[Block], folder: Path | None = None) -> str:
+    """The page as Markdown; no text in it is taken for HTML.
+
+    Args:
+        blocks: its parts.
+        folder: where paths of pictures start, if they are to be in the text; None: it links to them.
+    """
+    return "\n".join(_markdown(block, folder) for block in blocks)
 
 
-def render_markdown(blocks: Sequence[Block]) -> str:
-    """The page as Markdown; pictures are links to the files, and no text in it is taken for HTML."""
-    return "\n".join(map(_markdown, blocks))
-
-
-def _markdown(block: Block) -> str:
+def _markdown(block: Block, folder: Path | None) -> str:
+    if isinstance(block, Details):
+        head = f"<details><summary>{html.escape(block.summary)}</summary>"
+        return f"{head}\n\n{render_markdown(block.blocks, folder)}\n</details>\n"
+    image = ""
     match block:
-        case Details(summary, inside):
-            head = f"<details><summary>{html.escape(summary)}</summary>"
-            return f"{head}\n\n{render_markdown(inside)}\n</details>\n"
         case Heading(text, level):
             made = f"{'#' * level} {text}\n"
         case Text(text, note):
@@ -192,9 +176,26 @@ def _markdown(block: Block) -> str:
             made = "".join(f"- {item}\n" for item in items)
         case PageTable(caption=caption):
             made = (f"**{caption}**\n\n" if caption else "") + to_markdown(block)
-        case Picture(path, caption):
-            made = f"![{_plain(caption)}]({path})\n\n*{caption}*\n"
-    return made.replace("<", "&lt;")
+        case Picture(caption=caption):
+            image, made = f"{_image(block, folder)}\n\n", f"*{caption}*\n"
+    return image + made.replace("<", "&lt;")
+
+
+def to_markdown(table: PageTable) -> str:
+    """A pipe table; numbers are right-aligned."""
+    marks = ["---:" if numeric else "---" for numeric in table.numeric]
+    lines = [[column.heading for column in table.columns], marks, *table.cells]
+    text = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
+    return "".join(f"| {' | '.join(line)} |\n" for line in text)
+
+
+def _image(picture: Picture, folder: Path | None) -> str:
+    """A link to a picture, or the picture itself."""
+    said = re.sub(r"[`*\[\]]", "", picture.caption)
+    if folder is None:
+        return f"![{said.replace('<', '&lt;')}]({picture.path})"
+    data = base64.b64encode((folder / picture.path).read_bytes()).decode("ascii")
+    return f'<img alt="{html.escape(said)}" src="data:image/png;base64,{data}">'
 
 
 def render_html(blocks: Sequence[Block], folder: Path) -> str:
@@ -204,68 +205,19 @@ def render_html(blocks: Sequence[Block], folder: Path) -> str:
         blocks: the first one is the page's title.
         folder: where paths of pictures start.
     """
-    headings = [block for block in blocks if isinstance(block, Heading)]
-    links = "".join(
-        f'<li><a href="#{h.anchor}">{html.escape(h.text)}</a></li>' for h in headings if h.level == 2
-    )
-    first, *others = [_html(block, folder) for block in blocks]
-    content = "\n".join((first, f'<nav aria-label="Contents"><ul>{links}</ul></nav>', *others))
+    tokens, titles = MARKDOWN.parse(render_markdown(blocks, folder)), []
+    for opening, inside in itertools.pairwise(tokens):
+        if opening.type == "heading_open":
+            opening.attrSet("id", re.sub(r"[^a-z0-9]+", "-", inside.content.lower()).strip("-"))
+            title = html.escape(html.unescape(inside.content))
+            titles.append((opening.tag, f'<li><a href="#{opening.attrs["id"]}">{title}</a></li>'))
+    links = "".join(link for tag, link in titles if tag == "h2")
+    title, nav = re.sub("<[^>]+>", "", titles[0][1]), f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
+    content = MARKDOWN.renderer.render(tokens, MARKDOWN.options, {}).replace("</h1>", f"</h1>\n{nav}", 1)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
-        f"<title>{html.escape(headings[0].text)}</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{content}\n</main>\n</body>\n</html>\n"
     )
-
-
-def _html(block: Block, folder: Path) -> str:
-    match block:
-        case Heading(text, level):
-            return f'<h{level} id="{block.anchor}">{html.escape(text)}</h{level}>'
-        case Text(text, note):
-            return (
-                f'<p class="note"><strong>Note:</strong> {_inline(text)}</p>'
-                if note
-                else f"<p>{_inline(text)}</p>"
-            )
-        case Items(items):
-            return "<ul>" + "".join(f"<li>{_inline(item)}</li>" for item in items) + "</ul>"
-        case PageTable(caption=caption):
-            words = f"<figcaption>{_inline(caption)}</figcaption>" if caption else ""
-            return f'<figure class="table">{words}<div class="scroll">{to_html(block)}</div></figure>'
-        case Picture(path, caption):
-            data = base64.b64encode((folder / path).read_bytes()).decode("ascii")
-            image = f'<img alt="{html.escape(_plain(caption))}" src="data:image/png;base64,{data}">'
-            return f"<figure>{image}<figcaption>{_inline(caption)}</figcaption></figure>"
-        case Details(summary, inside):
-            within = "\n".join(_html(one, folder) for one in inside)
-            return f"<details><summary>{_inline(summary)}</summary>\n{within}\n</details>"
-
-
-def to_html(table: PageTable) -> str:
-    """An HTML table; classes: numbers `number`, sentences `words`, the first line of a regime `first`."""
-    kinds = [' class="number"' if numeric else "" for numeric in table.numeric]
-    head = "".join(
-        f'<th scope="col"{kind}>{html.escape(column.heading)}</th>'
-        for column, kind in zip(table.columns, kinds, strict=True)
-    )
-    body, previous = [], None
-    for row in table.cells:
-        classes = [_WORDS if len(cell) > _LONG else kind for cell, kind in zip(row, kinds, strict=True)]
-        cells = "".join(
-            f"<td{kind}>{html.escape(cell)}</td>" for cell, kind in zip(row, classes, strict=True)
-        )
-        body.append(f"<tr{'' if previous in (None, row[0]) else _FIRST}>{cells}</tr>")
-        previous = row[0]
-    rows = "\n".join(body)
-    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
-
-
-def _inline(text: str) -> str:
-    escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
-    return re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped)
-
-
-def _plain(text: str) -> str:
-    return re.sub(r"[`*\[\]]", "", text)

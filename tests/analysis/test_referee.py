@@ -15,7 +15,6 @@ import pytest
 from ded_bench.analysis.referee import (
     ABSOLUTE_HZ,
     REFEREE,
-    Andes,
     grid_data,
     judged,
     referee,
@@ -33,22 +32,19 @@ from tests.detailed_cases import MIXED
 #: An interpreter with ANDES, to be tried with; this one, unless told otherwise.
 PYTHON = os.environ.get("DED_BENCH_ANDES_PYTHON", sys.executable)
 
-#: Answers as `andes_run` does: all machines at 0.001 rad/s times the number of the run, and no more voltages
-#: where the first set-point is above 0.9 pu; notes each run.
+#: Answers as `andes_run` does: all machines at 0.001 rad/s, and no more voltages where the first set-point is
+#: above 0.9 pu; notes each run.
 STAND_IN = """#!{python}
 import json, sys
 import numpy as np
-grid = json.load(open(sys.argv[2]))
-print(json.dumps({{"andes": "0"}}), flush=True)
-for number, line in enumerate(sys.stdin, start=1):
-    place = line.strip()
-    run = json.load(open(place))
-    with open({log!r}, "a") as file:
-        print(json.dumps(run), file=file)
-    failed = max(run["set_points"]["south"]) > 0.9
-    n = round(run["horizon_s"] / run["dt_s"]) // 2 + 1
-    np.save(place[:-5] + ".npy", np.full((n, len(grid["machines"]["machines"])), 0.001 * number))
-    print(json.dumps({{"error": "no solution" if failed else ""}}), flush=True)
+asked = json.load(sys.stdin)
+run = asked["run"]
+with open({log!r}, "a") as file:
+    print(json.dumps(run), file=file)
+failed = max(run["set_points"]["south"]) > 0.9
+n = round(run["horizon_s"] / run["dt_s"]) // 2 + 1
+np.save(sys.argv[2], np.full((n, len(asked["grid"]["machines"]["machines"])), 0.001))
+print(json.dumps({{"andes": "0", "error": "no solution" if failed else ""}}))
 """
 
 
@@ -207,7 +203,6 @@ def test_andes_confirms_our_plant(place, andes_python: str, quiet_instance) -> N
     instance, schedule = ramping(case, quiet_instance)
     start = {"power": instance.initial.power, "omega": dict.fromkeys(case.generators, omega)}
     instance, schedule = ramping(case, quiet_instance, initial=start)
-    with Andes(andes_python, grid_data(case)) as andes:
-        found = judged(case, instance, schedule, next(iter(case.regimes)), andes)
+    found = judged(case, instance, schedule, next(iter(case.regimes)), grid_data(case), andes_python)
     assert found["difference_hz"] < 1e-5
     assert max(value for name, value in found.items() if name.startswith("peak")) > 1e-3

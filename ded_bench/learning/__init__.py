@@ -2,7 +2,8 @@
 
 `split_arrays`, `simulate_many`, `linearise` and `condense` need NumPy only; `simulated` and
 `cost_and_excess`, which PyTorch differentiates, need the extra `train`. `casadi_model` has
-the equations for optimisers. Each is imported when first asked for.
+the equations for optimisers, `export_programs` writes the linear programs of a closed loop.
+Each is imported when first asked for.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ded_bench.learning.linear_maps import CondensedMap as CondensedMap
     from ded_bench.learning.linear_maps import condense as condense
     from ded_bench.learning.linear_maps import linearise as linearise
+    from ded_bench.learning.linear_programs import export_programs as export_programs
     from ded_bench.learning.splits import SplitArrays as SplitArrays
     from ded_bench.learning.splits import split_arrays as split_arrays
 
@@ -28,6 +30,7 @@ _HOMES = {
     "casadi_model": "ded_bench.learning.casadi_expressions",
     "condense": "ded_bench.learning.linear_maps",
     "cost_and_excess": "ded_bench.learning.differentiable",
+    "export_programs": "ded_bench.learning.linear_programs",
     "linearise": "ded_bench.learning.linear_maps",
     "simulate_many": "ded_bench",
     "simulated": "ded_bench.learning.differentiable",

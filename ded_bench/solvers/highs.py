@@ -8,7 +8,7 @@ import highspy
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.solvers.linear_program import Basis, FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import Basis, FormAnswer, FreeForm, told
 from ded_bench.solvers.status import Status
 
 _OPTIONS: dict[str, Any] = {
@@ -57,4 +57,4 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, start: Basis | None
     ended = highs.getBasis()
     basis = Basis(np.array(ended.col_status, dtype=object), np.array(ended.row_status, dtype=object))
     message = highs.modelStatusToString(found)
-    return FormAnswer(status, x, iterations, f"highs {highs.version()}", message, basis)
+    return told(form, FormAnswer(status, x, iterations, f"highs {highs.version()}", message, basis))

@@ -6,7 +6,7 @@ may multiply others in the objective, so that costs, too, can change from one so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -113,6 +113,17 @@ class FormAnswer:
     version: str
     message: str
     basis: Basis | None = None  # where a simplex method ended
+
+
+#: Are told of every program that this process solves, and of the answer.
+LISTENERS: list[Callable[[FreeForm, FormAnswer], None]] = []
+
+
+def told(form: FreeForm, answer: FormAnswer) -> FormAnswer:
+    """The answer, when listeners have heard of it."""
+    for listener in LISTENERS:
+        listener(form, answer)
+    return answer
 
 
 @dataclass(frozen=True, eq=False)

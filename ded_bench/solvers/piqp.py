@@ -8,7 +8,7 @@ import numpy as np
 import piqp
 import scipy.sparse as sp
 
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, told
 from ded_bench.solvers.status import Status
 
 #: The programs of this suite take 15 to 60 iterations.
@@ -80,4 +80,4 @@ def solve_form(
         status = Status.TIME_LIMIT
     else:
         status = Status.FAILED
-    return FormAnswer(status, x, iterations, f"piqp {piqp.__version__}", found.name)
+    return told(form, FormAnswer(status, x, iterations, f"piqp {piqp.__version__}", found.name))

@@ -59,7 +59,7 @@ class Planner:
             if not isinstance(prepared, bool):
                 return self._none(prepared, started)
             self._ready = True
-        answer = _call(_solve, (*job, instance, last), self.limit_s)
+        answer = _call(answered, (*job, instance, last), self.limit_s)
         if not isinstance(answer, tuple):
             return self._none(answer, started)
         solution, warm = answer
@@ -91,7 +91,7 @@ def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:
     return True
 
 
-def _solve(
+def answered(
     case: Case, method: str, regime: str, settings: Settings, instance: Instance, last: Schedule | None
 ) -> tuple[Solution, bool]:
     """Solve in this process as in operation, if the method knows how; tells if it was given the last plan."""

@@ -24,7 +24,7 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
-from ded_bench.files.table import Table, cell
+from ded_bench.files.table import NotNegative, Table
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, named
@@ -62,10 +62,10 @@ class CertificateRow:
     fingerprint: str
     objective: float | None = None
     reference: float | None = None  # objective of the reference
-    freq_violation_hz: float | None = cell(default=None, lowest=0)
-    ramp_violation: float | None = cell(default=None, lowest=0)
-    bound_violation: float | None = cell(default=None, lowest=0)
-    initial_violation: float | None = cell(default=None, lowest=0)
+    freq_violation_hz: NotNegative | None = None
+    ramp_violation: NotNegative | None = None
+    bound_violation: NotNegative | None = None
+    initial_violation: NotNegative | None = None
 
 
 ROWS: Table[CertificateRow] = Table(CertificateRow)

@@ -7,30 +7,29 @@ import math
 import re
 import string
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field
 
 from ded_bench.analysis.inspect_case import suggested_knots
 from ded_bench.files.errors import InputError
 from ded_bench.files.matpower import read_matpower
 from ded_bench.files.strict import parse_record, read_text
-from ded_bench.files.table import records
-from ded_bench.plants.plant import plant_of
+from ded_bench.files.table import Table, records
+from ded_bench.plants.detailed.power_flow import Complex, port_network
+from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.grid_files import BASE_MVA
 from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import rounded
 
-Complex = NDArray[np.complex128]
-
 #: What is assumed of every machine, as on the shipped grids: d / m, 1/s.
 DAMPING = 0.3
-#: Newton's method ends at this mismatch, pu, and gives up after so many steps.
-MISMATCH, NEWTON_STEPS = 1e-10, 30
 #: Matrices of more buses, which are full, would fill the memory.
 MOST_BUSES = 5000
 #: Where H and x'd stand among the numbers of a PSS/E dyr record, by its model.
@@ -42,8 +41,23 @@ COLUMNS = {
     "gen": [0, 1, 2, 5, 6, 7, 8, 9],
     "branch": [0, 1, 2, 3, 4, 8, 9, 10],
 }
-#: Columns of a CSV file of dynamics: those that are needed, and others.
-NEEDED, OPTIONAL = ("bus", "h", "xd1"), ("mva", "p_min", "p_max", "ramp_pu_per_s")
+Above = Annotated[float, Field(gt=0)]
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What is known of a machine beside the MATPOWER file; its limits are on 100 MVA."""
+
+    bus: int
+    h: Above  # s, on its own base; likewise x'd, pu
+    xd1: Above
+    mva: Above | None = None
+    p_min: float | None = None
+    p_max: float | None = None
+    ramp_pu_per_s: float | None = None
+
+
+DYNAMICS = Table(Dynamics)
 
 
 class MatpowerGrid(NamedTuple):
@@ -128,101 +142,63 @@ def _grid(path: str | Path) -> MatpowerGrid:
     return MatpowerGrid(path, float(found["baseMVA"][0, 0]), bus, gen, branch, places)
 
 
-def _dynamics(path: str | Path) -> dict[int, list[dict[str, float]]]:
+def _dynamics(path: str | Path) -> dict[int, list[Dynamics]]:
     """Data of machines by bus, in the order of the file."""
-    found: dict[int, list[dict[str, float]]] = {}
-    for place, cells in (_of_dyr if Path(path).suffix.lower() == ".dyr" else _of_csv)(path):
-        one = _numbers(path, place, cells)
-        if not set(NEEDED) <= one.keys():
-            raise InputError(path, place, f"needs {', '.join(NEEDED)}")
-        found.setdefault(int(one["bus"]), []).append(one)
+    if Path(path).suffix.lower() == ".dyr":
+        header, lines = ["bus", "h", "xd1"], list(_of_dyr(read_text(path)))
+    else:
+        (_, header), *lines = records(read_text(path), path) or [(0, [])]
+        header = list(DYNAMICS.check_header([cell.strip() for cell in header], path))
+        if unknown := [name for name in header if name not in DYNAMICS.names]:
+            raise InputError(path, unknown[0][:40], f"unknown column (known: {', '.join(DYNAMICS.names)})")
+    found: dict[int, list[Dynamics]] = {}
+    for one in DYNAMICS.rows(lines, header, path):
+        found.setdefault(one.bus, []).append(one)
     return found
 
 
-def _of_dyr(path: str | Path) -> Iterator[tuple[str, dict[str, str]]]:
-    for record in re.split(r"/[^\n]*", read_text(path)):  # what follows a record is a comment
-        words = re.sub(r"['\",]", " ", record).split()
+def _of_dyr(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Line, bus, H and x'd of every record of a machine."""
+    for record in re.finditer(r"([^/]+)/[^\n]*", text):  # what follows a record is a comment
+        words = re.sub(r"['\",]", " ", record[1]).split()
         if len(words) > 2 and (columns := DYR.get(words[1].upper())):
-            values = zip(
-                NEEDED, (words[0], *(words[3 + c] for c in columns if 3 + c < len(words))), strict=False
-            )
-            yield f"{words[1]} of bus {words[0]}", dict(values)
-
-
-def _of_csv(path: str | Path) -> Iterator[tuple[str, dict[str, str]]]:
-    (_, header), *lines = records(read_text(path), path) or [(0, [])]
-    header = [cell.strip() for cell in header]
-    if missing := [name for name in NEEDED if name not in header]:
-        raise InputError(path, missing[0], f"required column is missing (needed: {', '.join(NEEDED)})")
-    if unknown := [name for name in header if name not in NEEDED + OPTIONAL]:
-        raise InputError(path, unknown[0][:40], f"unknown column (known: {', '.join(NEEDED + OPTIONAL)})")
-    for line, cells in lines:
-        if len(cells) != len(header):
-            raise InputError(path, f"line {line}", f"{len(cells)} values for {len(header)} columns")
-        yield f"line {line}", {n: cell for n, cell in zip(header, cells, strict=True) if cell.strip()}
-
-
-def _numbers(path: str | Path, place: str, cells: dict[str, str]) -> dict[str, float]:
-    found = {}
-    for name, cell in cells.items():
-        try:
-            found[name] = float(cell)
-        except ValueError:
-            found[name] = math.nan
-        if not math.isfinite(found[name]) or (name in ("h", "xd1", "mva") and found[name] <= 0):
-            what = "a number" if name in ("bus", "p_min", "p_max") else "a positive number"
-            raise InputError(path, f"{place}, {name}", f"{cell[:20]!r} is not {what}")
-    return found
+            line = text.count("\n", 0, record.end()) + 1
+            yield line, [words[0], *(words[3 + c] for c in columns if 3 + c < len(words))]
 
 
 def _power_flow(grid: MatpowerGrid) -> tuple[Complex, Complex]:
     """Voltages, and powers generated at the buses, of the solved AC power flow, pu of 100 MVA."""
     path, base, bus, gen, branch, places = grid
-    n, scale = len(bus), base / BASE_MVA
-    y = np.zeros((n, n), dtype=np.complex128)
-    y[np.diag_indices(n)] = (bus[:, 4] + 1j * bus[:, 5]) / BASE_MVA
+    held = np.isin(bus[:, 0], gen[:, 0]) & (bus[:, 1] != 1)
+    generated, size = np.zeros(len(bus), dtype=np.complex128), bus[:, 7].copy()
+    for row in gen:
+        place = places[int(row[0])]
+        generated[place] += complex(row[1], row[2]) / BASE_MVA
+        size[place] = row[5] if held[place] else size[place]
+    buses, lines = [], []
+    for row, v, s in zip(bus, size, generated, strict=True):
+        powers = dict(zip(("pd", "qd", "gs", "bs"), (row[2:6] / BASE_MVA).tolist(), strict=True))
+        buses.append(SimpleNamespace(id=row[0], v=v, angle_deg=row[8], pg=s.real, qg=s.imag, **powers))
     for row in branch:
-        i, j = places[int(row[0])], places[int(row[1])]
         if row[2] == row[3] == 0:
             raise InputError(path, f"mpc.branch {row[0]:g}-{row[1]:g}", "has no impedance")
-        series, half = scale / complex(row[2], row[3]), 0.5j * row[4] * scale
-        tap = (row[8] or 1.0) * np.exp(1j * np.radians(row[9]))
-        y[i, i] += (series + half) / abs(tap) ** 2
-        y[j, j] += series + half
-        y[i, j] -= series / np.conj(tap)
-        y[j, i] -= series / tap
-    drawn, size = (bus[:, 2] + 1j * bus[:, 3]) / BASE_MVA, bus[:, 7].copy()
-    wanted = -drawn
-    for row in gen:
-        wanted[places[int(row[0])]] += (row[1] + 1j * row[2]) / BASE_MVA
-        size[places[int(row[0])]] = row[5]
-    held = np.isin(bus[:, 0], gen[:, 0]) & (bus[:, 1] != 1)
-    angle, load = np.flatnonzero(bus[:, 1] != 3), np.flatnonzero(~held)
-    v = np.where(held, size, bus[:, 7]) * np.exp(1j * np.radians(bus[:, 8]))
-    for _ in range(NEWTON_STEPS):
-        current = y @ v
-        off = v * np.conj(current) - wanted
-        mismatch = np.concatenate([off.real[angle], off.imag[load]])
-        if np.abs(mismatch).max() < MISMATCH:
-            return v, v * np.conj(current) + drawn
-        unit = v / np.abs(v)
-        by_angle = 1j * v[:, None] * np.conj(np.diag(current) - y * v)
-        by_size = v[:, None] * np.conj(y * unit) + np.diag(np.conj(current) * unit)
-        rows = np.hstack([by_angle[:, angle], by_size[:, load]])
-        try:
-            step = np.linalg.solve(np.vstack([rows.real[angle], rows.imag[load]]), mismatch)
-        except np.linalg.LinAlgError:
-            break
-        turn, grow = np.zeros(n), np.zeros(n)
-        turn[angle], grow[load] = step[: len(angle)], step[len(angle) :]
-        v = (np.abs(v) - grow) * np.exp(1j * (np.angle(v) - turn))
-        if not np.isfinite(v).all():
-            break
-    raise InputError(path, "mpc", "the AC power flow has no solution from the voltages given")
+        r, x, b = row[2] * BASE_MVA / base, row[3] * BASE_MVA / base, row[4] * base / BASE_MVA
+        given = {"r": r, "x": x, "b": b, "tap": row[8] or 1.0, "shift_deg": row[9]}
+        lines.append(SimpleNamespace(from_bus=row[0], to_bus=row[1], **given))
+    network = SimpleNamespace(buses=buses, lines=lines, slack_machine_bus=grid.reference)
+    stations = [SimpleNamespace(bus=number, share=1.0) for number in bus[held, 0]]
+    try:
+        ports = port_network(network, SimpleNamespace(machines=stations))
+        point = ports.nominal()
+    except (SimulationError, np.linalg.LinAlgError):
+        problem = "the AC power flow has no solution from the voltages given"
+        raise InputError(path, "mpc", problem) from None
+    generated[held] = point.power
+    return ports.spread @ point.voltage, generated
 
 
 def _units(
-    grid: MatpowerGrid, dynamics: str | Path, known: dict[int, list[dict[str, float]]], generated: Complex
+    grid: MatpowerGrid, dynamics: str | Path, known: dict[int, list[Dynamics]], generated: Complex
 ) -> list[Unit]:
     """Machines in service; those of a bus share its reactive power by rating, its first one balances."""
     by_bus: dict[int, list[Array]] = {}
@@ -234,7 +210,7 @@ def _units(
     units = []
     for number, rows in by_bus.items():
         own, total = known[number], generated[grid.places[number]]
-        rating = [one.get("mva", float(row[6])) for one, row in zip(own, rows, strict=False)]
+        rating = [one.mva or float(row[6]) for one, row in zip(own, rows, strict=False)]
         if min(rating) <= 0:
             raise InputError(dynamics, "mva", f"is needed of the machine at bus {number}")
         p = [float(row[1]) / BASE_MVA for row in rows]
@@ -242,9 +218,10 @@ def _units(
         for k, (one, row) in enumerate(zip(own, rows, strict=False)):
             letter = string.ascii_lowercase[k] if len(rows) > 1 else ""
             power = complex(p[k], float(total.imag) * rating[k] / sum(rating))
-            low, high = (one.get(n, float(row[c]) / BASE_MVA) for n, c in (("p_min", 9), ("p_max", 8)))
-            given = f"g{number}{letter}", power, rating[k], one["h"], one["xd1"], low, high
-            units.append(Unit(number, *given, one.get("ramp_pu_per_s")))
+            ends = (one.p_min, row[9]), (one.p_max, row[8])
+            low, high = (float(p) / BASE_MVA if own is None else own for own, p in ends)
+            given = f"g{number}{letter}", power, rating[k], one.h, one.xd1, low, high
+            units.append(Unit(number, *given, one.ramp_pu_per_s))
     return units
 
 

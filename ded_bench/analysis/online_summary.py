@@ -6,6 +6,7 @@ from typing import Any
 
 import pandas as pd
 
+from ded_bench.analysis import summary
 from ded_bench.analysis.lines import GROUP, line_table, named
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
@@ -15,14 +16,7 @@ LOOP = [*GROUP, "period_s", "latency_s", "warm"]
 #: What others are set beside: static dispatch of every second, and on islands practice; method and settings.
 STATIC, PRACTICE = ("ed", "every=1"), ("ed", "every=60")
 #: Names of an island's numbers in lines, their columns in online.csv, and units of the former in the latter.
-ISLAND = {
-    "mean_peak_mhz": ("mean_freq_max_hz", 1e3),
-    "mean_rms_mhz": ("mean_freq_rms_hz", 1e3),
-    "swing_peak_mhz": ("swing_max_hz", 1e3),
-    "agc_travel_pu": ("agc_travel_pu", 1.0),
-    "cps1": ("cps1", 1.0),
-    "increase_percent": ("increase_percent", 1.0),
-}
+ISLAND = summary.ISLAND | {"cps1": ("cps1", 1.0), "increase_percent": ("increase_percent", 1.0)}
 #: Own latencies that differ by so small a part share a line.
 SAME = 0.01
 

@@ -1,8 +1,9 @@
 """Typed CSV tables: a frozen dataclass declares the columns; floats keep every digit.
 
 A field without a default is a column that must be there and filled in. Any other column may be missing, or
-its cell empty: the value is then the field's default. Columns that the dataclass does not declare are
-ignored, so that tables of a newer or an older version stay readable.
+its cell empty: the value is then the field's default. Types may be annotated with limits, as pydantic knows
+them. Columns that the dataclass does not declare are ignored, so that tables of a newer or an older version
+stay readable.
 """
 
 from __future__ import annotations
@@ -10,13 +11,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import re
-import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, create_model
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import read_text, write_atomically
@@ -26,29 +26,7 @@ if TYPE_CHECKING:
 
 #: No number of a table is larger unless the file is damaged; sums and ratios then stay finite.
 LARGEST = 1e15
-_NUMBERS = {
-    int: re.compile(r"[-+]?[0-9]{1,18}"),
-    float: re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"),
-}
-
 T = TypeVar("T")
-
-
-def cell(
-    *,
-    default: Any = dataclasses.MISSING,
-    lowest: float = -LARGEST,
-    highest: float = LARGEST,
-    check: Callable[[str], str] | None = None,
-) -> Any:
-    """Declare a field whose values are limited.
-
-    Args:
-        lowest, highest: of a number.
-        check: of a text; returns the value, or raises ValueError.
-    """
-    limits = {"lowest": lowest, "highest": highest, "check": check}
-    return dataclasses.field(default=default, metadata=limits)
 
 
 def plain_name(text: str) -> str:
@@ -58,41 +36,9 @@ def plain_name(text: str) -> str:
     return text
 
 
-@dataclass(frozen=True)
-class CsvColumn:
-    """One column: how its cells are read."""
-
-    name: str
-    kind: type
-    default: Any = dataclasses.MISSING
-    lowest: float = -LARGEST
-    highest: float = LARGEST
-    check: Callable[[str], str] | None = None
-
-    @property
-    def required(self) -> bool:
-        """The column must be there, and its cells filled in."""
-        return self.default is dataclasses.MISSING
-
-    def parse(self, cell: str) -> Any:
-        """Return the value of a cell; ValueError if it is wrong."""
-        if not cell:
-            if self.required:
-                raise ValueError("empty")
-            return self.default
-        if self.kind is str:
-            return self.check(cell) if self.check else cell
-        if self.kind is bool:
-            if cell not in ("True", "False"):
-                raise ValueError(cell)
-            return cell == "True"
-        if not _NUMBERS[self.kind].fullmatch(cell):
-            raise ValueError(cell)
-        value = self.kind(cell)
-        if not self.lowest <= value <= self.highest:
-            raise ValueError(cell)
-        return value
-
+PlainName = Annotated[str, AfterValidator(plain_name)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=0)]
 
 #: The cells of a row by the names of their columns.
 Cells = dict[str, str]
@@ -115,9 +61,15 @@ class Table(Generic[T]):
             upgrade: what turns the rows of such files into those of today.
         """
         self.kind, self._since, self._upgrade = kind, since, upgrade
-        hints = typing.get_type_hints(kind)
-        self.columns = tuple(_column(field, hints[field.name]) for field in dataclasses.fields(kind))  # type: ignore[arg-type]
-        self.names = tuple(column.name for column in self.columns)
+        fields = sorted(dataclasses.fields(kind), key=lambda f: f.default is not dataclasses.MISSING)  # type: ignore[arg-type]
+        self.names = tuple(field.name for field in fields)
+        self._required = [field.name for field in fields if field.default is dataclasses.MISSING]
+        plain, limited = typing.get_type_hints(kind), typing.get_type_hints(kind, include_extras=True)
+        self._floats = [name for name in self.names if float in (plain[name], *typing.get_args(plain[name]))]
+        cells: dict[str, Any] = {
+            f.name: (limited[f.name], ... if f.name in self._required else f.default) for f in fields
+        }
+        self._record: type[BaseModel] = create_model(kind.__name__, **cells)
 
     def read(self, path: str | Path) -> list[T]:
         """Read a table.
@@ -133,9 +85,9 @@ class Table(Generic[T]):
     def check_header(self, cells: Sequence[str], source: str | Path) -> tuple[str, ...]:
         """Return the names of a header; InputError if a required column is missing or any is there twice."""
         found = f"found: {repr(', '.join(cells)[:100])[1:-1] or 'nothing'}"
-        for column in self.columns:
-            if column.required and column.name not in cells:
-                raise InputError(source, column.name, f"required column is missing ({found})")
+        for name in self._required:
+            if name not in cells:
+                raise InputError(source, name, f"required column is missing ({found})")
         for name in cells:
             if cells.count(name) > 1:
                 raise InputError(source, name[:40], f"column is there twice ({found})")
@@ -157,17 +109,16 @@ class Table(Generic[T]):
         for line, texts in found:
             if len(texts) != len(header):
                 raise InputError(source, f"line {line}", f"{len(texts)} values for {len(header)} columns")
-            cells = dict(zip(header, texts, strict=True))
-            cells = upgrade(cells) if upgrade else cells
-            values = {}
-            for column in self.columns:
-                try:
-                    if column.name in cells:
-                        values[column.name] = column.parse(cells.pop(column.name))
-                except ValueError:
-                    text = texts[header.index(column.name)] if column.name in header else ""
-                    where, what = f"line {line}, {column.name}", f"{text[:30]!r} is not a valid value"
-                    raise InputError(source, where, what) from None
+            cells = {name: text for name, text in zip(header, texts, strict=True) if text}
+            try:
+                values = vars(self._record.model_validate_strings(upgrade(cells) if upgrade else cells))
+                large = (n for n, v in values.items() if isinstance(v, float | int) and not abs(v) <= LARGEST)
+                wrong = next(large, "")
+            except ValidationError as error:
+                wrong = str(error.errors()[0]["loc"][0])
+            if wrong:
+                text = texts[header.index(wrong)] if wrong in header else ""
+                raise InputError(source, f"line {line}, {wrong}", f"{text[:30]!r} is not a valid value")
             yield self.kind(**values)
 
     def format(self, rows: Iterable[T]) -> str:
@@ -190,11 +141,7 @@ class Table(Generic[T]):
         import pandas as pd  # worker processes, which read no table, do without
 
         values = [[getattr(row, name) for name in self.names] for row in rows]
-        frame = pd.DataFrame(values, columns=list(self.names))
-        for column in self.columns:
-            if column.kind is float:
-                frame[column.name] = frame[column.name].astype("float64")
-        return frame
+        return pd.DataFrame(values, columns=list(self.names)).astype(dict.fromkeys(self._floats, "float64"))
 
 
 def records(text: str, source: str | Path) -> list[tuple[int, list[str]]]:
@@ -226,9 +173,3 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return repr(float(value))
     return " ".join(str(value).splitlines()) if isinstance(value, str) else str(value)
-
-
-def _column(field: dataclasses.Field[Any], hint: Any) -> CsvColumn:
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    (kind,) = (choice for choice in choices if choice is not types.NoneType)
-    return CsvColumn(field.name, kind, field.default, **field.metadata)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ded_bench.files.table import Table, cell
+from ded_bench.files.table import Table
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder, reference_run
 from ded_bench.results.rows import Row
@@ -18,11 +18,11 @@ _LEFT_OUT = "validation"
 class Objective:
     """The re-simulated objective of one method in its default settings; comparable within one version."""
 
-    case: str = cell()
-    instance: str = cell()
-    regime: str = cell()
-    method: str = cell()
-    objective: float = cell()
+    case: str
+    instance: str
+    regime: str
+    method: str
+    objective: float
     problems_version: str = ""
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
-from ded_bench.files.table import Table, cell, plain_name
+from ded_bench.files.table import Count, NotNegative, PlainName, Table
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.forecast import QUALITIES
+from ded_bench.problem.quantities import Probability
 from ded_bench.problem.trajectory import Trajectory
 from ded_bench.results.folder import PLANT, OnlineKey, ResultsFolder
 from ded_bench.results.legacy import upgraded
@@ -20,15 +23,37 @@ from ded_bench.results.legacy import upgraded
 KEPT_S = 0.1
 
 
-def _quality(text: str) -> str:
-    if text not in QUALITIES:
-        raise ValueError(text)
-    return text
+_Forecast = Annotated[str, Field(pattern=f"^({'|'.join(QUALITIES)})$")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """One trajectory in one regime; the excess at a point of time is that over the most exceeded bound.
+
+    Islands have numbers about the mean frequency and swings about it, too (`Score`).
+    """
+
+    objective: float | None = None  # Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all points, as of the scorer
+    max_excess_hz: NotNegative | None = None  # the largest, also over what counts at the end only
+    mean_excess_hz: NotNegative | None = None  # mean over all grid points
+    share_outside: Probability | None = None  # of the grid points where it is more than 1e-6 Hz
+    ramp_violation: NotNegative | None = None  # pu per step
+    bound_violation: NotNegative | None = None  # pu
+    slack_travel_pu: NotNegative | None = None  # Σ_k |P_s(t_k+1) - P_s(t_k)|
+    mean_freq_rms_hz: NotNegative | None = None
+    mean_freq_max_hz: NotNegative | None = None
+    swing_rms_hz: NotNegative | None = None
+    swing_max_hz: NotNegative | None = None
+    excess_mean_hz: NotNegative | None = None
+    excess_relative_hz: NotNegative | None = None
+    excess_end_hz: NotNegative | None = None
+    agc_travel_pu: NotNegative | None = None
+    cps1: float | None = None  # %, see `judgement.cps1`
 
 
 @dataclass(frozen=True)
-class OnlineRow:
-    """One scenario operated with one method's plans, judged on the plant that was operated (see `Judgement`).
+class OnlineRow(Judgement):
+    """One scenario operated with one method's plans, judged on the plant that was operated.
 
     `unforeseen_hz` is how far loads that no plan knew of move frequencies; it depends on no method.
     `increase_percent` is over hindsight; `predicted` says that plans started from the state predicted for
@@ -38,38 +63,22 @@ class OnlineRow:
     the method, and of all else.
     """
 
-    scenario: str = cell(check=plain_name)
-    regime: str = cell(check=plain_name)
-    method: str = cell(check=plain_name)
-    settings: str = cell(check=plain_name)
-    period_s: float = cell(lowest=0)
-    latency_s: float = cell(lowest=0)
-    forecast: str = cell(check=_quality)
-    predicted: bool = cell()
-    warm: bool = cell()
-    plant: str = cell(default=PLANT, check=plain_name)
-    objective: float | None = None
+    scenario: PlainName
+    regime: PlainName
+    method: PlainName
+    settings: PlainName
+    period_s: NotNegative
+    latency_s: NotNegative
+    forecast: _Forecast
+    predicted: bool
+    warm: bool
+    plant: PlainName = PLANT
     increase_percent: float | None = None
-    max_excess_hz: float | None = cell(default=None, lowest=0)
-    mean_excess_hz: float | None = cell(default=None, lowest=0)
-    share_outside: float | None = cell(default=None, lowest=0, highest=1)
-    ramp_violation: float | None = cell(default=None, lowest=0)
-    bound_violation: float | None = cell(default=None, lowest=0)
-    slack_travel_pu: float | None = cell(default=None, lowest=0)
-    mean_freq_rms_hz: float | None = cell(default=None, lowest=0)
-    mean_freq_max_hz: float | None = cell(default=None, lowest=0)
-    swing_rms_hz: float | None = cell(default=None, lowest=0)
-    swing_max_hz: float | None = cell(default=None, lowest=0)
-    excess_mean_hz: float | None = cell(default=None, lowest=0)
-    excess_relative_hz: float | None = cell(default=None, lowest=0)
-    excess_end_hz: float | None = cell(default=None, lowest=0)
-    agc_travel_pu: float | None = cell(default=None, lowest=0)
-    cps1: float | None = None
-    unforeseen_hz: float | None = cell(default=None, lowest=0)
-    plans: int = cell(default=0, lowest=0)
-    late: int = cell(default=0, lowest=0)
-    failed: int = cell(default=0, lowest=0)
-    infeasible: int = cell(default=0, lowest=0)
+    unforeseen_hz: NotNegative | None = None
+    plans: Count = 0
+    late: Count = 0
+    failed: Count = 0
+    infeasible: Count = 0
     warm_used: bool = False
     error: str = ""
     limit_s: float | None = None
@@ -77,8 +86,8 @@ class OnlineRow:
     loop_s: float | None = None
     latency_source: str = ""  # timing, zero or given
     case: str = ""
-    model: str = cell(default="", check=plain_name)
-    policy: str = cell(default="", check=plain_name)
+    model: PlainName = ""
+    policy: PlainName = ""
     fingerprint: str = ""
     version: str = ""
     commit: str = ""
@@ -96,9 +105,9 @@ class OnlineRow:
 class HindsightRow:
     """The optimum of one scenario and regime with full knowledge, judged as the rows of `online.csv`."""
 
-    scenario: str = cell(check=plain_name)
-    regime: str = cell(check=plain_name)
-    plant: str = cell(default=PLANT, check=plain_name)
+    scenario: PlainName
+    regime: PlainName
+    plant: PlainName = PLANT
     method: str = ""
     objective: float | None = None
     max_excess_hz: float | None = None

@@ -6,11 +6,13 @@ import contextlib
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+from pydantic import AfterValidator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
-from ded_bench.files.table import Table, cell, plain_name
+from ded_bench.files.table import PlainName, Table
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -40,6 +42,9 @@ class Key(NamedTuple):
     time_limit_s: float | None = None
 
 
+_Claim = Annotated[str, AfterValidator(lambda text: str(Status(text)))]
+
+
 @dataclass(frozen=True)
 class Row:
     """One result. `status` is the solver's claim; objective and violations are re-simulated on `plant`.
@@ -49,12 +54,12 @@ class Row:
     method's then. A row is valid for a task of the same `fingerprint`.
     """
 
-    instance: str = cell(check=plain_name)
-    split: str = cell()
-    regime: str = cell(check=plain_name)
-    method: str = cell(check=plain_name)
-    settings: str = cell(check=plain_name)
-    status: str = cell(check=lambda text: str(Status(text)))
+    instance: PlainName
+    split: str
+    regime: PlainName
+    method: PlainName
+    settings: PlainName
+    status: _Claim
     iterations: int | None = None
     build_s: float | None = None
     setup_s: float | None = None
@@ -76,7 +81,7 @@ class Row:
     date: str = ""
     case: str = ""
     seed: str = ""
-    fingerprint: str = cell(default="", check=plain_name)
+    fingerprint: PlainName = ""
     time_limit_s: float | None = None
     model: str = ""
     policy: str = ""

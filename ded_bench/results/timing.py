@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from ded_bench.files.table import Table, cell
+from ded_bench.files.table import NotNegative, Table
 from ded_bench.results.legacy import upgraded
 
 #: Round of a process's very first call, on the warm-up instance; it enters no median.
@@ -36,12 +34,12 @@ class TimingRow:
     settings: str
     instance: str
     status: str
-    build_s: float | None = cell(default=None, lowest=0)
-    setup_s: float | None = cell(default=None, lowest=0)
-    solve_s: float | None = cell(default=None, lowest=0)
-    call_s: float | None = cell(default=None, lowest=0)
-    load_average: float | None = cell(default=None, lowest=0)
-    peak_memory_mib: float | None = cell(default=None, lowest=0)
+    build_s: NotNegative | None = None
+    setup_s: NotNegative | None = None
+    solve_s: NotNegative | None = None
+    call_s: NotNegative | None = None
+    load_average: NotNegative | None = None
+    peak_memory_mib: NotNegative | None = None
     error: str = ""
     model: str = ""
     policy: str = ""
@@ -93,41 +91,23 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     The first call of each process does not count; calls that failed count in `failures` and enter no
     median. `load_average` is the median of the calls', `peak_memory_mib` the largest.
     """
-    parts: dict[tuple[str, ...], list[TimingRow]] = {}
-    for row in rows:
-        parts.setdefault((row.case, *row.job), []).append(row)
-    frame = pd.DataFrame([_summary(calls) for calls in parts.values()], columns=list(SUMMARY_COLUMNS))
-    return frame.astype(dict.fromkeys(_NUMBERS, "float64"))
+    frame = TIMING.frame(rows)
+    frame["model"] = frame["model"].map(model_name)
+    last = frame.groupby(_JOB, sort=False)[_SAID].last()
+    warm = frame[frame["round"] != WARM_UP]
+    is_good = warm["error"] == ""
+    calls, good, failed = (part.groupby(_JOB) for part in (warm, warm[is_good], warm[~is_good]))
+    counts = {"instances": calls["instance"].nunique(), "repeats": calls["round"].max()}
+    counts |= {"failures": failed.size()}
+    whole = {name: values.reindex(last.index, fill_value=0) for name, values in counts.items()}
+    found = last.assign(**whole)
+    found["load_average"] = calls["load_average"].median()
+    found["peak_memory_mib"] = calls["peak_memory_mib"].max()
+    for end, part in (("", 0.5), ("_q1", 0.25), ("_q3", 0.75)):
+        found[[f"{name}{end}" for name in PARTS]] = good[list(PARTS)].quantile(part)
+    reasons = failed["error"].first().reindex(last.index, fill_value="")
+    return found.assign(error=reasons.mask(last.index.isin(good.size().index), "")).reset_index()
 
 
-_TIMES = tuple(f"{name}{end}" for name in reversed(PARTS) for end in ("", "_q1", "_q3"))
-_MORE = ("load_average", "peak_memory_mib")
-_NUMBERS = (*_TIMES, *_MORE)
-_SAID = ("run", "case", "problems_version", "version", "commit", "solver_version", "host", "date", "policy")
-SUMMARY_COLUMNS = (
-    *("regime", "method", "settings", "model", "instances", "repeats", "failures"),
-    *(*_NUMBERS, "error", *_SAID),
-)
-
-
-def _summary(calls: Sequence[TimingRow]) -> dict[str, Any]:
-    last = calls[-1]
-    warm = [row for row in calls if row.round != WARM_UP]
-    good = [row for row in warm if row.counts]
-    facts: dict[str, Any] = dict(zip(SUMMARY_COLUMNS, last.job, strict=False))
-    facts |= {
-        "instances": len({row.instance for row in warm}),
-        "repeats": max((row.round for row in warm), default=0),
-        "failures": len(warm) - len(good),
-        "load_average": np.median(_values(warm, "load_average") or [math.nan]),
-        "peak_memory_mib": max(_values(warm, "peak_memory_mib"), default=None),
-        "error": "" if good else next((row.error for row in warm if row.error), ""),
-    }
-    for name in PARTS:
-        times = np.quantile(_values(good, name) or [math.nan], (0.5, 0.25, 0.75))
-        facts |= dict(zip((name, f"{name}_q1", f"{name}_q3"), times.tolist(), strict=True))
-    return facts | {name: getattr(last, name) for name in _SAID}
-
-
-def _values(rows: Sequence[TimingRow], name: str) -> list[float]:
-    return [value for row in rows if (value := getattr(row, name)) is not None]
+_JOB = ["case", "regime", "method", "settings", "model"]
+_SAID = ["run", "problems_version", "version", "commit", "solver_version", "host", "date", "policy"]

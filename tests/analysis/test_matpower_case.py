@@ -137,7 +137,7 @@ def test_rules_by_hand(tmp_path: Path) -> None:
     [
         ("3,5,0.2,80,0.7\n", "", "h, xd1: are needed of every machine in service, also at bus 3"),
         ("bus,h,xd1", "bus,H,xd1", "h: required column is missing"),
-        ("3,3,0.3,,", "3,3,-0.3,,", "line 3, xd1: '-0.3' is not a positive number"),
+        ("3,3,0.3,,", "3,3,-0.3,,", "line 3, xd1: '-0.3' is not a valid value"),
         (
             "mpc.gencost",
             "mpc.bus(:, 3) = mpc.bus(:, 3) / 1e3;\nmpc.gencost",

@@ -87,7 +87,7 @@ def test_an_island_s_report_sets_plans_beside_practice(tmp_path):
     assert static["travel_ratio"] == pytest.approx(one.agc_travel_pu / other.agc_travel_pu)
     assert static["over_practice_percent"] == pytest.approx(100 * (other.objective / one.objective - 1))
     assert static["mean_peak_mhz"] == pytest.approx(1e3 * other.mean_freq_max_hz)
-    assert (tmp_path / "island" / "figures" / "practice.png").is_file()
+    assert (tmp_path / "island" / "figures" / "online_scenario.png").is_file()
 
 
 def test_the_overview_sets_grids_side_by_side(tmp_path):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from ded_bench.report.figures import closed_loop, practice, schedules, tradeoff
+from ded_bench.report.figures import closed_loop, schedules, tradeoff
 from ded_bench.report.figures.style import Drawn, save_figure
 from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
 
 #: The topic under which a section shows a figure, and what draws it, in the order in which they stand.
 FIGURES: Sequence[tuple[str, Callable[[Sources], Iterator[Drawn]]]] = (
-    ("practice", practice.draw),
     ("tradeoff", tradeoff.draw),
     ("schedules", schedules.draw),
     ("online", closed_loop.draw),

@@ -50,6 +50,7 @@ class Shown:
     omega: Array  # (n, n_gen), rad/s
     p_load: Array  # (n, n_load), pu
     p_slack: Array  # (n,), pu
+    agc: Array | None = None  # (n,), pu
 
     def curve(self, values: Array) -> Curve:
         """Values over time in the method's colour."""
@@ -108,6 +109,11 @@ def balance_panel(case: Case, regime: str, shown: Sequence[Shown]) -> Panel:
         limit = 1e3 * RAD_TO_HZ * float(case.bounds(regime).limit[0])
         return Panel(MEAN, [one.curve(1e3 * RAD_TO_HZ * one.omega @ mean) for one in shown], (limit, -limit))
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
+
+
+def agc_panel(shown: Sequence[Shown]) -> Panel:
+    """What secondary control asks of all machines, pu."""
+    return Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])
 
 
 def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:

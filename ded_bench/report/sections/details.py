@@ -101,7 +101,8 @@ def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list
     caption = "Methods in the closed loop at their own latency, forecasts as announced"
     explained = folded("How to read the closed loop", Items(CLOSED_LOOP))
     table = PageTable(own, ONLINE, caption, "online_methods")
-    return [Heading("The closed loop"), table, *explained, *pictures["online"]]
+    pictured = pictures["online"] if sources.case.slack else ()  # of an island it stands beside practice
+    return [Heading("The closed loop"), table, *explained, *pictured]
 
 
 def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:

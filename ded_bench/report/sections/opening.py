@@ -65,7 +65,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         *usual_first(PageTable(found, OUTCOME, _methods_caption(sources), "methods"), usual),
         *_on_island(sources),
         *_in_operation(sources),
-        *pictures["practice"],
+        *(pictures["online"] if case.slack is None else ()),
         *(block for table in papers for block in _beside_paper(table)),
         *folded("What is missing or mixed", *[Items(notes)] * bool(notes)),
         *folded("How to read the tables", Items(EXPLANATION)),

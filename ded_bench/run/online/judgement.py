@@ -13,7 +13,7 @@ import numpy as np
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import Plant
-from ded_bench.plants.score import STRICT_HZ, judge, mean_hz
+from ded_bench.plants.score import STRICT_HZ, Score, judge, mean_hz
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import forecast
@@ -21,6 +21,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
+from ded_bench.results.online_results import Judgement
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import Planned
 
@@ -32,33 +33,8 @@ WINDOW_S = 300.0
 EPSILON_HZ, MINUTE_S = 0.018, 60.0
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """One trajectory in one regime; the excess at a point of time is that over the most exceeded bound.
-
-    Islands have numbers about the mean frequency and swings about it, too (`Score`).
-    """
-
-    objective: float  # Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points, as of the scorer
-    max_excess_hz: float  # the largest, also over what counts at the end only
-    mean_excess_hz: float  # mean over all grid points
-    share_outside: float  # of the grid points where it is more than 1e-6 Hz
-    ramp_violation: float  # pu per step
-    bound_violation: float  # pu
-    slack_travel_pu: float  # Σ_k |P_s(t_k+1) - P_s(t_k)|
-    mean_freq_rms_hz: float | None = None
-    mean_freq_max_hz: float | None = None
-    swing_rms_hz: float | None = None
-    swing_max_hz: float | None = None
-    excess_mean_hz: float | None = None
-    excess_relative_hz: float | None = None
-    excess_end_hz: float | None = None
-    agc_travel_pu: float | None = None
-    cps1: float | None = None  # %, see `cps1`
-
-
 #: What islands have in addition, as the scorer names it.
-OF_ISLANDS = tuple(f.name for f in fields(Judgement) if f.default is None and f.name != "cps1")
+OF_ISLANDS = tuple(f.name for f in fields(Score) if f.default is None)
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,14 @@ from ded_bench.problem.scenario import Scenario
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import (
     HindsightRow,
+    Judgement,
     OnlineResults,
     OnlineRow,
     keep_trajectory,
 )
 from ded_bench.results.timing import model_name, read_timing
 from ded_bench.run.environment import commit, host, now, version
-from ded_bench.run.online.judgement import Judgement, hindsight, judge_operation, unforeseen_hz
+from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import LIMIT_S, Planner
 from ded_bench.run.pool import Workers

@@ -17,7 +17,7 @@ from ded_bench.cli import main
 from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.results.rows import Results
-from ded_bench.results.timing import read_timing
+from ded_bench.results.timing import TIMING
 
 pytestmark = pytest.mark.usefixtures("inline")
 PYPROJECT = """\
@@ -103,7 +103,7 @@ def test_a_package_of_a_few_lines_is_in_the_tables(problem, site, tmp_path, comm
     summary = pd.read_csv(out / "tables" / "summary.csv").set_index(["regime", "method"])
     for regime in ("NO", "TO"):
         assert summary.loc[(regime, "flat"), "rows"] == 2
-    assert {(row.regime, row.method) for row in read_timing(out / "timing.csv")} == {
+    assert {(row.regime, row.method) for row in TIMING.existing(out / "timing.csv")} == {
         ("NO", "flat"),
         ("TO", "flat"),
     }
@@ -139,7 +139,7 @@ def test_a_function_in_the_working_directory_is_run_and_its_failures_are_rows(
     code, _, err = command(*bench, "--method", "own_function:solve,ed")
     assert code == 1  # its TO has nothing to time
     assert "ed: not timed, since the results hold no rows of it" in err
-    times = {(row.regime, row.round): row for row in read_timing(Path("out/timing.csv"))}
+    times = {(row.regime, row.round): row for row in TIMING.existing(Path("out/timing.csv"))}
     assert sorted(times) == [("NO", 0), ("NO", 1), ("TO", 0), ("TO", 1)]
     assert times["NO", 1].solve_s > 0
     assert times["NO", 0].instance != times["NO", 1].instance

@@ -34,7 +34,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.archive import Archive
 from ded_bench.results.rows import ROWS, Row
-from ded_bench.results.timing import TIMING, TimingRow, read_timing
+from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run import runner
 from ded_bench.run.scoring import scored_row
 from ded_bench.surrogates.linear import linear_model
@@ -213,7 +213,7 @@ def test_commands_survive(folder: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("timing.csv", lambda path, _: read_timing(path)),
+        ("timing.csv", lambda path, _: TIMING.existing(path)),
         ("schedules.npz", lambda path, case: Archive(path).read("one", case, 0.05)),
     ],
 )

@@ -186,14 +186,12 @@ def clopper_pearson(successes: int, count: int, delta: float) -> float:
 
     Clopper and Pearson 1934, one-sided: exact for independent trials.
     """
-    _check_trials(successes, count, delta)
     test = binomtest(successes, count, alternative="greater")
     return float(test.proportion_ci(confidence_level=1.0 - delta, method="exact").low)
 
 
 def hoeffding(successes: int, count: int, delta: float) -> float:
     """Hoeffding's lower bound (1963): successes / m - sqrt(ln(1 / δ) / 2m), at least zero."""
-    _check_trials(successes, count, delta)
     return max(successes / count - math.sqrt(math.log(1.0 / delta) / (2.0 * count)), 0.0)
 
 
@@ -225,7 +223,7 @@ def certify(
     """
     case.check_regimes([candidate.regime])
     path, fingerprint = candidate.rows_file(case, folder), candidate.fingerprint(case, seed)
-    done = {r.index: r for r in read_rows(path) if r.fingerprint == fingerprint and r.index < count}
+    done = {r.index: r for r in ROWS.existing(path) if r.fingerprint == fingerprint and r.index < count}
     missing = [i for i in range(count) if i not in done]
     calls = [
         (case, candidate, seed, tuple(missing[start : start + CHUNK]))
@@ -270,11 +268,6 @@ def meets_limits(rows: pd.DataFrame, tolerance_hz: float, tolerance_pu: float) -
     return (rows["freq_violation_hz"] <= tolerance_hz) & (power <= tolerance_pu)
 
 
-def read_rows(path: Path) -> list[CertificateRow]:
-    """Read the rows of earlier runs, none if there is no such file; InputError if it is wrong."""
-    return ROWS.read(path) if path.is_file() else []
-
-
 def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -> list[CertificateRow]:
     """Answer some instances with both methods and re-simulate; one row each, without fingerprint."""
     rows = []
@@ -302,8 +295,3 @@ def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[Certifi
             if not isinstance(answer, list):
                 raise RuntimeError(f"a chunk of the certificate failed: {answer}")
             yield answer
-
-
-def _check_trials(successes: int, count: int, delta: float) -> None:
-    if not (0 <= successes <= count and count > 0 and 0 < delta < 1):
-        raise ValueError(f"{successes} successes of {count} with delta {delta}")

@@ -82,6 +82,10 @@ class Table(Generic[T]):
         header = self.check_header(found[0][1] if found else [], path)
         return list(self.rows(found[1:], header, path))
 
+    def existing(self, path: Path) -> list[T]:
+        """Read a table (see `read`); no rows if there is no such file."""
+        return self.read(path) if path.is_file() else []
+
     def check_header(self, cells: Sequence[str], source: str | Path) -> tuple[str, ...]:
         """Return the names of a header; InputError if a required column is missing or any is there twice."""
         found = f"found: {repr(', '.join(cells)[:100])[1:-1] or 'nothing'}"

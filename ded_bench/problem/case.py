@@ -8,7 +8,7 @@ import importlib
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr, model_validator
@@ -87,7 +87,10 @@ class Case(Fingerprinted, Extended):
         ramp_pu_per_s: float
         regimes: Mapping[str, Regime | IslandRegime]
         sampling: Sampling
+        knots: int | None
 
+    #: Knots of a case that names no number of its own.
+    usual_knots: ClassVar[int]
     _grid: GridFiles | None = PrivateAttr(default=None)
 
     @staticmethod
@@ -176,9 +179,9 @@ class Case(Fingerprinted, Extended):
         """Number of buses."""
 
     @property
-    @abc.abstractmethod
     def n_knots(self) -> int:
         """Number of knots of policies and knot methods (`knots` of the file)."""
+        return self.usual_knots if self.knots is None else self.knots
 
     def machine_of(self, name: str) -> str:
         """Name in `machines.json` of a generator, or of the slack."""

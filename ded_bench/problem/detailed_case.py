@@ -16,9 +16,6 @@ from ded_bench.problem.grid_files import load_grid_files
 from ded_bench.problem.limits import Agc, IslandRegime, Regime, ScheduledMachine, Transfer
 from ded_bench.problem.quantities import LARGEST, Array, Magnitude, Name, check_whole_steps
 
-#: Knots of a case that names no number of its own: one a second in a minute.
-KNOTS = 61
-
 
 class PlantChoice(Record):
     """What is simulated: an infinite machine at the slack bus, or an island with secondary control."""
@@ -45,6 +42,7 @@ def _regime(value: Any, _: Any) -> Regime | IslandRegime:
 class DetailedCase(Case):
     """A grid whose network and machine models stand in `network.json` and `machines.json` beside it."""
 
+    usual_knots = 61  # one a second in a minute
     schema_: Literal["ded-bench/case/3"] = Field(alias="schema")
     id: Name
     source: str | dict[Name, str] | None = None
@@ -141,8 +139,3 @@ class DetailedCase(Case):
     def n_bus(self) -> int:
         """Number of buses."""
         return len(self.detailed.network.buses)
-
-    @property
-    def n_knots(self) -> int:
-        """Number of knots of policies and knot methods (`knots` of the file)."""
-        return KNOTS if self.knots is None else self.knots

@@ -15,9 +15,6 @@ from ded_bench.problem.grid_files import unconnected
 from ded_bench.problem.limits import Regime, check_power_limits
 from ded_bench.problem.quantities import Array, Extended, Magnitude, Name, NonNegative, Number
 
-#: Knots of a case that names no number of its own.
-KNOTS = 50
-
 
 class Bus(Record):
     """A node with fixed voltage magnitude `v` in pu (paper, Table I)."""
@@ -55,6 +52,8 @@ class Machine(Extended):
 
 class LosslessCase(Case):
     """One grid. Buses keep the file's order; generators and loads are named by their bus."""
+
+    usual_knots = 50
 
     schema_: Literal["ded-bench/case/1", "ded-bench/case/2"] = Field(alias="schema")
     id: Name
@@ -134,11 +133,6 @@ class LosslessCase(Case):
     def n_bus(self) -> int:
         """Number of buses, those inside machines included."""
         return len(self.buses)
-
-    @property
-    def n_knots(self) -> int:
-        """Number of knots of policies and knot methods, chosen from the fastest mode (`knots` in case/2)."""
-        return KNOTS if self.knots is None else self.knots
 
     def machine_of(self, name: str) -> str:
         """Generator `g<name>` is machine `<name>` of `machines.json`."""

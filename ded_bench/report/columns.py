@@ -82,11 +82,6 @@ def _against(what: str, ours: str, paper: str, failures: str = "failures") -> Co
     return Column(f"against_paper_{what}", f"{what} against the paper", value=verdict)
 
 
-def _spread(name: str, text: str, unit: str = "") -> tuple[Column, ...]:
-    parts = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
-    return tuple(Column(f"{name}_{part}", f"{text} {heading}".strip(), unit) for part, heading in parts)
-
-
 REGIME, TITLE, CASE = Column("regime", "Regime"), Column("title", "Method"), Column("case", "Grid")
 ROWS, N, FAILURES = Column("rows", "rows"), Column("n", "n"), Column("failures", "failures")
 MODEL, DATE, SEED = Column("model", "surrogate"), Column("date", "date"), Column("seed", "seed")
@@ -143,15 +138,14 @@ ISLAND = (
 )
 
 
-_FREQUENCY = _spread("freq_violation_hz", "frequency", "Hz")
-GAPS = (
+#: Of `summary.summary`, whose file has the spreads of violations, too.
+DETAIL = (
     *(*_HEAD, ROWS, N, FAILURES, Column("unpaired", "without reference")),
-    *_spread("gap_percent", ""),
+    Column("gap_percent_mean", "mean"),
+    Column("gap_percent_median", "median"),
+    Column("gap_percent_p95", "95 %"),
+    Column("gap_percent_max", "max"),
     Column("cost_ratio", "ratio of summed costs", form=".6f"),
-)
-RATES = (
-    *_HEAD,
-    ROWS,
     Column("success_rate", "success (claimed)", form=".1%"),
     Column("correct_rate", "feasible (verified)", form=".1%"),
     Column("strict_rate", "strictly feasible (verified)", form=".1%"),
@@ -162,13 +156,6 @@ OTHER_RATES = (
     Column("carried", "carried", value=lambda x: f"{x['validated_n']} of {x['validated_asked']}"),
     Column("confirmed_rate", "confirmed by ANDES", form=".1%"),
     Column("refereed", "answered", value=lambda x: f"{x['confirmed_n']} of {x['confirmed_asked']}"),
-)
-VIOLATIONS = (
-    *_HEAD,
-    *_FREQUENCY,
-    *(Column(f"ramp_violation_{part}", f"ramp {part}", "pu") for part in ("mean", "max")),
-    *(Column(f"bound_violation_{part}", f"bounds {part}", "pu") for part in ("mean", "max")),
-    *(Column(f"initial_violation_{part}", f"initial {part}", "pu") for part in ("mean", "max")),
 )
 PROVENANCE = (
     *_HEAD,

@@ -28,7 +28,7 @@ from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
 from ded_bench.results.rows import VALIDATED, Key, Results
-from ded_bench.results.timing import read_timing, timing_summary
+from ded_bench.results.timing import TIMING, timing_summary
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,6 @@ class Sources:
     problems_version: str
     certificates: tuple[Certificate, ...]
     notes: list[str] = field(default_factory=list)
-    _runs: dict[Key, Trajectory | None] = field(default_factory=dict)
 
     @property
     def folder(self) -> Path:
@@ -108,15 +107,13 @@ class Sources:
 
     def trajectory(self, key: Key) -> Trajectory | None:
         """The simulated schedule of a row; None, and a note, if it is damaged or cannot be simulated."""
-        if key not in self._runs:
-            instance = self.instances[key.instance]
-            try:
-                schedule = self.results.schedule(self.results.rows[key], self.case, instance)
-                self._runs[key] = simulate(self.case, instance, schedule)
-            except (InputError, SimulationError) as error:
-                self._note(error)
-                self._runs[key] = None
-        return self._runs[key]
+        instance = self.instances[key.instance]
+        try:
+            schedule = self.results.schedule(self.results.rows[key], self.case, instance)
+            return simulate(self.case, instance, schedule)
+        except (InputError, SimulationError) as error:
+            self._note(error)
+            return None
 
     def _note(self, error: Exception) -> None:
         if (text := f"Not drawn: {error}") not in self.notes:
@@ -147,7 +144,7 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
     rows = judged_elsewhere(gaps(rows, reference.objectives), _other_judgements(paths))
-    calls = [call for call in read_timing(paths.timing) if call.case == case.id]
+    calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
         case=case,
@@ -167,11 +164,9 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
 
 def _other_judgements(paths: ResultsFolder) -> dict[str, dict[Key, bool | None]]:
     """What full machine models and ANDES say of kept schedules."""
-    validated = VALIDATED.read(paths.validated) if paths.validated.is_file() else []
-    confirmed = REFEREE.read(paths.referee) if paths.referee.is_file() else []
     return {
-        "validated": {row.key[0]: row.feasible for row in validated},
-        "confirmed": {row.key: row.confirmed for row in confirmed},
+        "validated": {row.key[0]: row.feasible for row in VALIDATED.existing(paths.validated)},
+        "confirmed": {row.key: row.confirmed for row in REFEREE.existing(paths.referee)},
     }
 
 

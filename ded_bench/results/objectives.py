@@ -48,5 +48,4 @@ def reference_objectives(case: Case) -> list[Objective]:
     Raises:
         InputError: the table is wrong.
     """
-    path = ResultsFolder(reference_run(case)).objectives
-    return OBJECTIVES.read(path) if path.is_file() else []
+    return OBJECTIVES.existing(ResultsFolder(reference_run(case)).objectives)

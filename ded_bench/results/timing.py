@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -74,15 +73,6 @@ TIMING: Table[TimingRow] = Table(TimingRow, since="method_version", upgrade=upgr
 def model_name(model: str) -> str:
     """The surrogate's name in `name@fingerprint`; empty for none."""
     return model.partition("@")[0]
-
-
-def read_timing(path: Path) -> list[TimingRow]:
-    """Read a timing table; no rows if there is no such file.
-
-    Raises:
-        InputError: a column is missing, or a value is wrong; names line and column.
-    """
-    return TIMING.read(path) if path.exists() else []
 
 
 def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:

@@ -35,7 +35,7 @@ from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.rows import Row
-from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name, read_timing
+from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import failed, prepared
@@ -117,7 +117,7 @@ def bench(
     if (there := _complete(path, run, {row.job for row in own.values()})) and not force:
         return there
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
-    kept = [] if force else [row for row in read_timing(partial) if row.run == run]
+    kept = [] if force else [row for row in TIMING.existing(partial) if row.run == run]
     rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
 
     def rounds_for(job: Job) -> int:
@@ -149,7 +149,7 @@ def bench(
 
 def _complete(path: Path, run: str, jobs: set[tuple[str, str, str, str]]) -> list[TimingRow]:
     """The rows of a table if it holds this very run; InputError if it holds other jobs, too."""
-    there = read_timing(path)
+    there = TIMING.existing(path)
     if others := {row.job for row in there} - jobs:
         regime, method, *_ = sorted(others)[0]
         raise InputError(
@@ -173,7 +173,7 @@ def measure(case: Case, job: Job, path: Path) -> list[TimingRow]:
     warm_up, *instances = validation_instances(case, 1 + FEW, servable=servable)
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
         rows = bench(case, instances, [job], Path(name) / "timing.csv", warm_up=warm_up, rounds=1)
-    TIMING.write(path, [*read_timing(path), *rows])
+    TIMING.write(path, [*TIMING.existing(path), *rows])
     return rows
 
 

@@ -23,7 +23,6 @@ from ded_bench.analysis.certificate import (
     judge,
     meets_limits,
     read_certificates,
-    read_rows,
     save_certificate,
 )
 from ded_bench.methods.registry import METHODS, Method
@@ -49,11 +48,6 @@ def test_bounds_in_closed_form() -> None:
     assert clopper_pearson(0, 100, 0.01) == 0.0
     assert hoeffding(90, 100, 0.01) == pytest.approx(0.9 - np.sqrt(np.log(100) / 200))
     assert hoeffding(1, 100, 0.01) == 0.0
-    for wrong in ((5, 4, 0.01), (-1, 4, 0.01), (0, 0, 0.01), (1, 4, 0.0), (1, 4, 1.0)):
-        with pytest.raises(ValueError, match="successes"):
-            clopper_pearson(*wrong)
-        with pytest.raises(ValueError, match="successes"):
-            hoeffding(*wrong)
 
 
 def test_what_counts() -> None:
@@ -91,7 +85,7 @@ def candidate(regime: str) -> Candidate:
 
 
 def rows_of(case: Case, folder: Path, regime: str) -> list[certificate.CertificateRow]:
-    return read_rows(candidate(regime).rows_file(case, folder))
+    return ROWS.existing(candidate(regime).rows_file(case, folder))
 
 
 def run(case: Case, folder: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:

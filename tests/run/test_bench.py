@@ -22,7 +22,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Row
-from ded_bench.results.timing import TimingRow, read_timing, timing_summary
+from ded_bench.results.timing import TIMING, TimingRow, timing_summary
 from ded_bench.run import bench as bench_module
 from ded_bench.run.bench import (
     ROUNDS,
@@ -190,7 +190,7 @@ def test_failed_calls_are_counted_and_enter_no_median(fake, run) -> None:
 
 def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
     first = run(BOTH)
-    assert read_timing(tmp_path / "timing.csv") == first
+    assert TIMING.existing(tmp_path / "timing.csv") == first
     fake.calls.clear()
     assert run(BOTH) == first
     assert not fake.calls
@@ -200,7 +200,7 @@ def test_a_complete_run_is_not_repeated(fake, run, tmp_path: Path) -> None:
     again = run(BOTH)
     assert len(fake.calls) == 4 * 4
     assert {row.run for row in again}.isdisjoint(row.run for row in first)
-    assert read_timing(tmp_path / "timing.csv") == again  # replaced as a whole
+    assert TIMING.existing(tmp_path / "timing.csv") == again  # replaced as a whole
 
 
 def test_a_run_of_some_methods_does_not_replace_one_of_more(fake, run, tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_run_of_some_methods_does_not_replace_one_of_more(fake, run, tmp_path:
         run([TO])
     assert (tmp_path / "timing.csv").read_bytes() == before
     run([*BOTH, Job("fake", "TO", Settings("fast=on"))])  # more methods: all are timed anew
-    assert len(timing_summary(read_timing(tmp_path / "timing.csv"))) == 3
+    assert len(timing_summary(TIMING.existing(tmp_path / "timing.csv"))) == 3
 
 
 def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_an_interrupted_run_goes_on(fake, run, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(BOTH)
     assert not (tmp_path / "timing.csv").exists()
-    assert len(read_timing(tmp_path / "timing.partial.csv")) == 4  # the turn that was complete
+    assert len(TIMING.existing(tmp_path / "timing.partial.csv")) == 4  # the turn that was complete
     fake.times = [2.0]
     prepared.cache_clear()
     rows = run(BOTH)
@@ -252,7 +252,7 @@ def test_full_ded_in_a_process_of_its_own(threebus: Case, tmp_path: Path) -> Non
         rounds=2,
         problems_version="v",
     )
-    assert rows == read_timing(tmp_path / "timing.csv")
+    assert rows == TIMING.existing(tmp_path / "timing.csv")
     (row,) = timing_summary(rows).to_dict("records")
     assert (row["failures"], row["error"], row["repeats"], row["problems_version"]) == (0, "", 2, "v")
     assert 0 < row["solve_s"] < 30

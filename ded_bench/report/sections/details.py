@@ -12,15 +12,12 @@ from ded_bench.analysis.online_summary import own_latency
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.columns import (
     CERTIFICATE,
-    GAPS,
+    DETAIL,
     ONLINE,
     OTHER_RATES,
     PROVENANCE,
-    RATES,
     TIMING,
     TRAINING,
-    VIOLATIONS,
-    computed,
 )
 from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
 from ded_bench.report.sections.opening import idealisation, rows_caption
@@ -50,20 +47,13 @@ OTHERS = (
 def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """Default settings in sight, all others folded away."""
     overview, usual = sources.summary, sources.summary["settings"] == DEFAULT
-    caption = f"Gap to {sources.reference.title}, % ({rows_caption(sources)})"
     others = OTHER_RATES if overview[["validated_asked", "confirmed_asked"]].to_numpy().any() else ()
-    columns, said = (
-        (*RATES, *others),
-        f"Claimed; verified on {idealisation(sources.case)}: shares of all rows",
+    caption = (
+        f"Gap to {sources.reference.title}, % ({rows_caption(sources)}); claimed, and verified on "
+        f"{idealisation(sources.case)}: shares of all rows" + f". {OTHERS}" * bool(others)
     )
-    said += f". {OTHERS}" * bool(others)
-    shares = PageTable(computed(overview, columns), columns, said)
-    return [
-        Heading("Each method in detail"),
-        *usual_first(PageTable(overview, GAPS, caption, "summary"), usual),
-        *usual_first(shares, usual),
-        *usual_first(PageTable(overview, VIOLATIONS, "Largest violation of each schedule"), usual),
-    ]
+    table = PageTable(overview, (*DETAIL, *others), caption, "summary")
+    return [Heading("Each method in detail"), *usual_first(table, usual)]
 
 
 def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:

@@ -55,7 +55,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     said = [*findings(found, reference.title), *_against_paper([table.frame for table in papers])]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
-    notes = (*data_notes(sources), *sources.notes)
+    notes = (*_problems(sources), *_makers(sources), *sources.notes)
     return [
         Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
         Text(what),
@@ -172,26 +172,15 @@ def alarms(sources: Sources) -> list[str]:
     return [f"No gap can be given: no row keeps every limit, and nobody ran {title(method)}. `{solve}` does."]
 
 
-def data_notes(sources: Sources) -> list[str]:
-    """What is missing, mixed or old."""
-    return [
-        *_problems(sources),
-        *_makers(sources),
-    ]
-
-
-def _versions(rows: pd.DataFrame) -> str:
-    return ", ".join(version or "(none given)" for version in sorted(set(rows["problems_version"])))
-
-
 def _problems(sources: Sources) -> Iterator[str]:
     """Rows of several problem versions, of unknown regimes, or without scores; objectives from elsewhere."""
     rows, judged = sources.rows, sources.judged
     versions = set(rows["problems_version"])
+    named = ", ".join(version or "(none given)" for version in sorted(versions))
     if len(versions) > 1:
-        yield f"Rows of different problem versions are not comparable: {_versions(rows)}."
+        yield f"Rows of different problem versions are not comparable: {named}."
     elif sources.problems_version and versions - {sources.problems_version}:
-        yield f"Rows are of problem version {_versions(rows)}, but the files are {sources.problems_version}."
+        yield f"Rows are of problem version {named}, but the files are {sources.problems_version}."
     if strange := sorted(set(judged["regime"]) - set(sources.case.regimes)):
         yield f"Rows of regimes that the case does not know are not drawn: {', '.join(strange)}."
     reference = sources.reference

@@ -28,7 +28,7 @@ from ded_bench.results.online_results import (
     OnlineRow,
     keep_trajectory,
 )
-from ded_bench.results.timing import model_name, read_timing
+from ded_bench.results.timing import TIMING, model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz
 from ded_bench.run.online.loop import LoopOptions, run_loop
@@ -274,7 +274,7 @@ def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[
     """
     for folder in folders:
         paths = ResultsFolder(folder)
-        rows = [*read_timing(paths.timing), *read_timing(paths.latency)]
+        rows = [*TIMING.existing(paths.timing), *TIMING.existing(paths.latency)]
         times = [
             (row.build_s or 0.0) + (row.solve_s or 0.0)
             for row in rows

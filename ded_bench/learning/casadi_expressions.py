@@ -103,14 +103,14 @@ def _lossless(plant: LosslessPlant) -> CasadiModel:
 
 
 def _detailed(plant: DetailedPlant) -> CasadiModel:
-    case, equations, system = plant.case, plant.equations, plant.equations.system
-    n, (u, p_load), scheduled = len(system.data), _inputs(case), equations.scheduled.tolist()
+    case, system = plant.case, plant.system
+    n, (u, p_load), scheduled = len(system.data), _inputs(case), system.scheduled.tolist()
     x, z = casadi.SX.sym("x", N_STATES * n), casadi.SX.sym("z", 2 * len(system.network.ports))
     p = casadi.SX.sym("p", 2 * n + 1)
-    p_ref = p[n : 2 * n] + equations.shares * p[-1]
+    p_ref = p[n : 2 * n] + system.shares * p[-1]
     p_ref[scheduled] += u
     drawn = casadi.SX(casadi.DM(system.network.p_drawn))
-    drawn[equations.load_ports.tolist()] = -p_load
+    drawn[system.load_ports.tolist()] = -p_load
     rates, alg, p_e, p_m = system.symbolic.equations(x, z, p_ref, drawn, p[:n])
     speed = (x[SPEED * n : (SPEED + 1) * n] * system.data.omega_0)[scheduled]
     p_slack = casadi.SX.zeros(1) if system.island else p_e[system.network.balancing]

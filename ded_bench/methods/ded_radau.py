@@ -85,7 +85,7 @@ def _on_detailed(
     plant = DetailedPlant(case)
     state = plant.initial(instance)
     points = mesh(plant, instance, state, longest_s)
-    elements, system = len(points.ends) - 1, plant.equations.system
+    elements, system = len(points.ends) - 1, plant.system
     columns = len(POINTS) * (len(system.moving) + len(state.v)) + len(case.generators)
     needed = BYTES_PER_DETAILED_ENTRY * elements * columns**2
     if refusal := too_large(needed, f"the Pyomo model of {elements} elements", "`ded-slp` takes less"):

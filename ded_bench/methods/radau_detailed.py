@@ -18,9 +18,9 @@ from ded_bench.methods.ded import eliminated
 from ded_bench.methods.first_schedules import first_schedules, static_dispatch
 from ded_bench.methods.knots import case_knots, divided, power_limits, transfer_room
 from ded_bench.methods.radau_program import POINTS, WEIGHTS, lagrange
-from ded_bench.plants.detailed.case_system import DetailedState
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
+from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.detailed.symbolic import Equations, Functions, plant_equations
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.simulate import simulate
@@ -81,10 +81,10 @@ class DetailedProgram:
     def __init__(
         self, plant: DetailedPlant, instance: Instance, regime: str, state: DetailedState, mesh: Mesh
     ) -> None:
-        self.case, self.equations, self.instance = plant.case, plant.equations, instance
+        self.case, self.system, self.instance = plant.case, plant.system, instance
         self._state, self._mesh = state, mesh
-        data = self.equations.system.data
-        self._moving = self.equations.system.moving
+        data = self.system.data
+        self._moving = self.system.moving
         self._scale = np.where(
             self._moving // len(data) == SPEED, data.omega_0[self._moving % len(data)], 1.0
         )
@@ -103,7 +103,7 @@ class DetailedProgram:
         m.gen, m.knot = pyo.RangeSet(0, len(self.case.generators) - 1), pyo.RangeSet(0, len(mesh.knots) - 1)
         m.p_set, m.held = pyo.Var(m.gen, m.knot), pyo.Var(pyo.RangeSet(0, len(mesh.acts)))
         self._p_set, self._held = _by_time(m.p_set, m.knot), np.array(list(m.held.values()))
-        self._speed = np.searchsorted(self._moving, SPEED * len(data) + self.equations.scheduled)
+        self._speed = np.searchsorted(self._moving, SPEED * len(data) + self.system.scheduled)
         self._follow_plant()
         self._limit_powers()
         self._limit_frequencies(regime)
@@ -111,17 +111,17 @@ class DetailedProgram:
     def _follow_plant(self) -> None:
         """States, voltages and secondary control follow the plant; what turbines deliver is paid."""
         m, mesh, state, case, instance = self.model, self._mesh, self._state, self.case, self.instance
-        data, weights, places = self.equations.system.data, self._mesh.weights, self._mesh.places
+        data, weights, places = self.system.data, self._mesh.weights, self._mesh.places
         for variable, value in zip(self._x[0], self._scale * state.x.flat[self._moving], strict=True):
             variable.fix(value)
         m.held[0].fix(state.held)
-        drawn = self.equations.p_drawn(instance.p_load(case))
+        drawn = self.system.p_drawn(instance.p_load(case))
         drawn = np.stack([np.interp(places, np.arange(len(drawn)), column) for column in drawn.T], axis=1)
         period = np.searchsorted(mesh.acts, places)  # what acts at an element's end is felt after it
         m.follows, m.balanced, m.secondary = (pyo.ConstraintList() for _ in range(3))
         cost_gen, cost_slack = instance.cost_gen(case), instance.cost_slack(case)
         m.p_slack = pyo.Var(m.t, [0, 1], bounds=(0, None), initialize=0.0)  # up and down
-        total = weights[0] * float(self.equations.turbines(state.x)[self.equations.scheduled] @ cost_gen)
+        total = weights[0] * float(self.system.turbines(state.x)[self.system.scheduled] @ cost_gen)
         times, slow = list(m.t), self._slowness()
         for k in range(1, len(places)):
             found = self._equations(k, drawn[k], self._held[period[k]])
@@ -130,10 +130,10 @@ class DetailedProgram:
                 m.follows.add(weight * self._slopes[index, times[k]] == weight * rate)
             for off in np.concatenate(found.balance):
                 m.balanced.add(off == 0.0)
-            total += weights[k] * (cost_gen @ found.p_m[self.equations.scheduled])
+            total += weights[k] * (cost_gen @ found.p_m[self.system.scheduled])
             if case.slack is not None:
                 up, down = m.p_slack[times[k], 0], m.p_slack[times[k], 1]
-                m.balanced.add(up - down == found.p_e[self.equations.system.network.balancing])
+                m.balanced.add(up - down == found.p_e[self.system.network.balancing])
                 total += weights[k] * cost_slack * (up + down)
         gain = 0.0 if case.agc is None else case.agc.k
         for j, act in enumerate(mesh.acts, 1):
@@ -143,10 +143,10 @@ class DetailedProgram:
 
     def _slowness(self) -> list[float]:
         """What rows of fast states are multiplied by, so that IPOPT's filter sees all states alike, s."""
-        drawn = self.equations.p_drawn(self.instance.p_load(self.case, np.zeros(1)))[0]
+        drawn = self.system.p_drawn(self.instance.p_load(self.case, np.zeros(1)))[0]
         x, v = self._state.x.copy(), self._state.v.view(np.complex128)
-        x[DELTA] -= self.equations.system.data.inertia @ x[DELTA]
-        rates = self.equations.system.slopes(x, v, drawn).rates * (self._scale[:, None] / self._scale)
+        x[DELTA] -= self.system.data.inertia @ x[DELTA]
+        rates = self.system.slopes(x, v, drawn).rates * (self._scale[:, None] / self._scale)
         return [float(value) for value in 1.0 / np.maximum(1.0, np.abs(rates).max(axis=1))]
 
     def _states(self, k: int) -> Expressions:
@@ -157,11 +157,11 @@ class DetailedProgram:
 
     def _equations(self, k: int, drawn: Array, held: Any) -> Equations:
         """The plant's equations at a point."""
-        place, knots, system = self._mesh.places[k], self._mesh.knots, self.equations.system
+        place, knots, system = self._mesh.places[k], self._mesh.knots, self.system
         j = max(int(np.searchsorted(knots, place)) - 1, 0)
         part = (place - knots[j]) / (knots[j + 1] - knots[j])
-        p_ref = self._state.offset + np.array([share * held for share in self.equations.shares], dtype=object)
-        p_ref[self.equations.scheduled] += (1 - part) * self._p_set[j] + part * self._p_set[j + 1]
+        p_ref = self._state.offset + np.array([share * held for share in self.system.shares], dtype=object)
+        p_ref[self.system.scheduled] += (1 - part) * self._p_set[j] + part * self._p_set[j + 1]
         voltage, states = (self._v[k, 0::2], self._v[k, 1::2]), self._states(k)
         states[DELTA] -= system.data.inertia @ states[DELTA]
         inputs = p_ref, drawn, self._state.v_ref

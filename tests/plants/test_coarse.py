@@ -42,7 +42,7 @@ def schedule(case: Case, size: float = 0.05) -> Schedule:
 def errors(case: Case, instance: Instance, spacing_s: float) -> tuple[Array, Array]:
     """Errors of frequencies (Hz) and of delivered powers (pu), at all points and machines."""
     exact = simulate(case, instance, schedule(case))
-    coarse = CoarsePlant(plant_of(case).equations, spacing_s)  # type: ignore[attr-defined]
+    coarse = CoarsePlant(plant_of(case).system, spacing_s)  # type: ignore[attr-defined]
     points = np.linspace(0.0, HORIZON, round(HORIZON / spacing_s) + 1)
     omega, delivered = coarse.follow(coarse.begin(instance), schedule(case).at(points))
     every = round(spacing_s / instance.dt_s)
@@ -61,7 +61,7 @@ def test_coarse_steps_follow_the_plant(island: Case, instance: Instance) -> None
 
 def test_the_linear_answer_is_that_of_small_changes(island: Case, quiet_instance: Any) -> None:
     """Set-points that move a little from the nominal equilibrium, AGC included."""
-    coarse = CoarsePlant(plant_of(island).equations, 0.2)  # type: ignore[attr-defined]
+    coarse = CoarsePlant(plant_of(island).system, 0.2)  # type: ignore[attr-defined]
     points = np.linspace(0.0, HORIZON, 41)
     change = 1e-4 * (schedule(island).at(points) - island.p_nominal)
     begun = coarse.begin(quiet_instance(island, horizon_s=HORIZON))
@@ -73,4 +73,4 @@ def test_the_linear_answer_is_that_of_small_changes(island: Case, quiet_instance
 
 def test_agc_between_steps_is_refused(island: Case, instance: Instance) -> None:
     with pytest.raises(InputError, match="acts between steps"):
-        _ = CoarsePlant(plant_of(island).equations, 0.3).maps  # type: ignore[attr-defined]
+        _ = CoarsePlant(plant_of(island).system, 0.3).maps  # type: ignore[attr-defined]

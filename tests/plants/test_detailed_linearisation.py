@@ -71,7 +71,7 @@ def test_rows_are_those_of_the_rollout(made):
 
 def test_a_step_is_the_exponential(made):
     plant, instance, _, model = made
-    system = plant.equations.system
+    system = plant.system
     point = system.network.nominal()
     modes = system.modes(point)
     moving = np.exp(modes * instance.dt_s)

@@ -71,8 +71,7 @@ def test_ida_says_the_same(mixed, plant, quiet_instance):
     """
     instance, schedule = ramping(mixed, quiet_instance)
     run = simulate(mixed, instance, schedule, plant)
-    equations, agc = plant.equations, mixed.agc
-    system, start = equations.system, plant.initial(instance)
+    system, agc, start = plant.system, mixed.agc, plant.initial(instance)
     n, n_x = len(system.data), start.x.size
     differential = system.moving
     still = np.setdiff1d(np.arange(n_x), differential)
@@ -81,9 +80,9 @@ def test_ida_says_the_same(mixed, plant, quiet_instance):
     y, held = np.concatenate([start.x.ravel(), start.v]), 0.0
 
     def inputs(t):
-        p_ref = start.offset + held * equations.shares
-        p_ref[equations.scheduled] += schedule.at(np.array([t]))[0]
-        return p_ref, equations.p_drawn(instance.p_load(mixed, np.array([t])))[0], start.v_ref
+        p_ref = start.offset + held * system.shares
+        p_ref[system.scheduled] += schedule.at(np.array([t]))[0]
+        return p_ref, system.p_drawn(instance.p_load(mixed, np.array([t])))[0], start.v_ref
 
     def residual(t, y, yp, res):
         rates, balance, *_ = system.symbolic.equations(y[:n_x], y[n_x:], *inputs(t))
@@ -106,8 +105,8 @@ def test_ida_says_the_same(mixed, plant, quiet_instance):
         y = solver.solve(np.array([first, last]), y, yp).y[-1]
         k = round(last / instance.dt_s)
         speeds = y[SPEED * n : (SPEED + 1) * n] * system.data.omega_0
-        np.testing.assert_allclose(run.omega[k], speeds[equations.scheduled], rtol=0, atol=2 * np.pi * 1e-7)
-        delivered = equations.turbines(y[:n_x].reshape(N_STATES, n))[equations.scheduled]
+        np.testing.assert_allclose(run.omega[k], speeds[system.scheduled], rtol=0, atol=2 * np.pi * 1e-7)
+        delivered = system.turbines(y[:n_x].reshape(N_STATES, n))[system.scheduled]
         np.testing.assert_allclose(run.p_gen[k], delivered, rtol=0, atol=1e-7)
     assert np.abs(run.omega).max() > 0.01
 
@@ -133,15 +132,15 @@ def test_powers_are_balanced(mixed, plant, quiet_instance):
     """
     instance, schedule = ramping(mixed, quiet_instance)
     run = simulate(mixed, instance, schedule, plant)
-    equations, states = plant.equations, run.states.states
-    network, data = equations.system.network, equations.system.data
+    system, states = plant.system, run.states.states
+    network, data = system.network, system.data
     v = states.v.view(np.complex128)
     lost = (v * (v @ network.admittance.T).conj()).real.sum(axis=1)
-    drawn = equations.p_drawn(run.p_load).sum(axis=1)
+    drawn = system.p_drawn(run.p_load).sum(axis=1)
     np.testing.assert_allclose(states.p_e.sum(axis=1), drawn + lost, rtol=0, atol=1e-8)
     w = states.x[:, SPEED]
     swing = (w[2:] - w[:-2]) / (2 * instance.dt_s * data.inverse_m)
-    left = (equations.turbines(states.x) - states.p_e - data.d * w)[1:-1]
+    left = (system.turbines(states.x) - states.p_e - data.d * w)[1:-1]
     smooth = np.abs(
         np.arange(2, 800)[:, None] * 0.01 - np.unique([*schedule.t, 0.5, 1.5, 2.5, 3.5, 4.5, 5.5])
     )
@@ -160,7 +159,7 @@ def test_the_integrator_is_of_order_four(plant, mixed, quiet_instance):
         p_set = np.column_stack([np.interp(t, grid, column) for column in schedule.at(grid).T])
         p_load = np.column_stack([np.interp(t, grid, column) for column in instance.p_load(mixed, grid).T])
         quick = dataclasses.replace(plant)
-        quick.equations.system.__dict__["fastest"] = 0.0  # one step from point to point
+        quick.system.__dict__["fastest"] = 0.0  # one step from point to point
         piece = quick.advance(quick.initial(instance), p_set, p_load, dt_s)
         ends.append(piece.omega[:: round(0.01 / dt_s)])
     errors = [np.abs(end - ends[-1]).max() for end in ends[:-1]]
@@ -211,18 +210,18 @@ def test_a_measured_start_has_what_was_measured(mixed, plant, quiet_instance, al
     for name in ("theta", "omega", "p_gen", "mechanical"):
         np.testing.assert_allclose(getattr(plant.observed(start), name), getattr(seen, name), atol=1e-12)
     assert start.next_s == pytest.approx(0.7)
-    x, data = start.x.copy(), plant.equations.system.data
+    x, data = start.x.copy(), plant.system.data
     drawn, reference = (
-        plant.equations.p_drawn(whole.p_load[[k]])[0],
-        seen.agc.held_pu * plant.equations.shares,
+        plant.system.p_drawn(whole.p_load[[k]])[0],
+        seen.agc.held_pu * plant.system.shares,
     )
-    reference[plant.equations.scheduled] += seen.p_gen
+    reference[plant.system.scheduled] += seen.p_gen
     np.testing.assert_allclose(x[GATE], reference - data.droop * x[SPEED], rtol=0, atol=1e-12)
     assert data.inertia @ x[DELTA] == pytest.approx(seen.agc.integral_rad, rel=1e-9)
     x[DELTA] -= data.inertia @ x[DELTA]
     x[SPEED] = x[WASHOUT] = 0.0
     given = x.ravel(), start.v, reference, drawn, start.v_ref
-    rates, balance, *_ = plant.equations.system.symbolic.equations(*given)
+    rates, balance, *_ = plant.system.symbolic.equations(*given)
     assert np.abs(balance.full()).max() < 1e-8
     assert np.abs(rates.full().reshape(N_STATES, -1)[E1Q : WASHOUT + 1]).max() < 1e-8
 
@@ -278,7 +277,7 @@ def test_a_lossless_case_is_judged_on_its_machines(quiet_instance, constant):
     plant = plant_of(case, "detailed")
     instance = quiet_instance(case, horizon_s=1.0)
     run = simulate(case, instance, constant(instance, case.p_nominal), plant)
-    system = plant.equations.system
+    system = plant.system
     assert system.network.balancing == list(case.detailed.machines).index(case.machine_of(case.slack))
     assert run.p_slack == pytest.approx(system.network.nominal().power.real[system.network.balancing])
     assert not system.island

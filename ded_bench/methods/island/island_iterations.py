@@ -77,7 +77,7 @@ class IslandGrid:
         self.knots = case.knot_times(horizon_s)
         between = max(round(float(self.knots[1]) / SPACING_S), 1)
         self.points = np.linspace(0.0, horizon_s, between * (len(self.knots) - 1) + 1)
-        self.coarse = CoarsePlant(self.plant.equations, float(self.points[1]))  # type: ignore[attr-defined]
+        self.coarse = CoarsePlant(self.plant.system, float(self.points[1]))  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
         self.hat = np.maximum(1.0 - np.abs(part), 0.0)
         n_gen = len(case.generators)

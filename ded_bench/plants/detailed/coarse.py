@@ -20,19 +20,17 @@ import numpy as np
 from scipy.linalg import expm
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.case_system import CaseSystem
 from ded_bench.plants.detailed.equations import (
     CompiledNetwork,
     LoadSlopes,
     machine_rates,
     mean_angle,
-    rates_at,
     renew,
     solve_voltages,
     sources,
 )
 from ded_bench.plants.detailed.machine_arrays import DELTA, GATE, SPEED, MachineArrays
-from ded_bench.plants.detailed.power_system import DIFFERENCE, interleaved
+from ded_bench.plants.detailed.power_system import PowerSystem, interleaved
 from ded_bench.plants.detailed.start import start
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
@@ -84,30 +82,24 @@ class CoarsePlant:
         InputError: secondary control acts between steps.
     """
 
-    equations: CaseSystem
+    system: PowerSystem
     spacing_s: float
 
     @functools.cached_property
     def _linear(self) -> tuple[Array, Array, Array]:
         """A, and the slopes of rates by governors' references and by loads drawn."""
-        system, at = self.equations.system, self._nominal
-        point, n = system.network.nominal(), len(system.data)
-        a = system.slopes(at[0], at[1].view(np.complex128), point.p_drawn).rates
+        system, (x, v, drawn, *_) = self.system, self._nominal
+        n, point = len(system.data), (x, v.view(np.complex128), system.network.nominal().p_drawn)
+        a = system.slopes(*point).rates
         by_reference = np.zeros((len(a), n))
         for i in range(n):
             by_reference[np.flatnonzero(system.moving == GATE * n + i), i] = system.data.rate_g[i]
-        drawn, by_load = at[2], np.empty((len(a), len(at[2])))
-        for j in range(len(drawn)):
-            there = [drawn + sign * DIFFERENCE * np.eye(len(drawn))[j] for sign in (1.0, -1.0)]
-            given = system.data, system.compiled_network
-            up, down = (rates_at(*given, d, np.stack(at[3:]), at[0][None], at[1])[0] for d in there)
-            by_load[:, j] = ((up - down) / (2.0 * DIFFERENCE)).ravel()[system.moving]
-        return a, by_reference, by_load
+        return a, by_reference, system.rates_by_drawn(*point)[:, : len(drawn)]
 
     @functools.cached_property
     def _nominal(self) -> tuple[Array, Array, Array, Array, Array]:
         """States, voltages, loads drawn, references of governors and of exciters."""
-        system = self.equations.system
+        system = self.system
         point = system.network.nominal()
         x, v_ref = system.equilibrium(point)
         mean = float(system.data.inertia @ x[DELTA])
@@ -127,16 +119,16 @@ class CoarsePlant:
     @functools.cached_property
     def maps(self) -> CoarseMaps:
         """One step."""
-        system, (a, by_reference, by_load) = self.equations.system, self._linear
+        system, (a, by_reference, by_load) = self.system, self._linear
         f, first, second = self._holds(self.spacing_s)
         seen = np.flatnonzero(np.abs(by_load).max(axis=1) > 0.0)
         x, v, drawn, p_ref, _ = self._nominal
-        agc, period, gain = self.equations.case.agc, 2**40, 0.0
+        agc, period, gain = self.system.case.agc, 2**40, 0.0
         if agc is not None:
             period, gain = round(agc.period_s / self.spacing_s), agc.k
             if abs(period * self.spacing_s - agc.period_s) > 1e-9:
                 problem = f"acts between steps of {self.spacing_s:g} s"
-                raise InputError(f"case {self.equations.case.id}", "plant.agc", problem)
+                raise InputError(f"case {self.system.case.id}", "plant.agc", problem)
         return CoarseMaps(
             system.moving,
             seen,
@@ -144,7 +136,7 @@ class CoarsePlant:
             np.ascontiguousarray(a[seen]),
             np.ascontiguousarray(by_load[seen]),
             *(x, v, drawn, p_ref),
-            first @ by_reference @ self.equations.shares,
+            first @ by_reference @ self.system.shares,
             gain,
             period,
         )
@@ -173,16 +165,16 @@ class CoarsePlant:
         Raises:
             InputError, SimulationError: see `start`.
         """
-        equations, state, maps = self.equations, start(self.equations, instance), self.maps
+        system, state, maps = self.system, start(self.system, instance), self.maps
         n = round(instance.horizon_s / self.spacing_s)
-        drawn = equations.p_drawn(
-            instance.p_load(equations.case, np.linspace(0.0, instance.horizon_s, n * PARTS + 1))
+        drawn = system.p_drawn(
+            instance.p_load(system.case, np.linspace(0.0, instance.horizon_s, n * PARTS + 1))
         )
         drawn = np.ascontiguousarray(drawn[:, : len(maps.drawn)])
         windows = np.lib.stride_tricks.sliding_window_view(drawn - maps.drawn, PARTS + 1, axis=0)[::PARTS]
         push = windows.swapaxes(1, 2).reshape(n, -1) @ self._load_answer
         push += self._inputs[0] @ (state.offset - maps.p_ref)
-        first = round(state.next_s / self.spacing_s) if equations.case.agc is not None else maps.period
+        first = round(state.next_s / self.spacing_s) if system.case.agc is not None else maps.period
         return CoarseStart(state.x, state.v_ref, drawn[::PARTS].copy(), push, state.held, first)
 
     def follow(self, begun: CoarseStart, p_set: Array) -> tuple[Array, Array]:
@@ -195,7 +187,7 @@ class CoarsePlant:
         Raises:
             SimulationError: the network has no voltages any more.
         """
-        system, machines = self.equations.system, self.equations.scheduled
+        system, machines = self.system, self.system.scheduled
         first, second = (part[:, machines].T for part in self._inputs)
         push = begun.push + p_set[:-1] @ first + np.diff(p_set, axis=0) @ second
         states = np.empty((len(p_set), *begun.x.shape))
@@ -203,7 +195,7 @@ class CoarsePlant:
         if advance(system.data, network, self.maps, begun, push, states) < len(states):
             raise SimulationError("the network has no voltages any more")
         omega = states[:, SPEED, machines] * system.data.omega_0[machines]
-        return omega, self.equations.turbines(states)[:, machines]
+        return omega, self.system.turbines(states)[:, machines]
 
     def response(self, p_set: Array) -> tuple[Array, Array]:
         """The linear answer from rest to changes of set-points.
@@ -214,7 +206,7 @@ class CoarsePlant:
         Returns:
             Frequencies, (n_points, n_gen, n_changes), rad/s; delivered powers likewise, pu.
         """
-        maps, data, machines = self.maps, self.equations.system.data, self.equations.scheduled
+        maps, data, machines = self.maps, self.system.data, self.system.scheduled
         n, n_changes = len(maps.moving), p_set.shape[2]
         first, second = (part[:, machines] for part in self._inputs)
         x, held = np.zeros((n, n_changes)), np.zeros(n_changes)
@@ -223,7 +215,7 @@ class CoarsePlant:
         for k in range(len(p_set)):
             states.reshape(n_changes, -1)[:, maps.moving] = x.T
             omega[k] = (states[:, SPEED, machines] * data.omega_0[machines]).T
-            delivered[k] = self.equations.turbines(states)[:, machines].T
+            delivered[k] = self.system.turbines(states)[:, machines].T
             if k and k % maps.period == 0:
                 held = -maps.gain * (states[:, DELTA] @ data.inertia)
             after = p_set[min(k + 1, len(p_set) - 1)]

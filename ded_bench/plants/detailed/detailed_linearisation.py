@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.case_system import CaseSystem, DetailedRun
 from ded_bench.plants.detailed.machine_arrays import DELTA, GATE, N_STATES, SPEED, TURBINE
+from ded_bench.plants.detailed.power_system import DetailedRun, PowerSystem
 from ded_bench.plants.time_varying import (
     Delivered,
     Hold,
@@ -29,23 +29,23 @@ from ded_bench.problem.quantities import Array
 from ded_bench.problem.trajectory import Trajectory
 
 
-def linearised(equations: CaseSystem, trajectory: Trajectory, points: Indices) -> TimeVarying:
+def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> TimeVarying:
     """Linearise along a trajectory (see `Plant.linearise_along`).
 
     Raises:
         InputError: secondary control acts between knots.
     """
     run: DetailedRun = trajectory.states
-    system, n_gen = equations.system, len(equations.case.generators)
+    n_gen = len(system.case.generators)
     if len(np.setdiff1d(run.agc_points, points)):
         problem = "times of secondary control must be among the knots"
-        raise InputError(f"case {equations.case.id}", "knots", problem)
-    kinds, machines = _states(equations)
+        raise InputError(f"case {system.case.id}", "knots", problem)
+    kinds, machines = _states(system)
     order = np.searchsorted(system.moving, kinds * len(system.data) + machines)
-    n = len(order) + (equations.case.agc is not None)
+    n = len(order) + (system.case.agc is not None)
     scale = np.where(kinds == SPEED, system.data.omega_0[machines], 1.0)
     middle = (points[:-1] + points[1:]) // 2
-    drawn = equations.p_drawn(trajectory.p_load[middle])
+    drawn = system.p_drawn(trajectory.p_load[middle])
     rates, slack = np.zeros((len(middle), n, n)), np.zeros((len(middle), n))
     for j, k in enumerate(middle):
         x = run.states.x[k].copy()
@@ -57,10 +57,10 @@ def linearised(equations: CaseSystem, trajectory: Trajectory, points: Indices) -
     into = np.zeros((n, n_gen))
     gates = np.flatnonzero(kinds == GATE)
     for place in gates[:n_gen]:
-        into[place, machines[place] == equations.scheduled] = system.data.rate_g[machines[place]]
+        into[place, machines[place] == system.scheduled] = system.data.rate_g[machines[place]]
     reset = None
-    if (agc := equations.case.agc) is not None:
-        rates[:, gates, -1] = (system.data.rate_g * equations.shares)[machines[gates]]
+    if (agc := system.case.agc) is not None:
+        rates[:, gates, -1] = (system.data.rate_g * system.shares)[machines[gates]]
         f = np.eye(n)
         f[-1] = 0.0
         f[-1, :-1] = np.where(kinds == DELTA, -agc.k * system.data.inertia[machines], 0.0)
@@ -79,18 +79,18 @@ def linearised(equations: CaseSystem, trajectory: Trajectory, points: Indices) -
         omega=trajectory.omega,
         p_slack=trajectory.p_slack,
         p_gen=trajectory.p_set[points],
-        delivered=_delivered(equations, kinds, machines, n, trajectory.p_gen, len(middle)),
+        delivered=_delivered(system, kinds, machines, n, trajectory.p_gen, len(middle)),
         reset=reset,
     )
 
 
-def _states(equations: CaseSystem) -> tuple[Indices, Indices]:
+def _states(system: PowerSystem) -> tuple[Indices, Indices]:
     """Kind and machine of every state that moves; those of the generators first, in their order."""
-    n_machine = len(equations.system.data)
-    others = np.setdiff1d(np.arange(n_machine), equations.scheduled)
-    machines = np.tile([*equations.scheduled, *others], N_STATES)
+    n_machine = len(system.data)
+    others = np.setdiff1d(np.arange(n_machine), system.scheduled)
+    machines = np.tile([*system.scheduled, *others], N_STATES)
     kinds = np.repeat(np.arange(N_STATES), n_machine)
-    moves = np.isin(kinds * n_machine + machines, equations.system.moving)
+    moves = np.isin(kinds * n_machine + machines, system.moving)
     return kinds[moves], machines[moves]
 
 
@@ -117,12 +117,12 @@ def _one_step(rates: Array, into: Array, dt_s: float, steps: int) -> Hold:
 
 
 def _delivered(
-    equations: CaseSystem, kinds: Indices, machines: Indices, n_state: int, p_gen: Array, n: int
+    system: PowerSystem, kinds: Indices, machines: Indices, n_state: int, p_gen: Array, n: int
 ) -> Delivered:
     """Turbines' powers by gates and turbines, the same in all n intervals."""
-    n_gen = len(equations.scheduled)
+    n_gen = len(system.scheduled)
     c = np.zeros((n_gen, n_state))
-    reheat = equations.system.data.reheat
+    reheat = system.data.reheat
     for kind, weight in ((GATE, reheat), (TURBINE, 1.0 - reheat)):
         places = np.flatnonzero(kinds == kind)[:n_gen]
         c[np.arange(n_gen), places] = weight[machines[places]]

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.case_system import CaseSystem, DetailedRun, DetailedState
 from ded_bench.plants.detailed.detailed_linearisation import linearised
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
+from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem
 from ded_bench.plants.detailed.start import initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
@@ -67,14 +67,14 @@ class DetailedPlant:
         return hashlib.sha256(parts.encode()).hexdigest()[:12]
 
     @functools.cached_property
-    def equations(self) -> CaseSystem:
+    def system(self) -> PowerSystem:
         """Its equations, by the case's generators and loads."""
-        return CaseSystem(self.case)
+        return PowerSystem(self.case)
 
     @functools.cached_property
     def dispatcher(self) -> StaticDispatch:
         """Its static dispatch."""
-        return StaticDispatch(self.equations)
+        return StaticDispatch(self.system)
 
     def initial(self, instance: Instance) -> DetailedState:
         """See `Plant.initial` and `start`.
@@ -82,7 +82,7 @@ class DetailedPlant:
         Raises:
             InputError: powers and loads at t = 0 are not balanced.
         """
-        return start(self.equations, instance)
+        return start(self.system, instance)
 
     def control(self, state: DetailedState, dt_s: float) -> SecondaryControl:
         """Secondary control by the points of a grid.
@@ -92,7 +92,7 @@ class DetailedPlant:
         """
         from ded_bench.plants.detailed.detailed_stepper import NEVER, SecondaryControl
 
-        agc, shares = self.case.agc, self.equations.shares
+        agc, shares = self.case.agc, self.system.shares
         if agc is None:
             return SecondaryControl(shares, 0.0, NEVER, 1)
         places = np.array([state.next_s, agc.period_s]) / dt_s
@@ -112,11 +112,11 @@ class DetailedPlant:
             integrate_plant,
         )
 
-        equations, n, control = self.equations, len(p_set), self.control(state, dt_s)
-        system, machines = equations.system, equations.scheduled
+        n, control = len(p_set), self.control(state, dt_s)
+        system, machines = self.system, self.system.scheduled
         p_ref = np.tile(state.offset, (n, 1))
         p_ref[:, machines] += p_set
-        drawn = np.ascontiguousarray(equations.p_drawn(p_load)[:, : system.network.n_load_port])
+        drawn = np.ascontiguousarray(system.p_drawn(p_load)[:, : system.network.n_load_port])
         network = system.compiled_network
         network = network if exact else network._replace(change=PLANNING_CHANGE)
         x, v = (np.empty((n, *first.shape)) for first in (state.x, state.v))
@@ -145,7 +145,7 @@ class DetailedPlant:
             carried=carried,
         )
         omega = states.x[:, SPEED, machines] * system.data.omega_0[machines]
-        p_gen = equations.turbines(states.x)[:, machines]
+        p_gen = system.turbines(states.x)[:, machines]
         p_slack = np.zeros(n) if system.island else states.p_e[:, system.network.balancing]
         run = DetailedRun(states, np.arange(control.first, n - 1, control.period), steps)
         return Piece(omega, p_gen, p_slack, run, end)
@@ -156,7 +156,7 @@ class DetailedPlant:
         Raises:
             InputError: secondary control acts between knots.
         """
-        return linearised(self.equations, trajectory, points)
+        return linearised(self.system, trajectory, points)
 
     def observed(self, state: DetailedState) -> State:
         """On islands everything that instance/2 can hold; else set-points and frequencies.
@@ -164,14 +164,14 @@ class DetailedPlant:
         Behind an infinite slack angles would be worse than none: turbines' powers, which are not told, or a
         planner's own network, hold others, and what it plans from would be far from any equilibrium.
         """
-        data, machines = self.equations.system.data, self.equations.scheduled
+        data, machines = self.system.data, self.system.scheduled
         omega = (state.x[SPEED] * data.omega_0)[machines]
         if self.case.slack is not None:
             return State(None, omega, state.p_set)
         agc, mean = None, float(data.inertia @ state.x[DELTA])
         if self.case.agc is not None:
             agc = AgcState(held_pu=state.held, integral_rad=mean, next_s=state.next_s)
-        theta, p_gen = (state.x[DELTA] - mean)[machines], self.equations.turbines(state.x)[machines]
+        theta, p_gen = (state.x[DELTA] - mean)[machines], self.system.turbines(state.x)[machines]
         return State(theta, omega, state.p_set, p_gen, agc)
 
     def columns(self, states: DetailedRun) -> Mapping[str, Array]:
@@ -180,7 +180,7 @@ class DetailedPlant:
         `v_<bus>` (pu); `delta_<machine>` (rad, relative to the slack's or the inertia-weighted mean); with
         secondary control `agc`, what it asks of all machines together (pu).
         """
-        found, system = states.states, self.equations.system
+        found, system = states.states, self.system
         network = system.network
         size = np.abs(found.v.view(np.complex128) @ network.spread.T)
         delta = found.x[:, DELTA] - (found.x[:, DELTA] @ system.data.inertia)[:, None]
@@ -195,7 +195,7 @@ class DetailedPlant:
 
     def nominal(self) -> NominalPoint:
         """See `Plant.nominal`; phase shifts of transformers are part of angles across them."""
-        system = self.equations.system
+        system = self.system
         point = system.network.nominal()
         voltage = dict(zip(system.network.buses, system.network.spread @ point.voltage, strict=True))
         lines = self.case.detailed.network.lines
@@ -212,7 +212,7 @@ class DetailedPlant:
 
         Where a slope changes, a set-point jumps by t1 t3 / t2 of the change.
         """
-        data, machines = self.equations.system.data, self.equations.scheduled
+        data, machines = self.system.data, self.system.scheduled
         t1, t3 = 1.0 / data.rate_g[machines], 1.0 / data.rate_h[machines]
         t2 = np.maximum(data.reheat[machines] * t3, LEAST_LEAD_S)
         change = np.diff(p_gen, axis=0, append=p_gen[-1:])
@@ -227,8 +227,8 @@ class DetailedPlant:
     def check_followed(self, instance: Instance) -> None:
         """See `Plant.check_followed`: on an island from kink to kink, simulated."""
         if self.case.slack is None:
-            point = initial_point(self.equations, instance)
-            schedule = self.dispatcher.followed(instance, self.equations.system.equilibrium(point).v_ref)
+            point = initial_point(self.system, instance)
+            schedule = self.dispatcher.followed(instance, self.system.equilibrium(point).v_ref)
             inputs = schedule.at(instance.grid), instance.p_load(self.case)
             self.advance(self.initial(instance), *inputs, instance.dt_s, exact=False)
 
@@ -238,10 +238,10 @@ class DetailedPlant:
         Powers and loads at t = 0 must have a stable equilibrium, the static dispatch at 0, at each kink of a
         load and at the horizon a power flow.
         """
-        equations = self.equations
+        system = self.system
         try:
-            point = initial_point(equations, instance)
-            if not equations.system.stable(point):
+            point = initial_point(system, instance)
+            if not system.stable(point):
                 raise SimulationError("their equilibrium is not stable")
         except InputError as error:
             raise InputError(source, error.field, error.problem) from None

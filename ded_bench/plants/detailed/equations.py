@@ -214,36 +214,3 @@ def machine_rates(
         rates[FEEDBACK, i] = data[i].rate_fb * (x[FIELD, i] - x[FEEDBACK, i])
         rates[GATE, i] = data[i].rate_g * (p_ref[i] - data[i].droop * w - x[GATE, i])
         rates[TURBINE, i] = data[i].rate_h * (x[GATE, i] - x[TURBINE, i])
-
-
-@compiled
-def rates_at(
-    data: MachineArrays, network: CompiledNetwork, drawn: Array, references: Array, x: Array, v: Array
-) -> Array:
-    """Rates at single states, with voltages solved for.
-
-    Args:
-        data: of n machines.
-        network: between ports.
-        drawn: active powers of the loads, (n_load,), pu.
-        references: of governors and of exciters, (2, n), pu.
-        x: states, (n_points, N_STATES, n).
-        v: guess of the voltages, (2 n_port,), pu.
-
-    Returns:
-        (n_points, N_STATES, n), 1/s; not numbers where there are no voltages.
-    """
-    rates, source, p_e = np.full_like(x, np.nan), np.empty(len(v)), np.empty(x.shape[2])
-    load = LoadSlopes(np.empty((len(drawn), 4)), np.empty((len(v), len(v))))
-    renew(network, drawn, v, load)
-    for k in range(len(x)):
-        sources(data, x[k], source)
-        found = v.copy()
-        solved = solve_voltages(network, drawn, source, load, found, FIXED_POINT_STEPS) <= FIXED_POINT_STEPS
-        if not solved:
-            found[:] = v
-            solved = solve_afresh(network, drawn, source, load, found)
-            renew(network, drawn, v, load)
-        if solved:
-            machine_rates(data, x[k], found, references[0], references[1], rates[k], p_e)
-    return rates

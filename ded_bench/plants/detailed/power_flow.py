@@ -97,7 +97,7 @@ class PortNetwork:
             if not worst < np.inf:
                 break
             if factors is None or worst > KEPT * before:
-                *factors, singular = dgetrf(self._jacobian(voltage, injected))
+                *factors, singular = dgetrf(self._slopes(voltage, injected)[np.ix_(unknown, unknown)])
                 if singular:
                     break
             step = np.zeros(2 * len(wanted))
@@ -110,25 +110,18 @@ class PortNetwork:
         """The power flow of the data, solved again: its rounded one is no equilibrium."""
         return self.power_flow(self.p_nominal, self.p_drawn)
 
-    def balance_slopes(self, point: OperatingPoint) -> tuple[Array, Array]:
-        """How the balancing machine's power changes with other powers, losses included.
+    def balance_slopes(self, point: OperatingPoint) -> Array:
+        """How the balancing machine's power changes with active powers of the machines, losses included.
 
         Returns:
-            Derivatives by the machines' active powers, (n_machine,), zero for the balancing one (about -1
-            for all others), and by the active powers drawn at the ports, (n_port,).
+            (n_machine,), zero for the balancing one, about -1 for all others.
         """
-        n = len(self.ports)
-        balancing = self.machine_port[self.balancing]
         injected = point.voltage * (self.admittance @ point.voltage).conj()
-        slopes = self._slopes(point.voltage, injected)
+        slopes, balancing = self._slopes(point.voltage, injected), self.machine_port[self.balancing]
         jacobian = slopes[np.ix_(self._unknown, self._unknown)]
-        by_all = np.zeros(2 * n)
+        by_all = np.zeros(len(slopes))
         by_all[self._unknown] = np.linalg.solve(jacobian.T, slopes[balancing, self._unknown])
-        by_injection = by_all[:n]
-        by_machine = by_injection[self.machine_port]
-        drawn = -by_injection
-        drawn[balancing] = 1.0
-        return by_machine, drawn
+        return by_all[self.machine_port]
 
     def _point(self, voltage: Complex, injected: Complex, p_machine: Array, p_drawn: Array) -> OperatingPoint:
         delivered = injected[self.machine_port] + (p_drawn + 1j * self.q_drawn)[self.machine_port]
@@ -153,9 +146,6 @@ class PortNetwork:
         slopes[:n, :n], slopes[:n, n:] = by_angle.real, by_size.real
         slopes[n:, :n], slopes[n:, n:] = by_angle.imag, by_size.imag
         return slopes
-
-    def _jacobian(self, voltage: Complex, injected: Complex) -> Array:
-        return self._slopes(voltage, injected)[np.ix_(self._unknown, self._unknown)]
 
 
 def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> PortNetwork:

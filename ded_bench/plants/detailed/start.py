@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.case_system import CaseSystem, DetailedState
 from ded_bench.plants.detailed.machine_arrays import (
     DELTA,
     E1D,
@@ -24,7 +23,7 @@ from ded_bench.plants.detailed.machine_arrays import (
     WASHOUT,
 )
 from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
-from ded_bench.plants.detailed.power_system import PowerSystem, interleaved
+from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import Array
@@ -35,24 +34,24 @@ REMAINDER = 1e-4
 STATIONARY = (E1Q, E1D, E2D, E2Q, EXCITER, FIELD, FEEDBACK)
 
 
-def initial_point(equations: CaseSystem, instance: Instance) -> OperatingPoint:
+def initial_point(system: PowerSystem, instance: Instance) -> OperatingPoint:
     """The power flow of the initial powers and loads; one machine takes what these are short of.
 
     Raises:
         InputError: that is more than REMAINDER, on an island and at rest.
         SimulationError: there is no solution.
     """
-    wanted = equations.p_machine(instance.p_initial(equations.case))
-    drawn = equations.p_drawn(instance.p_load(equations.case, np.zeros(1)))[0]
-    point, balancing = equations.system.network.power_flow(wanted, drawn), equations.system.network.balancing
+    wanted = system.p_machine(instance.p_initial(system.case))
+    drawn = system.p_drawn(instance.p_load(system.case, np.zeros(1)))[0]
+    point, balancing = system.network.power_flow(wanted, drawn), system.network.balancing
     short = float(point.power.real[balancing] - wanted[balancing])
-    if equations.system.island and instance.initial.measured is None and abs(short) > REMAINDER:
+    if system.island and instance.initial.measured is None and abs(short) > REMAINDER:
         problem = f"initial loads and losses exceed power by {short:.3g} pu, more than {REMAINDER:g} in size"
         raise InputError(f"instance {instance.id}", "initial.power", problem)
     return point
 
 
-def start(equations: CaseSystem, instance: Instance) -> DetailedState:
+def start(system: PowerSystem, instance: Instance) -> DetailedState:
     """The state at t = 0.
 
     Voltages at machines are nominal in the power flow of the initial powers and loads, which gives the
@@ -64,10 +63,9 @@ def start(equations: CaseSystem, instance: Instance) -> DetailedState:
         InputError: see `initial_point`; or there are angles, and no island.
         SimulationError: there is no equilibrium.
     """
-    case, system, machines = equations.case, equations.system, equations.scheduled
-    data = system.data
+    case, data, machines = system.case, system.data, system.scheduled
     p_set = instance.p_initial(case)
-    point = initial_point(equations, instance)
+    point = initial_point(system, instance)
     x, v_ref = system.equilibrium(point)
     offset = point.power.real.copy()
     offset[machines] -= p_set
@@ -91,7 +89,7 @@ def start(equations: CaseSystem, instance: Instance) -> DetailedState:
         x[DELTA] += agc.integral_rad
     reference = offset.copy()
     reference[machines] += p_set
-    reference += held * equations.shares
+    reference += held * system.shares
     mechanical = reference.copy()
     if (given := instance.mechanical_initial(case)) is not None:
         mechanical[machines] = given

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linprog
 
-from ded_bench.plants.detailed.case_system import CaseSystem
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint
+from ded_bench.plants.detailed.power_system import PowerSystem
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -47,13 +47,13 @@ class Balance:
 class StaticDispatch:
     """Dispatch of the generators of a case, beside what secondary control holds."""
 
-    equations: CaseSystem
+    system: PowerSystem
     held_pu: float = 0.0  # delivered beyond the powers, by all machines together
 
     @property
     def case(self) -> Case:
         """Whose machines are dispatched."""
-        return self.equations.case
+        return self.system.case
 
     def weigh(self, power: Array, p_load: Array, guess: Complex | None = None) -> Balance:
         """Solve the power flow and say what the powers are short of.
@@ -66,13 +66,13 @@ class StaticDispatch:
         Raises:
             SimulationError: the power flow has no solution.
         """
-        network = self.equations.system.network
-        machines = self.equations.p_machine(power) + self.held_pu * self.equations.shares
-        point = network.power_flow(machines, self.equations.p_drawn(p_load), guess)
-        slopes = network.balance_slopes(point)[0]
+        network = self.system.network
+        machines = self.system.p_machine(power) + self.held_pu * self.system.shares
+        point = network.power_flow(machines, self.system.p_drawn(p_load), guess)
+        slopes = network.balance_slopes(point)
         slopes[network.balancing] = -1.0
         short = float(point.power.real[network.balancing] - machines[network.balancing])
-        return Balance(power, point, short, slopes[self.equations.scheduled])
+        return Balance(power, point, short, slopes[self.system.scheduled])
 
     def cheapest(
         self, cost: Array, p_load: Array, start: Balance, reach: Array | None = None, rough: bool = False
@@ -252,10 +252,10 @@ class StaticDispatch:
         Raises:
             SimulationError: there is none.
         """
-        system = self.equations.system
+        system = self.system
         network, point = system.network, near.point
         sizes, port = np.abs(point.voltage), network.machine_port
-        machines, drawn = self.equations.p_machine(near.power), self.equations.p_drawn(p_load)
+        machines, drawn = self.system.p_machine(near.power), self.system.p_drawn(p_load)
         for _ in range(REGULATIONS):
             missed = np.zeros_like(
                 sizes
@@ -301,7 +301,7 @@ class StaticDispatch:
                 reach = self.case.ramp * max(times[number] - times[number - 1], SHORTEST_S)
                 following = self.cheapest(cost, load, following, reach, True)
                 powers.append(following.power)
-        if not self.equations.system.stable(point):
+        if not self.system.stable(point):
             raise SimulationError("the equilibrium at the horizon is not stable")
         return Schedule(times, np.array(powers))
 

@@ -104,11 +104,11 @@ def test_dispatch_leaves_to_secondary_control_what_it_holds(island, quiet_instan
     instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"agc": agc})})
     power = ed.dispatch(island, instance, 5.0).p[-1]
     held = -0.05 * 2.0 if due else 0.07
-    equations = plant_of(island).equations
+    system = plant_of(island).system
     share = held * np.array([island.agc.participation.get(name, 0.0) for name in island.generators])
-    weighed = StaticDispatch(equations).weigh(power + share, island.load_nominal)
+    weighed = StaticDispatch(system).weigh(power + share, island.load_nominal)
     assert weighed.short == pytest.approx(0.0, abs=1e-6)
-    without = StaticDispatch(equations).weigh(power, island.load_nominal)
+    without = StaticDispatch(system).weigh(power, island.load_nominal)
     assert without.short == pytest.approx(held, rel=0.1)
 
 

@@ -25,7 +25,8 @@ from ded_bench.methods.admm.admm_inference import (
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.admm_training import HELD_OUT, HOPELESS, MARGIN
 from ded_bench.methods.admm.modal_grid import ModalGrid
-from ded_bench.methods.admm.problems import Problems, draw
+from ded_bench.methods.admm.problems import draw, problems_of
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.plant import servable
 from ded_bench.plants.score import score
 from ded_bench.problem.benchmark import select_split, validation_instances
@@ -45,7 +46,7 @@ VALIDATION, FIRST = 64, 30_000
 class Judge:
     """Problems of one grid, prepared once for all candidates."""
 
-    def __init__(self, grid: ModalGrid, iterations: int, problems: Problems) -> None:
+    def __init__(self, grid: ModalGrid, iterations: int, problems: StackedInstances) -> None:
         self.grid, self.iterations, self.start = grid, iterations, grid.start(problems)
         self.linear = grid.along_first(self.start)
         self.served = self.start.served.copy()
@@ -81,7 +82,7 @@ def search(case: Case, policy: AdmmPolicy, seconds: float) -> Array:
     grid = ModalGrid(case, case.omega_bound(policy.scope.regime), policy.scope.horizon_s)
     iterations = policy.training["iterations"]
     instances = [one for one, _ in select_split(case.id, "train", HELD_OUT).instances]
-    check = Judge(grid, iterations, Problems.of(case, instances, grid.points))
+    check = Judge(grid, iterations, problems_of(case, instances, grid.points))
     known = sum(part.mean() for part in check(policy.weights["nodes"]))
     print(f"held out, gradients: {known:.6f}", flush=True)
     es = cma.CMAEvolutionStrategy(

@@ -24,7 +24,7 @@ class StackedInstances:
     flow has to be solved; where an instance gives others, their deviation counts.
     """
 
-    load: Array  # segments, see `load_segments`, (batch, n_load, n_segments, 3)
+    load: Array  # segments, see `load_segments`, (batch, n_load, n_segments, 3); or as their user has them
     cost: Array  # (slack, generators), (batch, 1 + n_gen)
     p_initial: Array  # P_0, (batch, n_gen), pu
     delta: Array  # θ(0) less the equilibrium of P_0 and the initial loads, (batch, n_gen), rad

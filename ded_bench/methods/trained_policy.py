@@ -1,28 +1,26 @@
-"""A trained policy as a method: its weights, and one answer, timed from the instance to the powers."""
+"""A trained policy as a method: its weights, and one answer, timed from the instance to the powers.
+
+A policy's file has weights and a JSON header in safetensors. Who answers reads weights as arrays; torch is
+for training alone.
+"""
 
 from __future__ import annotations
 
 import abc
 import functools
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numba
 import numpy as np
 
+from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.policy_file import (
-    Scope,
-    Weights,
-    checked_weights,
-    find_policy_file,
-    read_policy,
-    weights_fingerprint,
-    write_policy,
-)
+from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
@@ -31,9 +29,33 @@ from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 
+if TYPE_CHECKING:
+    from torch import nn
+
+SCHEMA = "ded-bench/policy/1"
 #: Instances answered at a time.
 CHUNK = 50
 SOLVER_VERSION = f"numba {numba.__version__}, numpy {np.__version__}"
+#: Weights and buffers of a network by name, in the order of its state dict, float32.
+Weights = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """What a policy was trained for: it answers nothing else."""
+
+    case: Case
+    regime: str
+    horizon_s: float
+
+    def check(self, instances: Sequence[Instance]) -> None:
+        """Raise InputError if an instance belongs to another case or horizon."""
+        for instance in instances:
+            source = f"instance {instance.id}"
+            if instance.case != self.case.id:
+                raise InputError(source, "case", f"the policy is for case {self.case.id}")
+            if abs(instance.horizon_s - self.horizon_s) > 1e-9:
+                raise InputError(source, "horizon_s", f"the policy is for a horizon of {self.horizon_s} s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +73,11 @@ class TrainedPolicy(abc.ABC):
 
     @staticmethod
     @abc.abstractmethod
-    def shapes(
-        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, tuple[int, ...]]:
+    def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the weights that a file with these facts must have.
 
         Raises:
-            ValueError: the facts are missing, mistyped or contradict the arrays.
+            ValueError: the facts are missing or mistyped.
         """
 
     @functools.cached_property
@@ -84,17 +104,36 @@ class TrainedPolicy(abc.ABC):
 
     def save(self, path: Path) -> None:
         """Write weights and header."""
-        write_policy(path, self.method, self.scope, self.weights, self.training)
+        facts = {"horizon_s": self.scope.horizon_s, "training": self.training}
+        write_arrays(path, self.weights, self._header(self.scope.case, self.scope.regime) | facts)
+
+    @classmethod
+    def _header(cls, case: Case, regime: str) -> dict[str, Any]:
+        """What tells policies apart."""
+        own = {"schema": SCHEMA, "method": cls.method}
+        return own | {"case": case.id, "case_fingerprint": case.fingerprint, "regime": regime}
 
     @classmethod
     def load(cls, path: str | Path, case: Case, regime: str) -> Self:
-        """Read a policy for a case and regime; InputError if the file is wrong or for something else."""
-        arrays, scope, training = read_policy(path, cls.method, case, regime)
+        """Read a policy for a case and regime.
+
+        Raises:
+            InputError: the file is wrong, or the policy is for another case, its limits changed, or for
+                another regime or method.
+        """
+        arrays, header = read_arrays(path)
+        for name, value in cls._header(case, regime).items():
+            if header.get(name) != value:
+                raise InputError(path, name, f"is {str(header.get(name))[:60]!r}, but {value!r} is needed")
+        horizon, training = header.get("horizon_s"), header.get("training")
+        finite = isinstance(horizon, (int, float)) and 0 < horizon < float("inf")
+        if horizon is None or not finite or not isinstance(training, dict):
+            raise InputError(path, "horizon_s, training", "missing or mistyped")
         try:
-            shapes = cls.shapes(scope, training, arrays)
+            shapes = cls.shapes(case, training)
         except ValueError as error:
             raise InputError(path, "training", str(error)) from None
-        return cls(scope, checked_weights(arrays, shapes, path), training)
+        return cls(Scope(case, regime, float(horizon)), checked_weights(arrays, shapes, path), training)
 
     @classmethod
     def find(cls, case: Case, regime: str, settings: Settings) -> Self:
@@ -110,6 +149,26 @@ class TrainedPolicy(abc.ABC):
         """The policy that `find` loads; raises as it does."""
         path = find_policy_file(cls.method, case, regime, settings)
         return (Artifact("policy", cls.method, cls.load(path, case, regime).fingerprint, path),)
+
+
+def checked_weights(
+    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], path: str | Path
+) -> Weights:
+    """Arrays as the weights of a network with exactly these names and shapes; InputError otherwise."""
+    for name in shapes.keys() | arrays.keys():
+        if name not in arrays or arrays[name].shape != shapes.get(name):
+            raise InputError(path, name, "is missing, unknown or has the wrong shape")
+    return {name: arrays[name].astype(np.float32) for name in shapes}
+
+
+def weights_of(network: nn.Module) -> Weights:
+    """The weights and buffers of a network in torch, copied."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in network.state_dict().items()}
+
+
+def weights_fingerprint(weights: Weights) -> str:
+    """Twelve hex digits that change when any weight does."""
+    return hashlib.sha256(b"".join(value.tobytes() for value in weights.values())).hexdigest()[:12]
 
 
 def as_solver(scope: Scope, answer: Callable[[Instance], Schedule], iterations: int | None = None) -> Solver:

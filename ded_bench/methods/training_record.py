@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.policy_file import DEFAULT_MODEL
@@ -59,29 +59,12 @@ class TrainingOptions:
         return {name: getattr(self, name) for name in kept}
 
 
-class Trained(Protocol):
-    """What a training returns, after it has written the policy's file."""
-
-    @property
-    def training(self) -> Mapping[str, Any]:
-        """Facts of the training: `epochs` (done), `seconds` (spent), one of `LOSSES`, and any others."""
-
-
-class Trainer(Protocol):
-    """`train` of a method's training module, which says `TAKES_START = True` if it knows `options.start`."""
-
-    def __call__(
-        self, case: Case, regime: str, instances: Sequence[Instance], out: Path, options: TrainingOptions, /
-    ) -> Trained:
-        """Train a policy; write it to `out`, and its history beside it.
-
-        Args:
-            instances: of the case, all on one time grid.
-
-        Raises:
-            InputError: the surrogate is missing, the checkpoint to go on from belongs to another training,
-                or the weights to start from do not fit.
-        """
+#: `train(case, regime, instances, out, options)` of a method's training module, which says
+#: `TAKES_START = True` if it knows `options.start`. The instances are all on one time grid. It writes the
+#: policy to `out`, its history beside it, and returns something whose `training` has facts: `epochs` (done),
+#: `seconds` (spent), one of `LOSSES`, and any others. It raises InputError if the surrogate is missing, the
+#: checkpoint to go on from belongs to another training, or the weights to start from do not fit.
+Trainer = Callable[[Case, str, Sequence[Instance], Path, TrainingOptions], Any]
 
 
 def checkpoint_file(policy: Path) -> Path:

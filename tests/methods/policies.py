@@ -14,9 +14,8 @@ from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy, n_channels
 from ded_bench.methods.dpc_paper.paper_training import PaperNetwork
-from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.methods.trained_policy import TrainedPolicy
+from ded_bench.methods.trained_policy import Scope, TrainedPolicy, weights_of
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Initial, Instance, LoadPoints
@@ -61,7 +60,7 @@ def staged_network(case: Case, size: float = 1.0, horizon: float = HORIZON) -> S
     """A network of `ded-dpc` whose last layers are not zero, with inputs normalised."""
     torch.manual_seed(0)
     response = Response.make(case, case.knot_times(horizon))
-    network = StagedNetwork(case, response, 2, 16, (1, 2, 4))
+    network = StagedNetwork(case, response)
     for stage in network.stages:
         torch.nn.init.normal_(stage.last.weight, std=size)
     inputs = StackedInstances.of(case, short_instances(case, 20, horizon=horizon))
@@ -93,7 +92,7 @@ def random_policy(method: str, case: Case, size: float = 0.3, horizon: float = H
     scope = Scope(case, list(case.regimes)[-1], horizon)
     if method == "ded-dpc":
         staged = staged_network(case, size, horizon)
-        return DispatchPolicy(scope, weights_of(staged), {"seed": 0} | staged.shape)
+        return DispatchPolicy(scope, weights_of(staged), {"seed": 0})
     if method == "ded-admm":
         network = torch_iterations(modal_grid(case, horizon), size)
         return AdmmPolicy(scope, weights_of(network), {"seed": 0, "iterations": ITERATIONS})

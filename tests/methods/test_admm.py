@@ -25,14 +25,13 @@ from ded_bench.methods.admm.admm_inference import (
 from ded_bench.methods.admm.admm_policy import prepare
 from ded_bench.methods.admm.admm_training import read_start, with_margin
 from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, oscillators
-from ded_bench.methods.admm.problems import POINTS, Problems
+from ded_bench.methods.admm.problems import POINTS, problems_of
 from ded_bench.methods.admm.torch_iterations import (
     ModalChange,
     ScheduleLoss,
     TorchIterations,
     Transposed,
 )
-from ded_bench.methods.policy_file import write_policy
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
@@ -187,7 +186,7 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     """Cost within 0.05 %, largest excess within 2 % of the bound, of what the simulation says."""
     grid = modal_grid(ninebus, 60.0)
     instance = sample_instance(ninebus, POLICY_SEED, 7)
-    start = grid.start(Problems.of(ninebus, [instance], grid.points))
+    start = grid.start(problems_of(ninebus, [instance], grid.points))
     outcome = grid.respond(start.schedule, start, grid.along_first(start))
     tensors = [torch.as_tensor(part, dtype=torch.float32) for part in (start.schedule, *outcome[1:])]
     loss = ScheduleLoss(grid)
@@ -211,7 +210,7 @@ def test_training_starts_from_weights_of_another_grid(ninebus: Case, threebus: C
     assert trained.training["start"] == known.fingerprint
     assert trained.fingerprint != known.fingerprint
     other = tmp_path / "other.safetensors"
-    write_policy(other, "ded-dpc", known.scope, known.weights, {})
+    random_policy("ded-dpc", threebus).save(other)
     with pytest.raises(InputError, match="ded-admm"):
         read_start(other)
 

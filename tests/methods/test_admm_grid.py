@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 
 from ded_bench.methods.admm.modal_grid import SMALLEST_COST
 from ded_bench.methods.admm.network_kernels import MISMATCH
-from ded_bench.methods.admm.problems import POINTS, Problems, sampled
+from ded_bench.methods.admm.problems import POINTS, problems_of, sampled
 from ded_bench.methods.stacked_instances import load_segments
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
@@ -26,7 +26,7 @@ def test_response_is_what_happens(case: Case) -> None:
     horizon = case.sampling.horizon_s
     grid = modal_grid(case, horizon)
     for instance in (sample_instance(case, POLICY_SEED, 1), in_operation(case, 2, horizon)):
-        start = grid.start(Problems.of(case, [instance], grid.points))
+        start = grid.start(problems_of(case, [instance], grid.points))
         _, omega, p_slack = grid.respond(start.schedule, start, grid.along_first(start))
         truth = simulate(case, instance, Schedule(grid.knots, start.schedule[0]))
         points = np.clip(np.round(grid.points / instance.dt_s).astype(int), 0, instance.steps)

@@ -27,7 +27,7 @@ from ded_bench.methods.dpc_paper.paper_training import (
     PaperNetwork,
     train,
 )
-from ded_bench.methods.policy_file import Scope, weights_of
+from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
@@ -133,7 +133,7 @@ def loss_and_data(case: Case, count: int, bound: float) -> tuple[PaperLoss, Batc
     model, instances = linear_model(case), some_instances(case, count)
     condensed = CondensedRollout.make(case, model, instances[0].grid, case.knot_times(HORIZON))
     data = Batch.of(case, model, instances, "cpu")
-    data = Batch(*(getattr(data, name).double() for name in data.__dataclass_fields__))
+    data = Batch(*(part.double() for part in data))
     return PaperLoss(condensed, bound, case.ramp * instances[0].dt_s, dtype=torch.float64), data
 
 
@@ -142,7 +142,7 @@ def test_condensed_loss_equals_the_sequential_one_in_values_and_gradients(case: 
     loss, batch = loss_and_data(case, 2, bound)
     raw = np.random.default_rng(0).uniform(case.p_min, case.p_max, (2, case.n_knots, len(case.generators)))
     knots = torch.tensor(raw, requires_grad=True)
-    values = torch.stack(list(loss.terms(knots, batch).values()), dim=1)
+    values = torch.stack(list(loss(knots, batch).values()), dim=1)
     values.sum().backward()
     for b, instance in enumerate(some_instances(case, 2)):
         alone = torch.tensor(raw[b], requires_grad=True)
@@ -172,7 +172,8 @@ def test_the_recipe_is_the_papers_and_nothing_else(threebus: Case, tmp_path: Pat
     for _ in range(7):
         for rows in torch.randperm(10, generator=order).split(8):
             optimiser.zero_grad()
-            sum(loss(network, data[rows]).values()).backward()
+            some = data.of_rows(rows)
+            sum(term.mean() for term in loss(network(some.channels), some).values()).backward()
             optimiser.step()
     expected = network.state_dict()
     assert (expected["mean"] == 0).all()

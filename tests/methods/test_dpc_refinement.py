@@ -110,9 +110,9 @@ def test_it_is_an_option_that_needs_a_model(threebus: Case, tmp_path: Path) -> N
     policy = random_policy("ded-dpc", threebus, horizon=threebus.sampling.horizon_s)
     regime, instance = policy.scope.regime, sample_instance(threebus, POLICY_SEED, 1)
     policy.save(policy_file(tmp_path, "ded-dpc", regime, "linear"))
-    settings = [Settings(o, "linear", search=(tmp_path,)) for o in ("default", "refine=25", "refine=200")]
+    settings = [Settings(o, "linear", search=(tmp_path,)) for o in ("default", "refine=100", "refine=300")]
     answers = [prepare(threebus, regime, chosen)(instance) for chosen in settings]
-    assert [answer.iterations for answer in answers] == [None, 25, 200]
+    assert [answer.iterations for answer in answers] == [None, 100, 300]
     assert len({answer.schedule.p.tobytes() for answer in answers}) == 3
     needed = [[one.kind for one in artifacts(threebus, regime, chosen)] for chosen in settings]
     assert needed == [["policy"], ["policy", "model"], ["policy", "model"]]

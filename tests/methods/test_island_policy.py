@@ -13,9 +13,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import IslandGrid, IslandIterations
 from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.island.island_training import FIRST, train
-from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case

@@ -102,11 +102,6 @@ def test_a_policy_refuses_what_it_was_not_trained_for(
 @pytest.mark.parametrize(
     ("method", "name", "value", "problem"),
     [
-        ("ded-dpc", "dilations", [1, 2, 70], "numbers of knots"),
-        ("ded-dpc", "dilations", [1, 2], "width or depth"),
-        ("ded-dpc", "width", 17, "width or depth"),
-        ("ded-dpc", "stages", 3, "width or depth"),
-        ("ded-dpc", "stages", None, "lacks"),
         ("ded-admm", "iterations", "many", "iterations"),
         ("ded-admm", "margin", "some", "margin"),
     ],

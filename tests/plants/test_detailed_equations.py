@@ -149,7 +149,7 @@ def test_symbolic_and_compiled_equations_agree(system):
 
 
 def test_linearisation_is_that_of_differences(system):
-    """Derivatives of the rates by the states that move and by loads, against differences of compiled ones."""
+    """All derivatives of the rates by the states that move, against central differences of compiled ones."""
     x, guess, point, v_ref = random_states(system, 1)
     n, step, drawn = len(system.moving), 1e-5, point.p_drawn[: system.network.n_load_port]
     references = point.power.real, v_ref
@@ -158,14 +158,9 @@ def test_linearisation_is_that_of_differences(system):
     rates = compiled_rates(system, drawn, references, moved, guess).reshape(2, n, -1)
     differences = ((rates[0] - rates[1]) / (2 * step))[:, system.moving].T
     v = voltages(system, x[0], guess, point.p_drawn)
-    place = x[0], v.view(np.complex128), point.p_drawn
-    slopes = system.slopes(*place).rates
+    slopes = system.slopes(x[0], v.view(np.complex128), point.p_drawn).rates
     scale = np.maximum(np.abs(slopes), 1.0)
     np.testing.assert_allclose(slopes / scale, differences / scale, rtol=0, atol=1e-5)
-    up, down = (drawn + sign * step * (np.arange(len(drawn)) == 1) for sign in (1, -1))
-    by_load = [compiled_rates(system, d, references, x, guess).ravel()[system.moving] for d in (up, down)]
-    expected = (by_load[0] - by_load[1]) / (2 * step)
-    np.testing.assert_allclose(system.rates_by_drawn(*place)[:, 1], expected, rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("island", [False, True])

@@ -17,11 +17,11 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
 from ded_bench.methods.admm.modal_grid import ModalGrid
-from ded_bench.methods.admm.problems import Problems
+from ded_bench.methods.admm.problems import problems_of
 from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Artifact, Settings, Solver
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import PowerFlowError
 from ded_bench.problem.case import Array, Case
@@ -71,15 +71,15 @@ class AdmmPolicy(TrainedPolicy):
         """See `TrainedPolicy.answers`."""
         return self.powers(self.problems(instances))
 
-    def problems(self, instances: Sequence[Instance]) -> Problems:
+    def problems(self, instances: Sequence[Instance]) -> StackedInstances:
         """Instances as arrays; InputError if the policy is not for them, or they cannot be served."""
         self.scope.check(instances)
         try:
-            return Problems.of(self.scope.case, instances, self.grid.points)
+            return problems_of(self.scope.case, instances, self.grid.points)
         except PowerFlowError as error:
             raise InputError(f"instance {instances[0].id}", "initial", str(error)) from None
 
-    def powers(self, problems: Problems, further: CompiledIterations | None = None) -> Array:
+    def powers(self, problems: StackedInstances, further: CompiledIterations | None = None) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu.
 
         Args:
@@ -95,9 +95,7 @@ class AdmmPolicy(TrainedPolicy):
         return further(start, grid.along(start, grid.respond(answer, start, linear)[0]), answer)
 
     @staticmethod
-    def shapes(
-        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, tuple[int, ...]]:
+    def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
         iterations, margin = training.get("iterations"), training.get("margin", 0.0)
         if not (isinstance(iterations, int) and 0 < iterations < 1000):

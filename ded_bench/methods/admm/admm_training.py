@@ -17,11 +17,17 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import PRICE, weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, Start
-from ded_bench.methods.admm.problems import Problems, draw
+from ded_bench.methods.admm.problems import draw, problems_of
 from ded_bench.methods.admm.torch_iterations import ScheduleLoss, TorchIterations
 from ded_bench.methods.island.island_training import train as train_on_island
-from ded_bench.methods.policy_file import Scope, Weights, checked_weights, weights_fingerprint, weights_of
-from ded_bench.methods.trained_policy import TrainedPolicy
+from ded_bench.methods.trained_policy import (
+    Scope,
+    TrainedPolicy,
+    Weights,
+    checked_weights,
+    weights_fingerprint,
+    weights_of,
+)
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.plant import SimulationError
@@ -76,7 +82,7 @@ def train(
     start = read_start(options.start) if options.start else None
     if start is not None:
         network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
-    check = grid.start(Problems.of(case, instances[:HELD_OUT], grid.points))
+    check = grid.start(problems_of(case, instances[:HELD_OUT], grid.points))
     run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
         facts = run.train(options, EPOCHS, f"{AdmmPolicy.method} {regime}")

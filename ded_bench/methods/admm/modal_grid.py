@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.network_kernels import CONTRACTION, MISMATCH, follow_trajectory
-from ded_bench.methods.admm.problems import POINTS, Problems, ramp_limited_schedules, time_grid
+from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules, time_grid
+from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.lossless.stepper import set_jacobian, solve_algebraic
 from ded_bench.problem.case import Array, Case
@@ -41,7 +42,7 @@ SMALLEST_COST = 0.05
 class Start:
     """What is known of problems before any decision."""
 
-    problems: Problems
+    problems: StackedInstances
     served: NDArray[np.bool_]  # whether there is a power flow, (batch,)
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0: q, q̇, (batch, 2, n_modes)
@@ -108,7 +109,7 @@ class ModalGrid:
         self._step = np.ascontiguousarray(np.moveaxis(maps, 0, 2))
         self._damping = u.T @ np.diag(other) @ u  # of the modes, less γ, (n_modes, n_modes), 1/s
 
-    def start(self, problems: Problems) -> Start:
+    def start(self, problems: StackedInstances) -> Start:
         """Angles at t = 0 and the first schedule."""
         network, batch = self.network, len(problems)
         theta, served = np.tile(self.theta, (batch, 1)), np.empty(batch, bool)

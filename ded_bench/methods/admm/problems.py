@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,32 +23,19 @@ OPERATING = 4
 FLUCTUATION, DECAY_S = 5e-4, 20.0
 
 
-@dataclass(frozen=True, eq=False)
-class Problems:
-    """Problems of one case; like `StackedInstances`, but for the loads."""
+def problems_of(case: Case, instances: Sequence[Instance], points: Array) -> StackedInstances:
+    """Instances whose `load` is sampled on a time grid, (batch, n_points, n_load), pu.
 
-    load: Array  # on the time grid, (batch, n_points, n_load), pu
-    cost: Array  # (slack, generators), (batch, 1 + n_gen)
-    p_initial: Array  # P_0, (batch, n_gen), pu
-    delta: Array  # θ(0) less the equilibrium of P_0 and the initial loads, (batch, n_gen), rad
-    omega: Array  # ω(0), (batch, n_gen), rad/s
+    Args:
+        case: theirs.
+        instances: to stack.
+        points: the time grid, (n_points,), s.
 
-    @staticmethod
-    def of(case: Case, instances: Sequence[Instance], points: Array) -> Problems:
-        """Sample instances on a time grid, (n_points,), s.
-
-        Raises:
-            PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
-        """
-        given = StackedInstances.of(case, instances)
-        load = sampled(given.load, points)
-        return Problems(load, given.cost, given.p_initial, given.delta, given.omega)
-
-    def __len__(self) -> int:
-        return len(self.load)
-
-    def __getitem__(self, rows: slice) -> Problems:
-        return Problems(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+    Raises:
+        PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
+    """
+    given = StackedInstances.of(case, instances)
+    return dataclasses.replace(given, load=sampled(given.load, points))
 
 
 def time_grid(knots: Array) -> Array:
@@ -56,7 +43,7 @@ def time_grid(knots: Array) -> Array:
     return np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
 
 
-def draw(case: Case, bound: float, points: Array, master: int, first: int, count: int) -> Problems:
+def draw(case: Case, bound: float, points: Array, master: int, first: int, count: int) -> StackedInstances:
     """Draw problems: the benchmark's instances; every fourth becomes one of the closed loop.
 
     That kind has the ramps of another instance besides, a decaying fluctuation, powers nearer to the static
@@ -70,7 +57,7 @@ def draw(case: Case, bound: float, points: Array, master: int, first: int, count
         first: index of the first instance.
         count: how many.
     """
-    found = Problems.of(case, list(sample_instances(case, master, count, first)), points)
+    found = problems_of(case, list(sample_instances(case, master, count, first)), points)
     chosen = found[::OPERATING]
     generator, shape = np.random.default_rng([master, first, count]), chosen.omega.shape
     more = np.roll(found.load, 1, axis=0)[::OPERATING]

@@ -11,14 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from ded_bench.methods.dpc.bound_keeper import BoundKeeper
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.policy_file import DEFAULT_MODEL, Scope
+from ded_bench.methods.policy_file import DEFAULT_MODEL
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
@@ -38,7 +36,7 @@ class Options:
 
 
 class DispatchPolicy(TrainedPolicy):
-    """A trained network; `training` has its `stages`, `width` and `dilations`."""
+    """A trained network."""
 
     method = "ded-dpc"
 
@@ -49,7 +47,7 @@ class DispatchPolicy(TrainedPolicy):
 
     @functools.cached_property
     def _compiled(self) -> CompiledStages:
-        return CompiledStages(self.scope.case, self.response, self.weights, tuple(self.training["dilations"]))
+        return CompiledStages(self.scope.case, self.response, self.weights)
 
     @functools.cached_property
     def _keeper(self) -> BoundKeeper:
@@ -68,21 +66,9 @@ class DispatchPolicy(TrainedPolicy):
         return self._compiled(Channels.of(self.scope.case, inputs, self.response))
 
     @staticmethod
-    def shapes(
-        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, tuple[int, ...]]:
+    def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
-        case = scope.case
-        stages, width, dilations = (training.get(name) for name in ("stages", "width", "dilations"))
-        if not (isinstance(stages, int) and isinstance(width, int) and isinstance(dilations, list)):
-            raise ValueError("lacks the network's stages, width and dilations")
-        if not all(isinstance(d, int) and 0 < d < case.n_knots for d in dilations):
-            raise ValueError("has dilations that are no numbers of knots")
-        layers = {name for name in arrays if ".mix." in name and name.endswith(".bias")}
-        widths = {arrays[name].shape for name in layers} | {(width,)}
-        if len(layers) != stages * len(dilations) or len(widths) != 1 or not layers:
-            raise ValueError("has another width or depth than the weights")
-        return weight_shapes(case, stages, width, len(dilations))
+        return weight_shapes(case)
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:

@@ -16,8 +16,10 @@ from ded_bench.methods.ramp_follower import track
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 
-#: Width of the layer that constants of an instance pass through.
-EMBEDDING = 64
+#: How many stages there are, channels of their hidden layers, and of the layer that constants pass through.
+STAGES, WIDTH, EMBEDDING = 2, 24, 64
+#: With windows of three these dilations reach 16 knots to either side, in each stage.
+DILATIONS = (1, 2, 4, 8)
 
 
 class StageWeights(NamedTuple):
@@ -39,17 +41,14 @@ class StageWeights(NamedTuple):
 class CompiledStages:
     """The same function as a StagedNetwork, with its state dict as arrays; the followers in float64."""
 
-    def __init__(
-        self, case: Case, response: Response, state: Mapping[str, np.ndarray], dilations: tuple[int, ...]
-    ) -> None:
-        n_stages = 1 + max(int(name.split(".")[1]) for name in state)
+    def __init__(self, case: Case, response: Response, state: Mapping[str, np.ndarray]) -> None:
         half = 0.5 * (case.p_max - case.p_min)
-        stages = [_matrices(_part(state, f"stages.{i}."), len(dilations), half) for i in range(n_stages)]
+        stages = [_matrices(_part(state, f"stages.{i}."), half) for i in range(STAGES)]
         self._weights = StageWeights(
             *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
         )
         self._limits = case.p_min, case.p_max, case.ramp * (response.knots[1] - response.knots[0])
-        self._of_power, self._dilations = response.of_power, np.array(dilations)
+        self._of_power, self._dilations = response.of_power, np.array(DILATIONS)
 
     def __call__(self, channels: Channels) -> Array:
         """Powers at the knots, (batch, n_knots, n_gen), pu."""
@@ -64,16 +63,9 @@ class CompiledStages:
         return p_gen.swapaxes(1, 2)
 
 
-def weight_shapes(case: Case, stages: int, width: int, n_blocks: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a StagedNetwork's weights, in the order of its state dict.
-
-    Args:
-        case: gives the number of channels.
-        stages: of the network; likewise `width`.
-        width: channels of the hidden layers.
-        n_blocks: how many dilations there are.
-    """
-    n_gen, (n_sequence, n_constants) = len(case.generators), n_channels(case)
+def weight_shapes(case: Case) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a StagedNetwork's weights, in the order of its state dict."""
+    n_gen, (n_sequence, n_constants), n_blocks = len(case.generators), n_channels(case), len(DILATIONS)
     n_seen = n_gen + 2 * (n_gen + 1) + n_sequence
     stage: dict[str, tuple[int, ...]] = {
         "sequence_mean": (n_seen,),
@@ -82,29 +74,29 @@ def weight_shapes(case: Case, stages: int, width: int, n_blocks: int) -> dict[st
         "constants_scale": (n_constants,),
     }
     layers: dict[str, tuple[int, ...]] = {
-        "first": (width, n_seen, 1, 3),
+        "first": (WIDTH, n_seen, 1, 3),
         "embed.0": (EMBEDDING, n_constants),
-        "embed.2": (width * (1 + n_blocks), EMBEDDING),
-        **{f"spread.{i}": (width, width, 1, 3) for i in range(n_blocks)},
-        **{f"mix.{i}": (width, width, 1, 1) for i in range(n_blocks)},
-        "last": (n_gen, width, 1, 1),
+        "embed.2": (WIDTH * (1 + n_blocks), EMBEDDING),
+        **{f"spread.{i}": (WIDTH, WIDTH, 1, 3) for i in range(n_blocks)},
+        **{f"mix.{i}": (WIDTH, WIDTH, 1, 1) for i in range(n_blocks)},
+        "last": (n_gen, WIDTH, 1, 1),
     }
     for name, shape in layers.items():
         stage |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
-    return {f"stages.{i}.{name}": shape for i in range(stages) for name, shape in stage.items()}
+    return {f"stages.{i}.{name}": shape for i in range(STAGES) for name, shape in stage.items()}
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-def _matrices(state: Mapping[str, np.ndarray], n_blocks: int, half: Array) -> StageWeights:
+def _matrices(state: Mapping[str, np.ndarray], half: Array) -> StageWeights:
     """The weights of one stage, from a ResidualNetwork's state; normalisation is part of them.
 
     Args:
         half: half of each generator's range, pu.
     """
-    blocks = range(n_blocks)
+    blocks = range(len(DILATIONS))
     enter = state["embed.0.weight"] / state["constants_scale"]
     biases = np.concatenate([state["first.bias"], *(state[f"spread.{i}.bias"] for i in blocks)])
     first = state["first.weight"][:, :, 0] / state["sequence_scale"][:, None]

@@ -16,36 +16,21 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from ded_bench.methods.dpc.channels import Channels, Response, n_channels
-from ded_bench.methods.dpc.inference import EMBEDDING
+from ded_bench.methods.dpc.inference import DILATIONS, EMBEDDING, STAGES, WIDTH
 from ded_bench.methods.torch_follower import follow_within
 from ded_bench.problem.case import Array, Case
-
-STAGES, WIDTH = 2, 24
-#: With windows of three these dilations reach 16 knots to either side, in each stage.
-DILATIONS = (1, 2, 4, 8)
 
 
 class StagedNetwork(nn.Module):
     """Schedules from channels: corrected and followed once per stage; differentiable."""
 
-    def __init__(
-        self,
-        case: Case,
-        response: Response,
-        stages: int = STAGES,
-        width: int = WIDTH,
-        dilations: tuple[int, ...] = DILATIONS,
-    ) -> None:
+    def __init__(self, case: Case, response: Response) -> None:
         super().__init__()
         n_gen, n_knots = len(case.generators), len(response.knots)
         n_sequence, n_constants = n_channels(case)
         n_seen = n_gen + response.n_outputs + n_sequence
-        self.stages = nn.ModuleList(
-            ResidualNetwork(n_seen, n_constants, n_gen, width, dilations) for _ in range(stages)
-        )
+        self.stages = nn.ModuleList(ResidualNetwork(n_seen, n_constants, n_gen) for _ in range(STAGES))
         self.response = response
-        #: Facts that the policy's file needs.
-        self.shape = {"stages": stages, "width": width, "dilations": list(dilations)}
         step = case.ramp * (response.knots[1] - response.knots[0])
         by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
         of_power = by_knot.reshape(n_knots * n_gen, -1)
@@ -83,18 +68,17 @@ class ResidualNetwork(nn.Module):
     they come, that is a third faster to train on a CPU than one-dimensional convolutions.
     """
 
-    def __init__(self, n_sequence: int, n_constants: int, n_gen: int, width: int, dilations: tuple[int, ...]):
+    def __init__(self, n_sequence: int, n_constants: int, n_gen: int) -> None:
         super().__init__()
-        self.width = width
-        self.first = nn.Conv2d(n_sequence, width, (1, 3), padding=(0, 1))
+        self.first = nn.Conv2d(n_sequence, WIDTH, (1, 3), padding=(0, 1))
         self.embed = nn.Sequential(
-            nn.Linear(n_constants, EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, width * (1 + len(dilations)))
+            nn.Linear(n_constants, EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, WIDTH * (1 + len(DILATIONS)))
         )
         self.spread = nn.ModuleList(
-            nn.Conv2d(width, width, (1, 3), padding=(0, d), dilation=(1, d)) for d in dilations
+            nn.Conv2d(WIDTH, WIDTH, (1, 3), padding=(0, d), dilation=(1, d)) for d in DILATIONS
         )
-        self.mix = nn.ModuleList(nn.Conv2d(width, width, 1) for _ in dilations)
-        self.last = nn.Conv2d(width, n_gen, 1)
+        self.mix = nn.ModuleList(nn.Conv2d(WIDTH, WIDTH, 1) for _ in DILATIONS)
+        self.last = nn.Conv2d(WIDTH, n_gen, 1)
         with torch.no_grad():
             for layer in self.mix:
                 layer.weight.mul_(0.5)  # type: ignore[operator]
@@ -120,7 +104,7 @@ class ResidualNetwork(nn.Module):
         """Corrections, shape (batch, n_knots, n_gen)."""
         x = ((sequence - self.sequence_mean) / self.sequence_scale).transpose(1, 2)[:, :, None]
         embedded = self.embed((constants - self.constants_mean) / self.constants_scale)
-        bias = embedded.unflatten(1, (-1, self.width, 1, 1))
+        bias = embedded.unflatten(1, (-1, WIDTH, 1, 1))
         h = self.first(x) + bias[:, 0]
         for i, (spread, mix) in enumerate(zip(self.spread, self.mix, strict=True)):
             h = h + mix(F.relu(spread(h) + bias[:, i + 1]))

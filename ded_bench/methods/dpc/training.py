@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.policy_network import StagedNetwork
 from ded_bench.methods.dpc.refinement import coarse_free_response, coarse_stride
-from ded_bench.methods.policy_file import Scope, weights_of
 from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.lossless.network import Network
@@ -54,9 +54,8 @@ FRESH_PER_SECOND = 200
 CHUNK = 500
 
 
-@dataclass(frozen=True, eq=False)
-class Pool:
-    """Instances as tensors, ready for the loss."""
+class Pool(NamedTuple):
+    """Instances as tensors, ready for the loss; the first four are what a StagedNetwork takes."""
 
     start: Tensor  # (batch, n_knots, n_gen), pu
     free_response: Tensor  # of the linearisation, at the knots, (batch, n_knots, n_outputs)
@@ -68,7 +67,12 @@ class Pool:
 
     @staticmethod
     def of(
-        channels: Channels, inputs: StackedInstances, model: Koopman, network: Network, grid: Array
+        channels: Channels,
+        inputs: StackedInstances,
+        model: Koopman,
+        network: Network,
+        grid: Array,
+        device: str,
     ) -> Pool:
         """Convert channels, and compute free responses on a time grid; float32."""
         stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
@@ -77,17 +81,12 @@ class Pool:
         scale = np.maximum(channels.static_cost(inputs), SMALLEST_COST) * len(grid)
         seen = channels.start, channels.free_response, channels.sequence, channels.constants
         arrays = (*seen, inputs.cost, scale, np.concatenate(free))
-        return Pool(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32) for a in arrays))
+        whole = (np.ascontiguousarray(array) for array in arrays)
+        return Pool(*(torch.as_tensor(array, dtype=torch.float32, device=device) for array in whole))
 
-    def to(self, device: str) -> Pool:
-        """The same on another device."""
-        return Pool(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, rows: Tensor) -> Pool:
-        return Pool(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+    def of_rows(self, rows: Tensor) -> Pool:
+        """Some of them."""
+        return Pool(*(part[rows] for part in self))
 
 
 class RolloutLoss:
@@ -101,11 +100,6 @@ class RolloutLoss:
         )
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
         self.spacing_s = condensed.stride * condensed.model.dt_s
-
-    def powers(self, network: nn.Module, pool: Pool) -> Tensor:
-        """Schedules at the knots, (batch, n_knots, n_gen), pu: what `DispatchPolicy.powers` computes."""
-        powers: Tensor = network(pool.start, pool.free_response, pool.sequence, pool.constants)
-        return powers
 
     def __call__(self, powers: Tensor, pool: Pool, margin: float = 0.0) -> tuple[Tensor, Tensor]:
         """Cost relative to the scale, (batch,), and relative excess of |ω|, (batch, n_gen, n_coarse)."""
@@ -134,7 +128,7 @@ def train(
     inputs = [StackedInstances.of(case, part) for part in (drawn, instances)]
     channels = [Channels.of(case, part, response) for part in inputs]
     data, check = (
-        Pool.of(c, i, model, network, first.grid).to(options.device)
+        Pool.of(c, i, model, network, first.grid, options.device)
         for c, i in zip(channels, inputs, strict=True)
     )
     stride = coarse_stride(model.dt_s, first.steps, SPACING_S)
@@ -147,12 +141,12 @@ def train(
     loss = RolloutLoss(condensed, case.omega_bound(regime), options.device)
     run = _DispatchTraining(staged, loss, data, check, options.seed, out)
     facts = run.train(options, EPOCHS, f"{DispatchPolicy.method} {regime}") | {
-        "instances": len(data),
-        "held_out": len(check),
+        "instances": len(drawn),
+        "held_out": len(instances),
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
     }
-    policy = DispatchPolicy(scope, weights_of(staged), facts | staged.shape)
+    policy = DispatchPolicy(scope, weights_of(staged), facts)
     policy.save(out)
     return policy
 
@@ -168,7 +162,7 @@ class _DispatchTraining(TrainingRun):
         )
         super().__init__(network, optimiser, seed, out)
         self.judge, self.data, self.check = loss, data, check
-        self.penalty = torch.zeros(len(data))  # of each instance when it was last seen
+        self.penalty = torch.zeros(len(data.cost))  # of each instance when it was last seen
 
     def batches(self) -> Sequence[Tensor]:
         """Rows of the next epoch: all, the hard ones repeatedly, shuffled."""
@@ -179,8 +173,8 @@ class _DispatchTraining(TrainingRun):
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """Cost and priced penalty of a batch."""
-        batch = self.data[rows.to(self.data.start.device)]
-        cost, excess = self.judge(self.judge.powers(self.network, batch), batch, MARGIN)
+        batch = self.data.of_rows(rows.to(self.data.start.device))
+        cost, excess = self.judge(self.network(*batch[:4]), batch, MARGIN)
         penalty = _penalty(excess)
         self.penalty[rows] = penalty.detach().cpu()
         price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress * self.judge.spacing_s
@@ -189,7 +183,7 @@ class _DispatchTraining(TrainingRun):
 
     def look(self) -> dict[str, float]:
         """Loss of the average at the last price, its cost, and what it exceeds, Hz."""
-        powers = self.judge.powers(self.average, self.check)
+        powers = self.average(*self.check[:4])
         cost, excess = self.judge(powers, self.check)
         _, tight = self.judge(powers, self.check, MARGIN)
         value = float(cost.mean() + PRICE[1] * self.judge.spacing_s * _penalty(tight).mean())

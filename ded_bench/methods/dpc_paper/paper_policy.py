@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.options import NoOptions
-from ded_bench.methods.policy_file import Scope
 from ded_bench.methods.solution import Settings, Solver
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import Network
@@ -48,11 +47,9 @@ class PaperPolicy(TrainedPolicy):
         return np.minimum(np.maximum(powers, case.p_min), case.p_max)  # again, in float64
 
     @staticmethod
-    def shapes(
-        scope: Scope, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, tuple[int, ...]]:
+    def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
-        return weight_shapes(n_channels(scope.case), len(scope.case.generators))
+        return weight_shapes(n_channels(case), len(case.generators))
 
 
 artifacts = PaperPolicy.artifacts

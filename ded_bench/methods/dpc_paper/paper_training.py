@@ -12,18 +12,17 @@ training instances, raw inputs. The paper leaves open
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ded_bench.methods.dpc_paper.paper_policy import FILTERS, WINDOWS, PaperPolicy, channels, n_channels
-from ded_bench.methods.policy_file import Scope, weights_of
+from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.lossless.network import Network
@@ -76,8 +75,7 @@ def _same_padding(window: int) -> nn.Module:
     return nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(NamedTuple):
     """Instances as tensors, ready for the loss."""
 
     channels: Tensor  # (batch, n_channels, n_knots)
@@ -99,11 +97,9 @@ class Batch:
         )
         return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32, device=device) for a in arrays))
 
-    def __len__(self) -> int:
-        return len(self.channels)
-
-    def __getitem__(self, rows: Tensor) -> Batch:
-        return Batch(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+    def of_rows(self, rows: Tensor) -> Batch:
+        """Some of them."""
+        return Batch(*(part[rows] for part in self))
 
 
 class PaperLoss:
@@ -125,12 +121,7 @@ class PaperLoss:
         )
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
 
-    def __call__(self, network: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """Mean of each term over the batch."""
-        terms = self.terms(network(batch.channels), batch)
-        return {name: value.mean() for name, value in terms.items()}
-
-    def terms(self, knots: Tensor, batch: Batch) -> dict[str, Tensor]:
+    def __call__(self, knots: Tensor, batch: Batch) -> dict[str, Tensor]:
         """The six terms of eq. (DPC_loss) of each instance, weighted, shape (batch,) each.
 
         Args:
@@ -174,7 +165,7 @@ def train(
         network = PaperNetwork(n_channels(case), case.p_min, case.p_max).to(options.device)
     run = _PaperTraining(network, loss, data, options.seed, out)
     facts = run.train(options, EPOCHS, f"{PaperPolicy.method} {regime}") | {
-        "instances": len(data),
+        "instances": len(instances),
         "held_out": 0,
         "model": model.kind,
         "model_fingerprint": model.fingerprint,
@@ -201,11 +192,12 @@ class _PaperTraining(TrainingRun):
     def batches(self) -> Sequence[Tensor]:
         """All instances, shuffled."""
         self.totals, self.seen = {}, 0
-        return torch.split(torch.randperm(len(self.data), generator=self.generator), BATCH)
+        return torch.split(torch.randperm(len(self.data.channels), generator=self.generator), BATCH)
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """The sum of the terms."""
-        terms = self.judge(self.network, self.data[rows])
+        batch = self.data.of_rows(rows)
+        terms = {name: term.mean() for name, term in self.judge(self.network(batch.channels), batch).items()}
         for name, value in terms.items():
             self.totals[name] = self.totals.get(name, 0.0) + value.item() * len(rows)
         self.seen += len(rows)

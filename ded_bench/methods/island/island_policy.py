@@ -23,7 +23,7 @@ from ded_bench.methods.island.island_iterations import (
 )
 from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.plants.plant import SimulationError
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Simulations after which costs count, and after which bounds are mended, at most.
@@ -93,9 +93,7 @@ class IslandPolicy(TrainedPolicy):
         return answer
 
     @staticmethod
-    def shapes(
-        scope: Any, training: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, tuple[int, ...]]:
+    def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
         for name in ("iterations", "mending"):
             count = training.get(name)

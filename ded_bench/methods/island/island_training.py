@@ -17,7 +17,7 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import IslandGrid
 from ded_bench.methods.island.island_policy import IslandPolicy
-from ded_bench.methods.policy_file import Scope
+from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions, write_history
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 #: Voltages are solved for less sharply than where schedules are judged, pu, in at most so many steps.
 CHANGE, STEPS = 1e-7, 30
+#: Step of differences of loads, pu.
+DIFFERENCE = 1e-6
 #: Loads are linear between so many points of a step.
 PARTS = 5
 
@@ -88,13 +90,23 @@ class CoarsePlant:
     @functools.cached_property
     def _linear(self) -> tuple[Array, Array, Array]:
         """A, and the slopes of rates by governors' references and by loads drawn."""
-        system, (x, v, drawn, *_) = self.system, self._nominal
-        n, point = len(system.data), (x, v.view(np.complex128), system.network.nominal().p_drawn)
-        a = system.slopes(*point).rates
-        by_reference = np.zeros((len(a), n))
+        system, (x, v, drawn, p_ref, v_ref) = self.system, self._nominal
+        n, network = len(system.data), system.compiled_network
+        a = system.slopes(x, v.view(np.complex128), system.network.nominal().p_drawn).rates
+        by_reference, by_load = np.zeros((len(a), n)), np.empty((len(a), len(drawn)))
         for i in range(n):
             by_reference[np.flatnonzero(system.moving == GATE * n + i), i] = system.data.rate_g[i]
-        return a, by_reference, system.rates_by_drawn(*point)[:, : len(drawn)]
+        load, source = LoadSlopes(np.empty((len(drawn), 4)), np.empty((len(v), len(v)))), np.empty(len(v))
+        sources(system.data, x, source)
+        for j, one in enumerate(np.eye(len(drawn))):
+            rates = np.empty((2, *x.shape))
+            for moved, found in zip((drawn + DIFFERENCE * one, drawn - DIFFERENCE * one), rates, strict=True):
+                there = v.copy()
+                renew(network, moved, v, load)
+                solve_voltages(network, moved, source, load, there, STEPS)
+                machine_rates(system.data, x, there, p_ref, v_ref, found, np.empty(n))
+            by_load[:, j] = ((rates[0] - rates[1]) / (2.0 * DIFFERENCE)).ravel()[system.moving]
+        return a, by_reference, by_load
 
     @functools.cached_property
     def _nominal(self) -> tuple[Array, Array, Array, Array, Array]:

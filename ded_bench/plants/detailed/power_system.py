@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
 from ded_bench.plants.detailed.machine_arrays import (
     DELTA,
@@ -192,24 +191,14 @@ class PowerSystem:
 
     def slopes(self, x: Array, voltage: Complex, p_drawn: Array) -> Slopes:
         """Linearise at states (N_STATES, n_machine) and voltages (n_port,), pu."""
-        full, balance = self._jacobian(x, voltage, p_drawn)
-        columns, by_v = full[:, : x.size].tocsc()[:, self.moving].toarray(), full[:, x.size :]
-        reduced = columns + by_v @ np.linalg.solve(by_v[balance].toarray(), -columns[balance])
-        return Slopes(reduced[self.moving], reduced[balance.stop :][: x.shape[1]])
-
-    def rates_by_drawn(self, x: Array, voltage: Complex, p_drawn: Array) -> Array:
-        """Derivatives of the moving states' rates by the powers drawn at the ports, (n_moving, n_port)."""
-        full, balance = self._jacobian(x, voltage, p_drawn)
-        by_v = full[:, x.size :]
-        # What the balance loses is 1 / conj(v) for each pu.
-        lost = interleaved(np.diag(1.0 / voltage.conj())).T
-        return np.asarray(by_v[self.moving] @ np.linalg.solve(by_v[balance].toarray(), lost))
-
-    def _jacobian(self, x: Array, voltage: Complex, p_drawn: Array) -> tuple[csr_matrix, slice]:
-        """`SymbolicPlant.jacobian`, and which of its rows are the network's balance."""
-        references = np.zeros(x.shape[1])  # they enter linearly
+        n, n_v = len(self.data.port), 2 * len(voltage)
+        references = np.zeros(n)  # they enter linearly
         given = x.ravel(), interleaved(voltage), references, p_drawn, references
-        return self.symbolic.jacobian(*given).sparse().tocsr(), slice(x.size, x.size + 2 * len(voltage))
+        full = self.symbolic.jacobian(*given).sparse().tocsr()
+        columns, by_v = full[:, : x.size].tocsc()[:, self.moving].toarray(), full[:, x.size :]
+        balance = slice(x.size, x.size + n_v)
+        reduced = columns + by_v @ np.linalg.solve(by_v[balance].toarray(), -columns[balance])
+        return Slopes(reduced[self.moving], reduced[x.size + n_v :][:n])
 
     def modes(self, point: OperatingPoint) -> NDArray[np.complex128]:
         """Eigenvalues at an equilibrium, 1/s, ascending in size; that of an island's free angle is first."""

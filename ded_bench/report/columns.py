@@ -84,9 +84,7 @@ def _against(what: str, ours: str, paper: str, failures: str = "failures") -> Co
 
 REGIME, TITLE, CASE = Column("regime", "Regime"), Column("title", "Method"), Column("case", "Grid")
 ROWS, N, FAILURES = Column("rows", "rows"), Column("n", "n"), Column("failures", "failures")
-MODEL, DATE, SEED = Column("model", "surrogate"), Column("date", "date"), Column("seed", "seed")
-PARAMETERS, DEVICE = Column("parameters", "parameters"), Column("device", "device")
-INSTANCES, SECONDS = Column("instances", "instances"), Column("seconds", "training", "s")
+DATE, INSTANCES = Column("date", "date"), Column("instances", "instances")
 _HEAD = (REGIME, TITLE)
 
 #: The paper's tables, of `paper_numbers.result_lines`.
@@ -178,11 +176,14 @@ TIMING = (
     *(Column("load_average", "load"), DATE, Column("error", "error")),
 )
 TRAINING = (
-    *(Column("name", "Policy"), SECONDS, Column("epochs", "epochs"), INSTANCES),
+    Column("name", "policy or model"),
+    Column("seconds", "training", "s"),
+    *(Column("epochs", "epochs"), INSTANCES, Column("trajectories", "trajectories")),
     Column("held_out", "held out"),
     Column("held_out_loss", "held-out loss", form=".6g"),
     Column("training_loss", "training loss", form=".6g"),
-    *(PARAMETERS, MODEL, SEED, DEVICE, Column("problem", "problem")),
+    *(Column("parameters", "parameters"), Column("model", "surrogate"), Column("seed", "seed")),
+    *(Column("device", "device"), Column("problem", "problem")),
 )
 CERTIFICATE = (
     *_HEAD,
@@ -247,8 +248,4 @@ GRIDS = (
     Column("tight_hz", "tightest bound", "Hz"),
     Column("knots", "knots"),
     Column("reference", "gaps are to"),
-)
-TRAININGS = (
-    *(CASE, Column("name", "model or policy"), SECONDS, INSTANCES),
-    *(Column("trajectories", "trajectories"), PARAMETERS, DEVICE),
 )

@@ -1,4 +1,4 @@
-"""One page over several grids: sizes, gaps, violations, times and memory against size, trainings."""
+"""One page over several grids: sizes, gaps, violations, times and memory against size."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, TRAININGS, Column
+from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, Column
 from ded_bench.report.figures.growth import growth_figure
 from ded_bench.report.figures.style import save_figure
-from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, write_page
-from ded_bench.report.sources import Sources, read_sources, trainings
+from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, write_page
+from ded_bench.report.sources import Sources, read_sources
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
 from ded_bench.run.environment import environment, now
@@ -54,20 +54,20 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     grids = sorted((read_grid(folder) for folder in folders), key=lambda grid: len(grid.case.generators))
     found = points(grids)
     made: list[Block] = [
-        Heading(f"Dynamics-aware economic dispatch on {len(grids)} grids", 1),
+        f"# Dynamics-aware economic dispatch on {len(grids)} grids",
         *_findings(grids),
-        *folded("How to read this page", Items(EXPLANATION)),
+        *folded("How to read this page", bullets(EXPLANATION)),
     ]
     for heading, blocks in _parts(grids, found, out).items():
-        made += [Heading(heading), *blocks] if blocks else []
+        made += [f"## {heading}", *blocks] if blocks else []
     if not found["solve_s"].notna().any():
-        made.append(Text("No method was timed alone yet; run `ded-bench bench`."))
+        made.append("No method was timed alone yet; run `ded-bench bench`.")
     folders_here = {grid.case.id: Path(os.path.relpath(grid.folder, out)).as_posix() for grid in grids}
     items = [f"`{case}`: `{folder}`, seen from this page" for case, folder in folders_here.items()]
     hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]
-    return write_page([*made, Heading("Where the rows come from"), Items(tuple(items))], out, "overview")
+    return write_page([*made, "## Where the rows come from", bullets(items)], out, "overview")
 
 
 def _findings(grids: Sequence[Sources]) -> list[Block]:
@@ -78,7 +78,7 @@ def _findings(grids: Sequence[Sources]) -> list[Block]:
             (grid.outcome["regime"] == grid.tightest) & (grid.outcome["settings"] == DEFAULT)
         ]
         said += [f"{grid.case.id}: {text}" for text in findings(lines, grid.reference.title)]
-    return [Items(tuple(said))]
+    return [bullets(said)]
 
 
 def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str, list[Block]]:
@@ -93,10 +93,6 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
 
     operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
     excess = "Largest excess over the frequency bound, Hz"
-    trained = [
-        trainings((*grid.results.paths.models, *grid.results.paths.policies)).assign(case=grid.case.id)
-        for grid in grids
-    ]
     with_slack = [grid.case.id for grid in grids if grid.case.slack is not None]
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
@@ -116,7 +112,6 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
             *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
         ],
         "The closed loop": table("online", operated, (CASE, *ONLINE), loop),
-        "Trainings": table("trainings", pd.concat(trained), TRAININGS, "What was trained"),
     }
 
 

@@ -6,7 +6,7 @@ import base64
 import html
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,29 +39,6 @@ td { vertical-align: top; }
 td[style] { white-space: nowrap; }
 @media (max-width: 40rem) { body { font-size: 15px; padding: 0.75rem 0.9rem 3rem; } }
 """
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A section's title; level 1 is the page's own."""
-
-    text: str
-    level: int = 2
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph; `code` and **bold** as in Markdown. A `note` is what one must know to read on."""
-
-    text: str
-    note: bool = False
-
-
-@dataclass(frozen=True)
-class Items:
-    """A bullet list."""
-
-    items: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +84,13 @@ class Details:
     blocks: tuple[Block, ...]
 
 
-Block = Heading | Text | Items | PageTable | Picture | Details
+#: Text is Markdown; `bullets` makes it of several.
+Block = str | PageTable | Picture | Details
+
+
+def bullets(items: Iterable[str]) -> str:
+    """A list in Markdown."""
+    return "\n".join(f"- {item}" for item in items)
 
 
 def folded(summary: str, *blocks: Block) -> list[Block]:
@@ -163,22 +146,20 @@ def render_markdown(blocks: Sequence[Block], folder: Path | None = None) -> str:
 
 
 def _markdown(block: Block, folder: Path | None) -> str:
-    if isinstance(block, Details):
-        head = f"<details><summary>{html.escape(block.summary)}</summary>"
-        return f"{head}\n\n{render_markdown(block.blocks, folder)}\n</details>\n"
-    image = ""
     match block:
-        case Heading(text, level):
-            made = f"{'#' * level} {text}\n"
-        case Text(text, note):
-            made = f"> **Note:** {text}\n" if note else f"{text}\n"
-        case Items(items):
-            made = "".join(f"- {item}\n" for item in items)
-        case PageTable(caption=caption):
-            made = (f"**{caption}**\n\n" if caption else "") + to_markdown(block)
+        case Details(summary, inside):
+            head = f"<details><summary>{html.escape(summary)}</summary>"
+            return f"{head}\n\n{render_markdown(inside, folder)}\n</details>\n"
         case Picture(caption=caption):
-            image, made = f"{_image(block, folder)}\n\n", f"*{caption}*\n"
-    return image + made.replace("<", "&lt;")
+            return f"{_image(block, folder)}\n\n*{_plain(caption)}*\n"
+        case PageTable(caption=caption):
+            return _plain((f"**{caption}**\n\n" if caption else "") + to_markdown(block))
+    return f"{_plain(block)}\n"
+
+
+def _plain(text: str) -> str:
+    """Markdown without HTML."""
+    return text.replace("<", "&lt;")
 
 
 def to_markdown(table: PageTable) -> str:
@@ -193,7 +174,7 @@ def _image(picture: Picture, folder: Path | None) -> str:
     """A link to a picture, or the picture itself."""
     said = re.sub(r"[`*\[\]]", "", picture.caption)
     if folder is None:
-        return f"![{said.replace('<', '&lt;')}]({picture.path})"
+        return f"![{_plain(said)}]({picture.path})"
     data = base64.b64encode((folder / picture.path).read_bytes()).decode("ascii")
     return f'<img alt="{html.escape(said)}" src="data:image/png;base64,{data}">'
 

@@ -22,7 +22,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -52,26 +52,16 @@ ROUNDS, ENOUGH_S = (1, 2, 5, 10), 5.0
 PROCEDURE = "all instances in a row"
 
 
+#: Cells of a `TimingRow` that one call fills.
+Told = dict[str, Any]
+
+
 class Job(NamedTuple):
     """A method that is timed, in one regime."""
 
     method: str
     regime: str
     settings: Settings
-
-
-class Call(NamedTuple):
-    """One call of a method: its answer, its wall-clock seconds, and what was so when it ended.
-
-    Attributes:
-        load_average: of the machine.
-        peak_memory_mib: the most that the method's process has held so far; None if the process died.
-    """
-
-    solution: Solution
-    seconds: float | None
-    load_average: float
-    peak_memory_mib: float | None = None
 
 
 def bench(
@@ -165,7 +155,7 @@ def _turn(
     calls = _ask(pool, case, job, warm_up, instances)
     for instance, call in zip([warm_up, *instances], calls, strict=True):
         number = WARM_UP if instance is warm_up else row.round
-        yield _timed_row(dataclasses.replace(row, round=number, instance=instance.id), call)
+        yield dataclasses.replace(row, round=number, instance=instance.id, **call)
 
 
 def measure(case: Case, job: Job, path: Path) -> list[TimingRow]:
@@ -211,38 +201,36 @@ def _run_id(
     return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
-def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequence[Instance]) -> list[Call]:
+def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequence[Instance]) -> list[Told]:
     """Warm-up and answers; where the process died, instance by instance, to find which one kills it."""
     ((_, answer),) = pool.imap([(timed_turn, (case, *job, warm_up, tuple(instances)))], [None])
     if isinstance(answer, list):
         return answer
     if len(instances) == 1:
-        return [Call(failed(answer), None, os.getloadavg()[0])] * 2
+        return [_told(failed(answer))] * 2
     single = [_ask(pool, case, job, warm_up, [instance]) for instance in instances]
     return [single[0][0], *(call for _, call in single)]
 
 
-def _timed_row(row: TimingRow, call: Call) -> TimingRow:
-    """A row with what a call told."""
-    solution = call.solution
-    return dataclasses.replace(
-        row,
-        status=str(solution.status),
-        build_s=solution.build_s,
-        setup_s=solution.setup_s,
-        solve_s=solution.solve_s,
-        call_s=call.seconds,
-        load_average=call.load_average,
-        peak_memory_mib=call.peak_memory_mib,
-        error="" if solution.schedule is not None else solution.error or solution.status.sentence,
-        solver_version=solution.solver_version,
-        date=now(),
-    )
+def _told(solution: Solution, seconds: float | None = None, peak_memory: float | None = None) -> Told:
+    """What a call that has just ended tells of its row; `peak_memory` of its process, None if that died."""
+    return {
+        "status": str(solution.status),
+        "build_s": solution.build_s,
+        "setup_s": solution.setup_s,
+        "solve_s": solution.solve_s,
+        "call_s": seconds,
+        "load_average": os.getloadavg()[0],
+        "peak_memory_mib": peak_memory,
+        "error": "" if solution.schedule is not None else solution.error or solution.status.sentence,
+        "solver_version": solution.solver_version,
+        "date": now(),
+    }
 
 
 def timed_turn(
     case: Case, method: str, regime: str, settings: Settings, warm_up: Instance, instances: Sequence[Instance]
-) -> list[Call]:
+) -> list[Told]:
     """Answer the warm-up instance and then all others, in this process; a call that fails is an answer, too.
 
     Garbage is collected between the calls; what the method keeps is not gone through each time, since that
@@ -251,14 +239,14 @@ def timed_turn(
     try:
         solve = prepared(case, method, regime, settings)
     except Exception as error:
-        return [Call(failed(error), None, os.getloadavg()[0])] * (1 + len(instances))
+        return [_told(failed(error))] * (1 + len(instances))
     gc.unfreeze()
     first = timed(solve, warm_up)
     gc.freeze()
     return [first, *(timed(solve, instance) for instance in instances)]
 
 
-def timed(solve: Solver, instance: Instance) -> Call:
+def timed(solve: Solver, instance: Instance) -> Told:
     """Answer one instance and time the whole call, without the garbage collector."""
     gc.collect()
     gc.disable()
@@ -269,10 +257,10 @@ def timed(solve: Solver, instance: Instance) -> Call:
         if solution.solve_s is None:  # a method that does not time itself is timed as a whole
             solution = dataclasses.replace(solution, solve_s=elapsed)
     except Exception as error:  # the boundary to other people's methods: a failure is a row
-        return Call(failed(error), None, os.getloadavg()[0], _peak_memory_mib())
+        return _told(failed(error), None, _peak_memory_mib())
     finally:
         gc.enable()
-    return Call(solution, elapsed, os.getloadavg()[0], _peak_memory_mib())
+    return _told(solution, elapsed, _peak_memory_mib())
 
 
 def _peak_memory_mib() -> float:

@@ -11,10 +11,8 @@ import pandas as pd
 from ded_bench.report.columns import Column
 from ded_bench.report.page import (
     Details,
-    Heading,
     PageTable,
     Picture,
-    Text,
     write_page,
 )
 from tests.reading import Page
@@ -28,8 +26,8 @@ COLUMNS = (Column("regime", "Regime"), Column("x", "x_1 (%)"), Column("n", "n"),
 def test_a_page_is_written_twice_and_its_tables_too(tmp_path: Path) -> None:
     (tmp_path / "p.png").write_bytes(b"picture")
     table = PageTable(FRAME, COLUMNS, "caption", "numbers")
-    folded = Details("more & <more>", (Heading("Folded", 3), Text("a <b> c"), table))
-    blocks = [Heading("A <title>", 1), Text("**bold** & `code`"), Picture("p.png", "a `picture`"), folded]
+    folded = Details("more & <more>", ("### Folded", "a <b> c", table))
+    blocks = ["# A <title>", "**bold** & `code`", Picture("p.png", "a `picture`"), folded]
     written = write_page(blocks, tmp_path, "page")
     assert [path.name for path in written] == ["p.png", "numbers.csv", "page.md", "page.html"]
     assert pd.read_csv(written[1])["n"].to_list() == [1, 2, 3]

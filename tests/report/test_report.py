@@ -177,7 +177,7 @@ def test_the_page_needs_nothing_else(report, finished: Path) -> None:
 
 def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
     text = (finished / "report.md").read_text()
-    assert cells(text, "## Training of the policies")[0][:3] == ["ded-dpc-TO", "124", "7"]
+    assert cells(text, "## Training")[0][:3] == ["ded-dpc-TO", "124", "7"]
     made = pd.read_csv(finished / "tables" / "provenance.csv").set_index(["regime", "method"])
     assert made.loc[("TO", "ded-ko"), "made_with"] == "koopman@1"
 

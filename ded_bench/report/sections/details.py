@@ -19,7 +19,7 @@ from ded_bench.report.columns import (
     TIMING,
     TRAINING,
 )
-from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
+from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, usual_first
 from ded_bench.report.sections.opening import idealisation, rows_caption
 from ded_bench.report.sources import Sources, trainings
 from ded_bench.run.environment import environment, now
@@ -53,32 +53,33 @@ def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
         f"{idealisation(sources.case)}: shares of all rows" + f". {OTHERS}" * bool(others)
     )
     table = PageTable(overview, (*DETAIL, *others), caption, "summary")
-    return [Heading("Each method in detail"), *usual_first(table, usual)]
+    return ["## Each method in detail", *usual_first(table, usual)]
 
 
 def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """Default settings in sight, all others folded away."""
-    made: list[Block] = [Text("No method was timed alone yet; run `ded-bench bench`.")]
+    made: list[Block] = ["No method was timed alone yet; run `ded-bench bench`."]
     if len(sources.timing):
         timing = titled(pd.concat([rows for *_, rows in groups(sources.timing)]))
         caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
         made = usual_first(PageTable(timing, TIMING, caption), timing["settings"] == DEFAULT)
-    return [Heading("Times"), *made]
+    return ["## Times", *made]
 
 
 def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
-    """How policies were trained, and their certificates."""
-    frame = trainings(sources.results.paths.policies)
-    made: list[Block] = [Heading("Training of the policies")]
+    """How policies and models were trained, and certificates."""
+    paths = sources.results.paths
+    frame = trainings((*paths.policies, *paths.models))
+    made: list[Block] = ["## Training"]
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()
         columns = tuple(column for column in TRAINING if filled[column.name])
         made.append(PageTable(frame, columns, "", "training"))
     else:
-        made.append(Text("The folder holds no policy; `ded-bench train-dpc` trains one."))
-    made.append(Heading("Certificate"))
+        made.append("The folder holds no policy or model; `ded-bench train-dpc` and `train-ko` make some.")
+    made.append("## Certificate")
     if not sources.certificates:
-        return [*made, Text("No certificate was made for these results; `ded-bench certify` makes one.")]
+        return [*made, "No certificate was made for these results; `ded-bench certify` makes one."]
     certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in sources.certificates]))
     return [*made, PageTable(certificates, CERTIFICATE, "All that makes them up stands in certificate.json")]
 
@@ -89,10 +90,10 @@ def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list
     if not len(own):
         return []
     caption = "Methods in the closed loop at their own latency, forecasts as announced"
-    explained = folded("How to read the closed loop", Items(CLOSED_LOOP))
+    explained = folded("How to read the closed loop", bullets(CLOSED_LOOP))
     table = PageTable(own, ONLINE, caption, "online_methods")
     pictured = pictures["online"] if sources.case.slack else ()  # of an island it stands beside practice
-    return [Heading("The closed loop"), table, *explained, *pictured]
+    return ["## The closed loop", table, *explained, *pictured]
 
 
 def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
@@ -121,7 +122,7 @@ def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
         f"This report was written {now()} with: {here}.",
     )
     whole = folded("Versions, surrogates and policies of every line", table)
-    return [Heading("What made the rows"), *whole, Items(items)]
+    return ["## What made the rows", *whole, bullets(items)]
 
 
 def _listed(values: pd.Series[str]) -> str:

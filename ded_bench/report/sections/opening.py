@@ -16,7 +16,7 @@ from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import ISLAND, OUTCOME, PRACTICE, TABLE_V, TABLE_VI, tabulate
-from ded_bench.report.page import Block, Heading, Items, PageTable, Picture, Text, folded, usual_first
+from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, usual_first
 from ded_bench.report.sources import Sources
 
 #: How the tables are to be read.
@@ -57,19 +57,19 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
     notes = (*_problems(sources), *_makers(sources), *sources.notes)
     return [
-        Heading(f"Dynamics-aware economic dispatch on {case.id}", 1),
-        Text(what),
-        *(Text(text, note=True) for text in alarms(sources)),
-        Items(tuple(said)),
+        f"# Dynamics-aware economic dispatch on {case.id}",
+        what,
+        *(f"> **Note:** {text}" for text in alarms(sources)),
+        bullets(said),
         *pictures["tradeoff"],
         *usual_first(PageTable(found, OUTCOME, _methods_caption(sources), "methods"), usual),
         *_on_island(sources),
         *_in_operation(sources),
         *(pictures["online"] if case.slack is None else ()),
         *(block for table in papers for block in _beside_paper(table)),
-        *folded("What is missing or mixed", *[Items(notes)] * bool(notes)),
-        *folded("How to read the tables", Items(EXPLANATION)),
-        Heading("Schedules and frequencies"),
+        *folded("What is missing or mixed", *[bullets(notes)] * bool(notes)),
+        *folded("How to read the tables", bullets(EXPLANATION)),
+        "## Schedules and frequencies",
         *pictures["schedules"],
     ]
 

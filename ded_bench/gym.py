@@ -17,15 +17,15 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import Plant, PlantState, SimulationError, as_plant, servable
-from ded_bench.plants.score import AGC_COLUMN, Score, judge
+from ded_bench.plants.plant import Plant, SimulationError, as_plant, servable
+from ded_bench.plants.score import judge
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import LARGEST_DEVIATION_HZ, Instance, State
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.run.online.loop import History
 
 Observed = dict[str, NDArray[np.float32]]
 
@@ -86,7 +86,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         largest_hz = self.case.regimes[regime].largest_hz
         self.price = step_cost / largest_hz if price is None else price
         self.action_space = Box(-1.0, 1.0, (len(self.case.generators),), np.float32)
-        seen = self.plant.observed(self._drawn(POLICY_SEED)[1])
+        seen = self.plant.observed(self._drawn(POLICY_SEED)[1].state)
         ends = _ends(self.case, seen)
         self._spaces: dict[str, Any] = {
             name: Box(low.astype(np.float32), high.astype(np.float32)) for name, (low, high) in ends.items()
@@ -111,18 +111,11 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             given.check_case(self.case)
         master = POLICY_SEED + int(self.np_random.integers(VALIDATION_SEED - POLICY_SEED))
         self.instance: Instance
-        self._state: PlantState
-        self.instance, self._state = (
-            self._drawn(master) if given is None else (given, self.plant.initial(given))
-        )
-        instance, n_gen = self.instance, len(self.case.generators)
-        self._cost = instance.cost_gen(self.case), instance.cost_slack(self.case)
-        self._loads, self._now = instance.p_load(self.case), 0
-        self._omega, self._p_set, self._p_gen = np.zeros((3, instance.steps + 1, n_gen))
-        self._p_slack, self._agc = np.zeros((2, instance.steps + 1))
-        self._p_set[0] = instance.p_initial(self.case)
+        self._run: History
+        self.instance, self._run = self._drawn(master) if given is None else (given, self._begun(given))
+        self._cost = self.instance.cost_gen(self.case), self.instance.cost_slack(self.case)
         self._knots = [0]
-        return self._observation(), {"instance": instance}
+        return self._observation(), {"instance": self.instance}
 
     def step(self, action: NDArray[np.floating]) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Move the set-points for a second.
@@ -130,52 +123,53 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         Raises:
             InputError: the action is no number for each generator, or the episode has ended.
         """
-        first, last = self._now, min(self._now + self._points, self.instance.steps)
+        run = self._run
+        first, last = run.now, min(run.now + self._points, self.instance.steps)
         if first == last:
             raise InputError("step", "", "the episode has ended: reset the environment")
         if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
             raise InputError("action", "", f"must be finite, of the shape {self.action_space.shape}")
-        grid, k = self.instance.grid, slice(first, last + 1)
-        power = np.stack([self._p_set[first], self._moved(np.asarray(action, dtype=np.float64), first, last)])
-        p_set = Schedule(grid[[first, last]], power).at(grid[k])
+        grid = self.instance.grid
+        power = np.stack([run.p_set[first], self._moved(np.asarray(action, dtype=np.float64), first, last)])
+        p_set = Schedule(grid[[first, last]], power).at(grid[first : last + 1])
         ended = last == self.instance.steps
         info: dict[str, Any] = {"instance": self.instance}
         try:
-            piece = self.plant.advance(self._state, p_set, self._loads[k], self.instance.dt_s)
+            run.go_on(p_set)
         except SimulationError as error:
             left = -((first - self.instance.steps) // self._points)
             info |= {"cost": LARGEST_DEVIATION_HZ, "error": str(error)}
             return self._observation(), -left * self.price * LARGEST_DEVIATION_HZ, True, False, info
-        self._omega[k], self._p_set[k], self._p_gen[k] = piece.omega, p_set, piece.p_gen
-        self._p_slack[k], self._state, self._now = piece.p_slack, piece.end, last
-        self._agc[k] = self.plant.columns(piece.states).get(AGC_COLUMN, 0.0)
         self._knots.append(last)
         new = slice(first + bool(first), last + 1)
-        cost = float((self._p_gen[new] @ self._cost[0] + self._cost[1] * np.abs(self._p_slack[new])).sum())
-        excess = max(_counting(self._bounds, ended).excess_hz(self._omega[new]).values())
+        cost = float((run.p_gen[new] @ self._cost[0] + self._cost[1] * np.abs(run.p_slack[new])).sum())
+        excess = max(_counting(self._bounds, ended).excess_hz(run.omega[new]).values())
         info["cost"] = excess
         if ended:
             info |= {
-                "score": self._score(),
-                "schedule": Schedule(grid[self._knots], self._p_set[self._knots]),
+                "score": judge(self.case, self.instance, run.trajectory(), self.regime),
+                "schedule": Schedule(grid[self._knots], run.p_set[self._knots]),
             }
         return self._observation(), -cost - self.price * excess, ended, False, info
 
-    def _drawn(self, master: int) -> tuple[Instance, PlantState]:
+    def _begun(self, instance: Instance) -> History:
+        return History(self.case, self.plant, instance, instance.grid, instance.p_load(self.case))
+
+    def _drawn(self, master: int) -> tuple[Instance, History]:
         """The first draw that the plant, which need not be the case's own, can begin with."""
         for instance in sample_instances(self.case, master, ATTEMPTS, servable=servable):
             with contextlib.suppress(SimulationError):
-                return instance, self.plant.initial(instance)
+                return instance, self._begun(instance)
         raise InputError(f"case {self.case.id}", "plant", f"{self.plant.name} can begin with no draw")
 
     def _moved(self, action: Array, first: int, last: int) -> Array:
         """Set-points at the end of a step, (n_gen,), pu."""
-        case, before = self.case, self._p_set[first]
+        case, before = self.case, self._run.p_set[first]
         reach = case.ramp * (last - first) * self.instance.dt_s
         wanted = np.clip(before + np.clip(action, -1.0, 1.0) * reach, case.p_min, case.p_max)
         power = before + np.clip(wanted - before, -reach, reach)
         # Until the end of the next step, so that the limit is kept between the ends of steps, too.
-        ahead = self._loads[first : last + self._points + 1]
+        ahead = self._run.p_load[first : last + self._points + 1]
         for row, by_load, limit in zip(*case.transfer_rows, strict=True):
             over = row @ power + (ahead @ by_load).max() - limit
             room = row * np.maximum(power - np.maximum(before - reach, case.p_min), 0.0)
@@ -184,24 +178,17 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         return np.asarray(power)
 
     def _observation(self) -> Observed:
-        instance, seen = self.instance, self.plant.observed(self._state)
-        ahead = np.minimum(self._now + np.round(AHEAD_S / instance.dt_s).astype(int), instance.steps)
+        instance, run, seen = self.instance, self._run, self.plant.observed(self._run.state)
+        ahead = np.minimum(run.now + np.round(AHEAD_S / instance.dt_s).astype(int), instance.steps)
         found = {
-            "time": np.array([self._now / instance.steps]),
-            "p": self._p_set[self._now],
-            "forecast": self._loads[ahead],
+            "time": np.array([run.now / instance.steps]),
+            "p": run.p_set[run.now],
+            "forecast": run.p_load[ahead],
             "cost": np.array([instance.cost[name] for name in self.case.priced]),
             **_seen(seen),
         }
         spaces = self._spaces.items()
         return {name: np.clip(found[name], s.low, s.high).astype(np.float32) for name, s in spaces}
-
-    def _score(self) -> Score:
-        """Of the whole episode, as the scorer judges it: pieces are the whole to the last bit."""
-        instance, columns = self.instance, {} if self.case.agc is None else {AGC_COLUMN: self._agc}
-        run = self._omega, self._p_set, self._p_gen, self._loads, self._p_slack
-        trajectory = Trajectory(instance.grid, *run, self.case, columns=columns)
-        return judge(self.case, instance, trajectory, self.regime)
 
 
 def _counting(bounds: Bounds, ended: bool) -> Bounds:

@@ -99,11 +99,11 @@ def test_seeds_say_which_training_draws_come(env: DispatchEnv) -> None:
 def test_full_ramps_lead_to_the_limits(env: DispatchEnv) -> None:
     """And no further; nothing else is accepted as an action."""
     env.reset(seed=1, options={"instance": env.reset(seed=1)[1]["instance"]})
-    start, case = env._p_set[0].copy(), env.case
+    start, case = env._run.p_set[0].copy(), env.case
     env.step(np.ones(len(start)))
     if not case.transfers:
         np.testing.assert_allclose(
-            env._p_set[env._now], np.minimum(start + case.ramp, case.p_max), atol=1e-12
+            env._run.p_set[env._run.now], np.minimum(start + case.ramp, case.p_max), atol=1e-12
         )
     for wrong in (np.full(len(start), np.nan), np.zeros(len(start) + 1)):
         with pytest.raises(InputError, match="action: must be finite, of the shape"):
@@ -116,9 +116,9 @@ def test_a_transfer_limit_holds() -> None:
     env.reset(seed=2)
     for _ in range(30):
         env.step(np.ones(4))
-    done = slice(env._now + 1)
-    assert env.case.transfer_excess(env._p_set[done], env._loads[done]).max() < 1e-12
-    assert (env._p_set[done] <= env.case.p_max).all()
+    done = slice(env._run.now + 1)
+    assert env.case.transfer_excess(env._run.p_set[done], env._run.p_load[done]).max() < 1e-12
+    assert (env._run.p_set[done] <= env.case.p_max).all()
 
 
 def test_the_loop_says_the_same() -> None:
@@ -130,7 +130,7 @@ def test_the_loop_says_the_same() -> None:
     scenario = as_scenario(case, info["instance"])
     plans = iter([Planned(info["schedule"])])
     outcome = run_loop(case, scenario, lambda *_: next(plans, Planned(None)), LoopOptions())
-    np.testing.assert_array_equal(outcome.trajectory.omega, env._omega)
+    np.testing.assert_array_equal(outcome.trajectory.omega, env._run.omega)
     judged = judge_operation(case, scenario, outcome.trajectory, "TO")
     assert judged.objective == info["score"].objective
     assert judged.max_excess_hz == info["score"].freq_violation_hz

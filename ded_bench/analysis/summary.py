@@ -85,15 +85,6 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
     return line_table(rows, [*HEAD, *statistics(frame[:0])])
 
 
-def island_summary(frame: pd.DataFrame) -> pd.DataFrame:
-    """Every line's `statistics`, and means of what rows of islands say of frequencies (mHz) and AGC (pu)."""
-    rows = []
-    for regime, key, group in groups(frame):
-        means = {name: scale * group[column].mean() for name, (column, scale) in ISLAND.items()}
-        rows.append(head(regime, key) | statistics(group) | means)
-    return line_table(rows, [*HEAD, *statistics(frame[:0]), *ISLAND])
-
-
 def statistics(group: pd.DataFrame) -> dict[str, Any]:
     """Counts, rates and spreads of rows with their gaps (see `summary`); missing where there are no rows."""
     paired = group.dropna(subset=["gap_percent"])
@@ -153,7 +144,8 @@ def outcome(frame: pd.DataFrame, timing: pd.DataFrame | None = None) -> pd.DataF
 
     Of `rows`, `solved` have a score and `feasible` keep every limit; `largest` is the largest violation.
     `seconds` is the median of the timing table where it has the line (`alone` is true), else that
-    of the results table, taken under parallel load.
+    of the results table, taken under parallel load. Islands have means of what their rows say of frequencies
+    (mHz) and AGC (pu).
     """
     loaded = frame.groupby(GROUP)["solve_s"].median()
     alone = (loaded if timing is None else timing.set_index(GROUP)["solve_s"]).dropna()
@@ -166,4 +158,6 @@ def outcome(frame: pd.DataFrame, timing: pd.DataFrame | None = None) -> pd.DataF
     seconds: Any = np.where(measured, alone.reindex(keys), loaded.reindex(keys)) if len(found) else []
     found = found.assign(gap_percent=found["gap_percent_mean"], seconds=seconds, alone=measured)
     counts = ("n", "rows", "solved", "feasible", "correct_rate")
-    return found[[*HEAD, *counts, "gap_percent", "largest", "seconds", "alone"]]
+    for name, (column, scale) in ISLAND.items():
+        found[name] = [scale * group[column].mean() for *_, group in groups(frame)]
+    return found[[*HEAD, *counts, "gap_percent", "largest", "seconds", "alone", *ISLAND]]

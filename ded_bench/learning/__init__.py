@@ -1,9 +1,9 @@
 """For those who train: a split as arrays, simulation in batches, linear maps, and a differentiable layer.
 
 `split_arrays`, `simulate_many`, `linearise` and `condense` need NumPy only; `simulated` and
-`cost_and_excess`, which PyTorch differentiates, need the extra `train`, and are imported when first asked
-for. `casadi_model` has the equations for optimisers, `export_programs` writes the linear programs of a closed
-loop.
+`cost_and_excess`, which PyTorch differentiates, need the extra `train`. `casadi_model` has
+the equations for optimisers, `export_programs` writes the linear programs of a closed loop.
+Each is imported when first asked for.
 """
 
 from __future__ import annotations
@@ -11,22 +11,35 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ded_bench import simulate_many as simulate_many
-from ded_bench.learning.casadi_expressions import CasadiModel as CasadiModel
-from ded_bench.learning.casadi_expressions import casadi_model as casadi_model
-from ded_bench.learning.linear_maps import CondensedMap as CondensedMap
-from ded_bench.learning.linear_maps import condense as condense
-from ded_bench.learning.linear_maps import linearise as linearise
-from ded_bench.learning.linear_programs import export_programs as export_programs
-from ded_bench.learning.splits import SplitArrays as SplitArrays
-from ded_bench.learning.splits import split_arrays as split_arrays
-
 if TYPE_CHECKING:
+    from ded_bench.learning.casadi_expressions import CasadiModel as CasadiModel
+    from ded_bench.learning.casadi_expressions import casadi_model as casadi_model
     from ded_bench.learning.differentiable import cost_and_excess as cost_and_excess
     from ded_bench.learning.differentiable import simulated as simulated
+    from ded_bench.learning.linear_maps import CondensedMap as CondensedMap
+    from ded_bench.learning.linear_maps import condense as condense
+    from ded_bench.learning.linear_maps import linearise as linearise
+    from ded_bench.learning.linear_programs import export_programs as export_programs
+    from ded_bench.learning.splits import SplitArrays as SplitArrays
+    from ded_bench.learning.splits import split_arrays as split_arrays
+
+_HOMES = {
+    "CasadiModel": "ded_bench.learning.casadi_expressions",
+    "CondensedMap": "ded_bench.learning.linear_maps",
+    "SplitArrays": "ded_bench.learning.splits",
+    "casadi_model": "ded_bench.learning.casadi_expressions",
+    "condense": "ded_bench.learning.linear_maps",
+    "cost_and_excess": "ded_bench.learning.differentiable",
+    "export_programs": "ded_bench.learning.linear_programs",
+    "linearise": "ded_bench.learning.linear_maps",
+    "simulate_many": "ded_bench",
+    "simulated": "ded_bench.learning.differentiable",
+    "split_arrays": "ded_bench.learning.splits",
+}
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in ("cost_and_excess", "simulated"):
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module("ded_bench.learning.differentiable"), name)
+    return getattr(importlib.import_module(_HOMES[name]), name)

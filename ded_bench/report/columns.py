@@ -122,20 +122,13 @@ OUTCOME = (
     Column("largest", "largest violation"),
     Column("seconds", "median time", "s"),
 )
-#: On islands, of `summary.island_summary`.
+#: Beside it, of islands.
 ISLAND = (
-    *_HEAD,
     Column("mean_peak_mhz", "peak of the mean frequency", "mHz", ".2f"),
     Column("mean_rms_mhz", "its rms", "mHz", ".2f"),
     Column("swing_peak_mhz", "largest swing", "mHz", ".2f"),
     Column("agc_travel_pu", "AGC travel", "pu", ".2f"),
-    Column("gap_percent_mean", "cost over the reference", "%", ".3f"),
-    Column("correct_rate", "feasible (verified)", form=".1%"),
-    N,
-    FAILURES,
 )
-
-
 #: Of `summary.summary`, whose file has the spreads of violations, too.
 DETAIL = (
     *(*_HEAD, ROWS, N, FAILURES, Column("unpaired", "without reference")),
@@ -154,15 +147,6 @@ OTHER_RATES = (
     Column("carried", "carried", value=lambda x: f"{x['validated_n']} of {x['validated_asked']}"),
     Column("confirmed_rate", "confirmed by ANDES", form=".1%"),
     Column("refereed", "answered", value=lambda x: f"{x['confirmed_n']} of {x['confirmed_asked']}"),
-)
-PROVENANCE = (
-    *_HEAD,
-    ROWS,
-    Column("version", "ded-bench"),
-    Column("commit", "commit"),
-    Column("method_version", "method's version"),
-    Column("made_with", "surrogate and policy"),
-    Column("solver_version", "solver"),
 )
 TIMING = (
     *(*_HEAD, INSTANCES, Column("repeats", "repeats")),

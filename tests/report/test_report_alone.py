@@ -61,7 +61,7 @@ def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path) ->
 
 @pytest.mark.usefixtures("sketched")
 def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
-    """Means of rows, in mHz; beside a slack there is no such table."""
+    """Means of rows, in mHz."""
     case = Case.load(MIXED)
     facts = {"objective": 1.0, "feasible": True, "swing_max_hz": 0.001, "case": case.id, "plant": "detailed"}
     rows = [
@@ -80,7 +80,7 @@ def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
     ]
     Results(tmp_path).add(rows)
     write_report(case, tmp_path, tmp_path / "no-problems")
-    made = pd.read_csv(tmp_path / "tables" / "island.csv").iloc[0]
+    made = pd.read_csv(tmp_path / "tables" / "methods.csv").iloc[0]
     assert made[["mean_peak_mhz", "swing_peak_mhz", "agc_travel_pu"]].tolist() == pytest.approx(
         [5.0, 1.0, 2.0]
     )

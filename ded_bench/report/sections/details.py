@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 
 import pandas as pd
 
-from ded_bench.analysis.lines import HEAD, groups, head, titled
+from ded_bench.analysis.lines import groups, titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.columns import (
@@ -15,7 +14,6 @@ from ded_bench.report.columns import (
     DETAIL,
     ONLINE,
     OTHER_RATES,
-    PROVENANCE,
     TIMING,
     TRAINING,
 )
@@ -97,14 +95,8 @@ def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list
 
 
 def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
-    """Versions of every line folded away; machines and versions in sight."""
+    """Machines, versions, models and policies."""
     rows = sources.rows
-    names = ("version", "commit", "method_version", "made_with", "solver_version")
-    lines = [
-        head(regime, key) | {"rows": len(group)} | {name: _listed(group[name]) for name in names}
-        for regime, key, group in groups(sources.judged)
-    ]
-    table = PageTable(pd.DataFrame(lines, columns=[*HEAD, "rows", *names]), PROVENANCE, "", "provenance")
 
     def distinct(name: str) -> str:
         return "; ".join(sorted({str(value) for value in rows[name] if value})) or "–"
@@ -117,17 +109,10 @@ def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
         f"Rows: {', '.join(f'{count} on {name} instances' for name, count in counts.items()) or 'none'}.",
         f"Rows made: {dates[0]} to {dates[-1]}; problem version: {distinct('problems_version')}.",
         f"Hosts of the rows: {distinct('host')}; parallel workers: {distinct('workers')}, one thread each.",
-        f"Versions of ded-bench: {distinct('version')}; solvers: {distinct('solver_version')}.",
+        f"Versions of ded-bench: {distinct('version')}; commits: {distinct('commit')}; "
+        f"solvers: {distinct('solver_version')}.",
+        f"Surrogates and policies: {distinct('made_with')}.",
         f"Master seeds of the instances: {', '.join(masters) or '–'}.",
         f"This report was written {now()} with: {here}.",
     )
-    whole = folded("Versions, surrogates and policies of every line", table)
-    return ["## What made the rows", *whole, bullets(items)]
-
-
-def _listed(values: pd.Series[str]) -> str:
-    """Distinct values, the most frequent first; with their numbers, if there are several."""
-    counts = Counter(str(value) for value in values)
-    if len(counts) == 1:
-        return next(iter(counts))
-    return ", ".join(f"{value or 'unknown'} × {count}" for value, count in counts.most_common())
+    return ["## What made the rows", bullets(items)]

@@ -10,7 +10,6 @@ from ded_bench.analysis.findings import findings, own_first
 from ded_bench.analysis.lines import records, title, titled
 from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.paper_numbers import Paper, result_lines
-from ded_bench.analysis.summary import island_summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
@@ -55,6 +54,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     said = [*findings(found, reference.title), *_against_paper([table.frame for table in papers])]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
+    columns = OUTCOME if case.slack else (*OUTCOME, *ISLAND)
     notes = (*_problems(sources), *_makers(sources), *sources.notes)
     return [
         f"# Dynamics-aware economic dispatch on {case.id}",
@@ -62,8 +62,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         *(f"> **Note:** {text}" for text in alarms(sources)),
         bullets(said),
         *pictures["tradeoff"],
-        *usual_first(PageTable(found, OUTCOME, _methods_caption(sources), "methods"), usual),
-        *_on_island(sources),
+        *usual_first(PageTable(found, columns, _methods_caption(sources), "methods"), usual),
         *_in_operation(sources),
         *(pictures["online"] if case.slack is None else ()),
         *(block for table in papers for block in _beside_paper(table)),
@@ -79,16 +78,6 @@ def idealisation(case: Case) -> str:
     if case.plant_name == "lossless":
         return "a lossless network with classical machines and an infinite slack"
     return f"full machine models, {'an island' if case.slack is None else 'with an infinite slack'}"
-
-
-def _on_island(sources: Sources) -> Iterator[PageTable]:
-    """What dispatch does to frequencies, secondary control and cost, where rows have it."""
-    if sources.case.slack is None and len(sources.judged):
-        caption = (
-            "What each dispatch does to an island's frequency, secondary control (AGC) and cost: means over "
-            f"{rows_caption(sources)}; feasible: within {ISLAND_HZ:g} Hz of every bound"
-        )
-        yield PageTable(tabulate(ISLAND, island_summary(sources.judged)), ISLAND, caption, "island")
 
 
 def _in_operation(sources: Sources) -> Iterator[PageTable]:

@@ -74,16 +74,25 @@ class _Course:
         return Schedule(times, self.schedule.at(times + (start - self.start) * self.dt))
 
 
-class _History:
-    """What a plant has done since t = 0, and where it is; grows piece by piece."""
+class History:
+    """What a plant has done since t = 0, and where it is; grows piece by piece.
 
-    def __init__(self, case: Case, scenario: Scenario, plant: Plant) -> None:
-        first, n = scenario.snapshot(case, 0.0), scenario.steps + 1
-        self._case, self._plant, self._grid, self._dt = case, plant, scenario.grid, scenario.dt_s
-        self.now, self.state = 0, plant.initial(first)
-        self.p_load = scenario.p_load(case)
-        self.omega, self.p_set, self.p_gen = np.empty((3, n, len(case.generators)))
-        self.p_slack, self.agc = np.empty((2, n))
+    Args:
+        case: the grid.
+        plant: what is operated.
+        first: how it begins.
+        grid: all times, (n,), s.
+        p_load: load injections at them, (n, n_load), pu.
+
+    Raises:
+        SimulationError: the plant cannot begin so.
+    """
+
+    def __init__(self, case: Case, plant: Plant, first: Instance, grid: Array, p_load: Array) -> None:
+        self._case, self._plant, self._grid, self._dt = case, plant, grid, first.dt_s
+        self.now, self.state, self.p_load = 0, plant.initial(first), p_load
+        self.omega, self.p_set, self.p_gen = np.empty((3, len(grid), len(case.generators)))
+        self.p_slack, self.agc = np.empty((2, len(grid)))
         self.p_set[0] = first.p_initial(case)
 
     def go_on(self, p_set: Array) -> None:
@@ -136,7 +145,8 @@ class _Loop:
         self.horizon, longest = case.sampling.horizon_s, max(options.period_s, options.horizon_s)
         if longest > self.horizon:
             self.horizon = math.ceil(longest / self.dt - WHOLE) * self.dt
-        self.history = _History(case, scenario, plant)
+        first, p_load = scenario.snapshot(case, 0.0), scenario.p_load(case)
+        self.history = History(case, plant, first, scenario.grid, p_load)
         power = self.history.p_set[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
         self.course, self.held = _Course(stay, 0, self.dt), False

@@ -200,7 +200,7 @@ def _power_flow(grid: MatpowerGrid) -> tuple[Complex, Complex]:
 def _units(
     grid: MatpowerGrid, dynamics: str | Path, known: dict[int, list[Dynamics]], generated: Complex
 ) -> list[Unit]:
-    """Machines in service; those of a bus share its reactive power by rating, its first one balances."""
+    """Machines in service; those of a bus share reactive power by rating, the reference's first balances."""
     by_bus: dict[int, list[Array]] = {}
     for row in grid.gen:
         by_bus.setdefault(int(row[0]), []).append(row)
@@ -214,7 +214,8 @@ def _units(
         if min(rating) <= 0:
             raise InputError(dynamics, "mva", f"is needed of the machine at bus {number}")
         p = [float(row[1]) / BASE_MVA for row in rows]
-        p[0] += float(total.real) - sum(p)
+        if number == grid.reference:  # elsewhere the power flow keeps them, but for round-off
+            p[0] += float(total.real) - sum(p)
         for k, (one, row) in enumerate(zip(own, rows, strict=False)):
             letter = string.ascii_lowercase[k] if len(rows) > 1 else ""
             power = complex(p[k], float(total.imag) * rating[k] / sum(rating))

@@ -5,16 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import ded_bench
+from ded_bench.analysis.matpower_case import imported
 from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.files.matpower import read_matpower
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import REPOSITORY, Case
 from tests.cli.command_line import refused
 
 GRID = "39bus"
+PUBLIC = REPOSITORY / "examples" / "grids"
 #: Two machines at a bus, another base than 100 MVA, a tap, a bus out of service, a machine switched off, rows
 #: on one line; at the machines' buses the power flow is to be found.
 SMALL = """function mpc = small
@@ -165,3 +168,28 @@ def test_what_is_read_of_a_file(tmp_path: Path) -> None:
     }
     with pytest.raises(InputError, match="cannot be read"):
         read_matpower(tmp_path / "none.m")
+
+
+@pytest.mark.parametrize(("name", "like"), [("ieee14", ["--like", "39bus"]), ("ieee39", [])])
+def test_public_grids_to_the_end_of_the_road(
+    name: str, like: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Imported, drawn, solved, reported; what static dispatch breaks `ded-slp` keeps."""
+    monkeypatch.chdir(tmp_path)
+    grid = PUBLIC / name
+    assert not main(["import", f"{grid}.m", "--dynamics", f"{grid}.csv", *like, "--out", name])
+    assert not main(["instances", "--case", name, "--count", "2", "--test", "1"])
+    assert not main(["solve", "--case", name, "--method", "ed,ded-slp", "--regime", "TO"])
+    rows = pd.read_csv(tmp_path / "results" / name / "results.csv").set_index("method")
+    assert rows["feasible"].to_dict() == {"ed": False, "ded-slp": True}
+    assert not main(["report", "--case", name])
+    assert "DED (SLP)" in (tmp_path / "results" / name / "report.md").read_text()
+
+
+def test_two_sources_of_new_england_agree() -> None:
+    """MATPOWER's has its reference elsewhere; the other machines are those of the shipped grid."""
+    case, shipped = imported(PUBLIC / "ieee39.m", PUBLIC / "ieee39.csv", "public"), Case.load("39bus")
+    assert set(case.generators) - set(shipped.generators) == {"g39"}
+    for name in set(case.generators) & set(shipped.generators):
+        own, other = case.machines[name], shipped.machines[name]
+        assert (own.m, own.p_nominal) == pytest.approx((other.m, other.p_nominal), rel=1e-3)

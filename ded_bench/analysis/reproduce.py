@@ -7,24 +7,23 @@ re-simulated. Rows that failed or ended by a time limit depend on the machine: t
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
-from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import registered
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.folder import search_folders
 from ded_bench.results.rows import Results, Row
 from ded_bench.results.timing import model_name
-from ded_bench.run.pool import Workers
-from ded_bench.run.tasks import Answered, Task, failed, make_tasks, solve_and_score
+from ded_bench.run.runner import run
+from ded_bench.run.tasks import Task, make_tasks
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import MODELS, TRAINED
 
@@ -39,6 +38,7 @@ class Sampled:
     """What came of the sample of one method, settings, surrogate and regime.
 
     Attributes:
+        tell: called with everything that differs or is skipped.
         rows: how many were solved again.
         skipped: what was not, and why: a sentence each.
         differences: a sentence for each row that differs.
@@ -50,6 +50,7 @@ class Sampled:
     settings: str
     model: str
     regime: str
+    tell: Callable[[str], None]
     rows: int = 0
     skipped: list[str] = field(default_factory=list)
     differences: list[str] = field(default_factory=list)
@@ -60,6 +61,11 @@ class Sampled:
     def name(self) -> str:
         """As its sentences call it."""
         return " ".join(filter(None, (self.method, self.settings, self.model, self.regime)))
+
+    def note(self, kind: list[str], sentence: str) -> None:
+        """Add a sentence to those of its kind."""
+        kind.append(sentence)
+        self.tell(f"{self.name}: {sentence}")
 
 
 def reproduce(
@@ -92,21 +98,17 @@ def reproduce(
             parts.setdefault(name, []).append(row)
     if not parts:
         raise InputError(results.path, "method", f"has no rows of {', '.join(methods) or case.id}")
-    lines = [Sampled(*name) for name in sorted(parts)]
+    lines = [Sampled(*name, on_sentence) for name in sorted(parts)]
     tasks: list[tuple[Sampled, Row, Task]] = []
     for line in lines:
         chosen = _sample(line, parts[line.method, line.settings, line.model, line.regime], instances, sample)
         tasks += [
             (line, row, task) for row in chosen if (task := _task(case, line, row, instances, results.folder))
         ]
-        for sentence in line.skipped:
-            on_sentence(f"{line.name}: {sentence}")
-    calls = [(solve_and_score, (case, task, row.plant)) for _, row, task in tasks]
-    with Workers(workers) as pool, tqdm(total=len(tasks), unit="row", disable=None, desc="reproduce") as bar:
-        for (line, row, _), answer in pool.imap(calls, tasks):
-            for sentence in _compared(line, row, answer):
-                on_sentence(f"{line.name}: {sentence}")
-            bar.update()
+    with tempfile.TemporaryDirectory(prefix="ded-bench-") as folder:
+        solved = run(case, [task for *_, task in tasks], Results(folder), workers)
+    for (line, row, _), again in zip(tasks, solved, strict=True):
+        _compare(line, row, again)
     return lines
 
 
@@ -115,10 +117,10 @@ def _sample(line: Sampled, rows: Sequence[Row], instances: Mapping[str, Instance
     unlike = [r for r in rows if r.objective is None or r.status in (Status.TIME_LIMIT, Status.FAILED)]
     if unlike:
         named = ", ".join(row.instance for row in unlike[:5]) + (", …" if len(unlike) > 5 else "")
-        line.skipped.append(f"{len(unlike)} of {len(rows)} rows failed or ended by a limit ({named})")
+        line.note(line.skipped, f"{len(unlike)} of {len(rows)} rows failed or ended by a limit ({named})")
     known = sorted((r for r in rows if r not in unlike and r.instance in instances), key=lambda r: r.key[1:7])
     if not known and len(unlike) < len(rows):
-        line.skipped.append("its instances are unknown here")
+        line.note(line.skipped, "its instances are unknown here")
     return random.Random(f"{SEED} {line.name}").sample(known, min(count, len(known)))
 
 
@@ -127,10 +129,10 @@ def _task(
 ) -> Task | None:
     """The task that makes a row; None, and noted why, if the folder has not what made it."""
     if line.method not in registered():
-        line.skipped.append(f"{row.instance}: no method has this name")
+        line.note(line.skipped, f"{row.instance}: no method has this name")
         return None
     if line.model not in ("", *MODELS):
-        line.skipped.append(f"{row.instance}: made with a model of its own ({row.model})")
+        line.note(line.skipped, f"{row.instance}: made with a model of its own ({row.model})")
         return None
     search = search_folders(case, folder)
     settings = Settings(line.settings, line.model, time_limit_s=row.time_limit_s, search=search)
@@ -139,37 +141,31 @@ def _task(
             case, [(instances[row.instance], row.split)], [line.method], [line.regime], settings
         )
     except InputError as error:
-        line.skipped.append(f"{row.instance}: {error}")
+        line.note(line.skipped, f"{row.instance}: {error}")
         return None
     if task.key.policy != row.policy or (line.model in TRAINED and task.key.model != row.model):
-        line.skipped.append(f"{row.instance}: its {row.policy or row.model} is not the one in {folder}")
+        line.note(line.skipped, f"{row.instance}: its {row.policy or row.model} is not the one in {folder}")
         return None
     return task
 
 
-def _compared(line: Sampled, row: Row, answer: object) -> Iterator[str]:
-    """Note one answer; yields a sentence if it is not that of the row."""
-    solution, verdict = answer[:2] if isinstance(answer, Answered) else (failed(answer), None)
-    if solution.status == Status.TIME_LIMIT:
-        line.skipped.append(f"{row.instance}: ended by its limit this time")
-        yield line.skipped[-1]
+def _compare(line: Sampled, row: Row, again: Row) -> None:
+    """Note whether a row that was solved again is as before."""
+    if again.status == Status.TIME_LIMIT:
+        line.note(line.skipped, f"{row.instance}: ended by its limit this time")
         return
     line.rows += 1
-    if not isinstance(verdict, Score) or row.objective is None or row.freq_violation_hz is None:
-        reason = verdict or solution.error or solution.status.sentence
-        line.differences.append(f"{row.instance}: no score this time ({reason})")
+    numbers = (getattr(r, name) for r in (row, again) for name in ("objective", "freq_violation_hz"))
+    objective, hz, objective_now, hz_now = numbers
+    if objective_now is None:
+        line.note(line.differences, f"{row.instance}: no score this time ({again.error or again.status})")
         line.objective = float("inf")
-        yield line.differences[-1]
         return
-    relative = abs(verdict.objective / row.objective - 1) if row.objective else abs(verdict.objective)
-    hz = abs(verdict.freq_violation_hz - row.freq_violation_hz)
-    line.objective, line.hz = max(line.objective, relative), max(line.hz, hz)
-    if relative > OBJECTIVE_RELATIVE or hz > VIOLATION_HZ:
-        line.differences.append(
-            f"{row.instance}: objective {row.objective!r}, now {verdict.objective!r}; "
-            f"freq_violation_hz {row.freq_violation_hz!r}, now {verdict.freq_violation_hz!r}"
-        )
-        yield line.differences[-1]
+    relative, apart = abs(objective_now - objective) / (abs(objective) or 1.0), abs(hz_now - hz)
+    line.objective, line.hz = max(line.objective, relative), max(line.hz, apart)
+    if relative > OBJECTIVE_RELATIVE or apart > VIOLATION_HZ:
+        said = f"objective {objective!r}, now {objective_now!r}; freq_violation_hz {hz!r}, now {hz_now!r}"
+        line.note(line.differences, f"{row.instance}: {said}")
 
 
 def table_of(lines: Sequence[Sampled]) -> str:

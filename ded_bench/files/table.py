@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import inspect
 import io
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -56,12 +57,15 @@ class Table(Generic[T]):
         """Declare a table.
 
         Args:
-            kind: of its rows.
+            kind: of its rows; columns without a default come first, and those that it inherits last.
             since: a column that files of older versions lack.
             upgrade: what turns the rows of such files into those of today.
         """
         self.kind, self._since, self._upgrade = kind, since, upgrade
-        fields = sorted(dataclasses.fields(kind), key=lambda f: f.default is not dataclasses.MISSING)  # type: ignore[arg-type]
+        known = [inspect.get_annotations(c) for c in kind.__mro__]
+        depth = {name: i for i, names in reversed([*enumerate(known)]) for name in names}
+        fields = list(dataclasses.fields(kind))  # type: ignore[arg-type]
+        fields.sort(key=lambda f: (f.default is not dataclasses.MISSING, depth[f.name]))
         self.names = tuple(field.name for field in fields)
         self._required = [field.name for field in fields if field.default is dataclasses.MISSING]
         plain, limited = typing.get_type_hints(kind), typing.get_type_hints(kind, include_extras=True)

@@ -91,6 +91,10 @@ class Case(Fingerprinted, Extended):
 
     #: Knots of a case that names no number of its own.
     usual_knots: ClassVar[int]
+    #: Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`).
+    plant_name: ClassVar[str]
+    #: Whether it is nothing without the files of its grid beside it.
+    needs_grid: ClassVar[bool] = False
     _grid: GridFiles | None = PrivateAttr(default=None)
 
     @staticmethod
@@ -110,7 +114,7 @@ class Case(Fingerprinted, Extended):
         return case
 
     def _read_grid(self, folder: Path) -> None:
-        if all((folder / name).is_file() for name in GRID_FILES):
+        if self.needs_grid or all((folder / name).is_file() for name in GRID_FILES):
             grid = load_grid_files(folder, self.id, self.f0_hz)
             self._grid = grid
             self._check_grid(grid, folder)
@@ -142,11 +146,6 @@ class Case(Fingerprinted, Extended):
             problem = f"{NETWORK_FILE} and {MACHINES_FILE} are needed beside case.json"
             raise InputError(f"case {self.id}", "plant", problem)
         return self._grid
-
-    @property
-    @abc.abstractmethod
-    def plant_name(self) -> str:
-        """Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`)."""
 
     @property
     @abc.abstractmethod

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,7 +11,6 @@ from pydantic import Field, WrapValidator, model_validator
 
 from ded_bench.files.strict import Record
 from ded_bench.problem.case import Case, Sampling
-from ded_bench.problem.grid_files import load_grid_files
 from ded_bench.problem.limits import Agc, IslandRegime, Regime, ScheduledMachine, Transfer
 from ded_bench.problem.quantities import LARGEST, Array, Magnitude, Name, check_whole_steps
 
@@ -42,6 +40,7 @@ def _regime(value: Any, _: Any) -> Regime | IslandRegime:
 class DetailedCase(Case):
     """A grid whose network and machine models stand in `network.json` and `machines.json` beside it."""
 
+    plant_name, needs_grid = "detailed", True
     usual_knots = 61  # one a second in a minute
     schema_: Literal["ded-bench/case/3"] = Field(alias="schema")
     id: Name
@@ -78,22 +77,12 @@ class DetailedCase(Case):
                 raise ValueError(f"{field}: there is no machine {min(unknown)}")
         return self
 
-    def _read_grid(self, folder: Path) -> None:
-        grid = load_grid_files(folder, self.id, self.f0_hz)
-        self._grid = grid
-        self._check_grid(grid, folder)
-
     @functools.cached_property
     def fingerprint(self) -> str:
         """Twelve hex digits that change with the case, its network or its machines."""
         parts = [self.model_dump_json(by_alias=True)]
         parts += [] if self._grid is None else [self._grid.fingerprint]
         return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
-
-    @property
-    def plant_name(self) -> str:
-        """See `Case.plant_name`."""
-        return self.plant.kind
 
     @property
     def island(self) -> bool:

@@ -53,7 +53,7 @@ class Machine(Extended):
 class LosslessCase(Case):
     """One grid. Buses keep the file's order; generators and loads are named by their bus."""
 
-    usual_knots = 50
+    plant_name, usual_knots = "lossless", 50
 
     schema_: Literal["ded-bench/case/1", "ded-bench/case/2"] = Field(alias="schema")
     id: Name
@@ -98,11 +98,6 @@ class LosslessCase(Case):
         newer |= {f"machines.{bus}.ramp_pu_per_s" for bus in self.machines}
         if self.schema_ == "ded-bench/case/1" and given & newer:
             raise ValueError(f"{min(given & newer)}: belongs to schema ded-bench/case/2")
-
-    @property
-    def plant_name(self) -> str:
-        """Name of the plant that it is simulated on unless told otherwise (`plants.plant.PLANTS`)."""
-        return "lossless"
 
     @functools.cached_property
     def slack(self) -> str:

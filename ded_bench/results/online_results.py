@@ -18,6 +18,7 @@ from ded_bench.problem.quantities import Probability
 from ded_bench.problem.trajectory import Trajectory
 from ded_bench.results.folder import PLANT, OnlineKey, ResultsFolder
 from ded_bench.results.legacy import upgraded
+from ded_bench.results.rows import Made, OfIslands
 
 #: Trajectories are kept at points this far apart, s.
 KEPT_S = 0.1
@@ -27,10 +28,10 @@ _Forecast = Annotated[str, Field(pattern=f"^({'|'.join(QUALITIES)})$")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judgement:
+class Judgement(OfIslands):
     """One trajectory in one regime; the excess at a point of time is that over the most exceeded bound.
 
-    Islands have numbers about the mean frequency and swings about it, too (`Score`).
+    Islands have numbers about the mean frequency and swings about it, too.
     """
 
     objective: float | None = None  # Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all points, as of the scorer
@@ -40,19 +41,11 @@ class Judgement:
     ramp_violation: NotNegative | None = None  # pu per step
     bound_violation: NotNegative | None = None  # pu
     slack_travel_pu: NotNegative | None = None  # Σ_k |P_s(t_k+1) - P_s(t_k)|
-    mean_freq_rms_hz: NotNegative | None = None
-    mean_freq_max_hz: NotNegative | None = None
-    swing_rms_hz: NotNegative | None = None
-    swing_max_hz: NotNegative | None = None
-    excess_mean_hz: NotNegative | None = None
-    excess_relative_hz: NotNegative | None = None
-    excess_end_hz: NotNegative | None = None
-    agc_travel_pu: NotNegative | None = None
     cps1: float | None = None  # %, see `judgement.cps1`
 
 
 @dataclass(frozen=True)
-class OnlineRow(Judgement):
+class OnlineRow(Judgement, Made):
     """One scenario operated with one method's plans, judged on the plant that was operated.
 
     `unforeseen_hz` is how far loads that no plan knew of move frequencies; it depends on no method.
@@ -85,15 +78,9 @@ class OnlineRow(Judgement):
     method_s: float | None = None
     loop_s: float | None = None
     latency_source: str = ""  # timing, zero or given
-    case: str = ""
     model: PlainName = ""
     policy: PlainName = ""
     fingerprint: str = ""
-    version: str = ""
-    commit: str = ""
-    method_version: int = 0
-    host: str = ""
-    date: str = ""
 
     @property
     def key(self) -> OnlineKey:
@@ -102,7 +89,7 @@ class OnlineRow(Judgement):
 
 
 @dataclass(frozen=True)
-class HindsightRow:
+class HindsightRow(Made):
     """The optimum of one scenario and regime with full knowledge, judged as the rows of `online.csv`."""
 
     scenario: PlainName
@@ -113,13 +100,7 @@ class HindsightRow:
     max_excess_hz: float | None = None
     slack_travel_pu: float | None = None
     error: str = ""
-    case: str = ""
     fingerprint: str = ""
-    version: str = ""
-    commit: str = ""
-    method_version: int = 0
-    host: str = ""
-    date: str = ""
 
     @property
     def key(self) -> tuple[str, str, str]:

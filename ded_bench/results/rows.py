@@ -12,7 +12,7 @@ from pydantic import AfterValidator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
-from ded_bench.files.table import PlainName, Table
+from ded_bench.files.table import NotNegative, PlainName, Table
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -45,13 +45,38 @@ class Key(NamedTuple):
 _Claim = Annotated[str, AfterValidator(lambda text: str(Status(text)))]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """What made a row, where and when; `method_version` is the method's then."""
+
+    case: str = ""
+    version: str = ""
+    commit: str = ""
+    method_version: int = 0
+    host: str = ""
+    date: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfIslands:
+    """Numbers of islands alone, as the scorer names and defines them (`Score`)."""
+
+    mean_freq_rms_hz: NotNegative | None = None
+    mean_freq_max_hz: NotNegative | None = None
+    swing_rms_hz: NotNegative | None = None
+    swing_max_hz: NotNegative | None = None
+    excess_mean_hz: NotNegative | None = None
+    excess_relative_hz: NotNegative | None = None
+    excess_end_hz: NotNegative | None = None
+    agc_travel_pu: NotNegative | None = None
+
+
 @dataclass(frozen=True)
-class Row:
+class Row(OfIslands, Made):
     """One result. `status` is the solver's claim; objective and violations are re-simulated on `plant`.
 
     Units are in the names; ramp, bound and initial violations are in pu. `settings` is the canonical text of
-    the method's options, `commit` and `version` tell the code that made the row, and `method_version` is the
-    method's then. A row is valid for a task of the same `fingerprint`.
+    the method's options. A row is valid for a task of the same `fingerprint`.
     """
 
     instance: PlainName
@@ -75,27 +100,13 @@ class Row:
     error: str = ""
     workers: int = 1
     problems_version: str = ""
-    version: str = ""
     solver_version: str = ""
-    host: str = ""
-    date: str = ""
-    case: str = ""
     seed: str = ""
     fingerprint: PlainName = ""
     time_limit_s: float | None = None
     model: str = ""
     policy: str = ""
     plant: str = "lossless"
-    commit: str = ""
-    method_version: int = 0
-    mean_freq_rms_hz: float | None = None
-    mean_freq_max_hz: float | None = None
-    swing_rms_hz: float | None = None
-    swing_max_hz: float | None = None
-    excess_mean_hz: float | None = None
-    excess_relative_hz: float | None = None
-    excess_end_hz: float | None = None
-    agc_travel_pu: float | None = None
 
     @property
     def key(self) -> Key:

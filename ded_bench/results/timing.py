@@ -10,6 +10,7 @@ import pandas as pd
 
 from ded_bench.files.table import NotNegative, Table
 from ded_bench.results.legacy import upgraded
+from ded_bench.results.rows import Made
 
 #: Round of a process's very first call, on the warm-up instance; it enters no median.
 WARM_UP = 0
@@ -17,7 +18,7 @@ PARTS = ("build_s", "setup_s", "solve_s")
 
 
 @dataclass(frozen=True)
-class TimingRow:
+class TimingRow(Made):
     """One call of one method, wall-clock seconds.
 
     `settings` are those that matter outside the closed loop. `call_s` is the whole call as its process saw
@@ -42,14 +43,8 @@ class TimingRow:
     error: str = ""
     model: str = ""
     policy: str = ""
-    case: str = ""
     problems_version: str = ""
-    version: str = ""
-    commit: str = ""
-    method_version: int = 0
     solver_version: str = ""
-    host: str = ""
-    date: str = ""
 
     @property
     def job(self) -> tuple[str, str, str, str]:

@@ -14,7 +14,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,8 +44,7 @@ from ded_bench.run.tasks import Task, solve_and_score
 CHUNK = 50
 
 
-@dataclass(frozen=True)
-class Criteria:
+class Criteria(Record):
     """What counts as a success, and how sure a bound is: its confidence is 1 - delta."""
 
     gap_percent: float = 1.0
@@ -73,7 +72,7 @@ ROWS: Table[CertificateRow] = Table(CertificateRow)
 SCORES = [name for name in ROWS.names if name in Score.__dataclass_fields__]
 
 
-class Certificate(Record):
+class Certificate(Criteria):
     """Lower confidence bounds on the probability of success, with all that they depend on."""
 
     case: str
@@ -86,10 +85,6 @@ class Certificate(Record):
     successes: int
     meets_limits: int  # instances on which every limit is met, whatever the cost
     near_reference: int  # instances within the gap, whatever the limits
-    tolerance_hz: float
-    tolerance_pu: float
-    gap_percent: float
-    delta: float
     clopper_pearson: float
     hoeffding: float
     artifacts: str  # changes with the case, the methods, the policy and the models
@@ -238,7 +233,7 @@ def certify(
     limits = meets_limits(rows, criteria.tolerance_hz, criteria.tolerance_pu)
     near = gaps(rows) <= criteria.gap_percent
     successes = int((limits & near).sum())
-    facts: dict[str, Any] = asdict(criteria) | candidate.facts(case)
+    facts: dict[str, Any] = criteria.model_dump() | candidate.facts(case)
     return Certificate(
         case=case.id,
         seed=CERTIFICATE_SEED + seed,

@@ -82,7 +82,7 @@ def add_commands(commands: Any) -> None:
 def _instances(a: argparse.Namespace) -> int:
     from ded_bench.plants.plant import servable
 
-    case = _drawable(a.case, None)
+    case = Case.load(a.case)
     home = problem_folder(a.case, case)
     split = load_split(home) if (home / "split.json").is_file() else None
     test, seed = a.test, SEED if split is None else split.seed
@@ -101,23 +101,6 @@ def _instances(a: argparse.Namespace) -> int:
     if manifest.redraws:
         print(f"{manifest.redraws} loads or instances were drawn again: wrong sign, or not servable")
     return 0
-
-
-def _drawable(name: str, duration_s: float | None) -> Case:
-    """A case whose horizon, and the duration of scenarios if there are any, is a number of time steps.
-
-    Raises:
-        InputError: there is no such case, or a time is none.
-    """
-    case = Case.load(name)
-    ranges = case.sampling
-    try:
-        check_whole_steps("horizon_s", ranges.horizon_s, ranges.dt_s)
-        if duration_s is not None:
-            check_whole_steps(f"a scenario's duration of {duration_s:g} s", duration_s, ranges.dt_s)
-    except ValueError as error:
-        raise InputError(name, "sampling", str(error)) from None
-    return case
 
 
 def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
@@ -194,7 +177,7 @@ def lines_of(method: Method) -> list[str]:
 
 
 def _cases(a: argparse.Namespace) -> int:
-    return _list() if a.case is None else _check(_drawable(a.case, None), a.count)
+    return _list() if a.case is None else _check(Case.load(a.case), a.count)
 
 
 def _list() -> int:
@@ -262,7 +245,11 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 def _scenarios(a: argparse.Namespace) -> int:
     from ded_bench.plants.plant import servable
 
-    case = _drawable(a.case, DURATION_S)
+    case = Case.load(a.case)
+    try:
+        check_whole_steps(f"a scenario's duration of {DURATION_S:g} s", DURATION_S, case.sampling.dt_s)
+    except ValueError as error:
+        raise InputError(a.case, "sampling", str(error)) from None
     folder = a.out or scenario_folder(problem_folder(a.case, case))
     hours = len(list(folder.glob("*-h[0-9]*.json"))) if a.hours is None else a.hours
 

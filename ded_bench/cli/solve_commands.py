@@ -49,22 +49,19 @@ def add_commands(commands: Any) -> None:
     _add_solve(commands)
     _add_score(commands)
     p = command(commands, "reproduce", "solve a sample of rows again and compare")
-    p.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose rows, models, policies")
     p.add_argument("--sample", type=positive, default=5, metavar="N", help="rows per method and settings")
-    p.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in the results")
-    p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
-    declare(p, "--workers")
-    p.set_defaults(run=_reproduce, instance=None)
-    p = command(commands, "referee", "ANDES, the field's simulator, judges kept schedules: referee.csv")
-    p.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose schedules are judged")
-    p.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in the results")
-    p.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
-    p.add_argument(
-        "--limit", type=positive, metavar="N", help="of instances, those with most schedules first"
-    )
-    p.add_argument("--python", default=sys.executable, metavar="PATH", help="one that has ANDES")
-    declare(p, "--workers")
-    p.set_defaults(run=_referee, instance=None)
+    p.set_defaults(run=_reproduce)
+    q = command(commands, "referee", "ANDES, the field's simulator, judges kept schedules: referee.csv")
+    of_many = "of instances, those with most schedules first"
+    q.add_argument("--limit", type=positive, metavar="N", help=of_many)
+    q.add_argument("--python", default=sys.executable, metavar="PATH", help="one that has ANDES")
+    q.set_defaults(run=_referee)
+    for one in (p, q):
+        one.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose rows are meant")
+        one.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in it")
+        one.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
+        declare(one, "--workers")
+        one.set_defaults(instance=None)
 
 
 def _add_solve(commands: Any) -> None:

@@ -24,7 +24,14 @@ from ded_bench.problem.grid_files import (
 )
 from ded_bench.problem.limits import Agc, Bounds, IslandRegime, Regime, Transfer
 from ded_bench.problem.quantities import Array as Array
-from ded_bench.problem.quantities import Extended, NonNegative, Positive, Probability, Range
+from ded_bench.problem.quantities import (
+    Extended,
+    NonNegative,
+    Positive,
+    Probability,
+    Range,
+    check_whole_steps,
+)
 
 #: Records of a case's file by its schema: `module:class`.
 SCHEMAS = {
@@ -70,6 +77,7 @@ class Sampling(Extended):
                 raise ValueError(f"{name}: must not be negative")
         if (self.rate_pu_per_s is None) == (self.rate_relative_per_s is None):
             raise ValueError("exactly one of rate_pu_per_s and rate_relative_per_s is needed")
+        check_whole_steps("horizon_s", self.horizon_s, self.dt_s)
         return self
 
 

@@ -122,7 +122,7 @@ class DetailedCase(Case):
     @functools.cached_property
     def inertia(self) -> Array:
         """M = 2 h of the generators on 100 MVA, shape (n_gen,), s."""
-        return self.detailed.inertia(self.generators)
+        return np.array([self.detailed.machines[name].inertia for name in self.generators])
 
     @property
     def n_bus(self) -> int:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import LoadPoints
-from ded_bench.problem.scenario import Scenario, ScenarioLoad, ramped_for
+from ded_bench.problem.instance import LoadPoints, ramped_for
+from ded_bench.problem.scenario import Scenario, ScenarioLoad
 
-Quality = Literal["announced", "perfect", "worse", "persistence"]
 #: `announced`: ramps as announced; `perfect`: what will be; `worse`: announcements four times as wrong;
 #: `persistence`: loads stay as they are.
-QUALITIES: tuple[str, ...] = get_args(Quality)
+QUALITIES = ("announced", "perfect", "worse", "persistence")
 WORSE = 4.0
 #: Points closer together than this are one, s.
 RESOLUTION = 1e-9

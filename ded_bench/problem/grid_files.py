@@ -11,12 +11,11 @@ import itertools
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, WrapValidator, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, parse_record, read_text
-from ded_bench.problem.quantities import SMALLEST, Array, Magnitude, Name, NonNegative, Number, Positive
+from ded_bench.problem.quantities import SMALLEST, Magnitude, Name, NonNegative, Number, Positive
 
 BASE_MVA = 100.0
 GRID_FILES = NETWORK_FILE, MACHINES_FILE = "network.json", "machines.json"
@@ -272,10 +271,6 @@ class GridFiles(Fingerprinted):
     def slack(self) -> str:
         """Name of the machine at `slack_machine_bus`."""
         return next(m.name for m in self.data.machines if m.bus == self.data.slack_machine_bus)
-
-    def inertia(self, names: tuple[str, ...]) -> Array:
-        """M = 2 h in s on BASE_MVA of some machines, shape (n,)."""
-        return np.array([self.machines[name].inertia for name in names])
 
 
 def load_grid_files(folder: Path, case: str, f0_hz: float) -> GridFiles:

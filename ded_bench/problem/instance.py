@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 LARGEST_DEVIATION_HZ = 1.0
 
 
+def ramped_for(t: Array, start: float, duration: float) -> Array:
+    """How long a ramp has gone on at times `t`, s."""
+    return np.minimum(np.maximum(t - start, 0.0), duration)  # np.clip takes twice as long
+
+
 class LoadRamp(Record):
     """A load that ramps once: `initial + rate * clip(t - start, 0, duration)`, an injection in pu."""
 
@@ -43,8 +48,7 @@ class LoadRamp(Record):
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
-        into = np.minimum(np.maximum(t - self.start, 0.0), self.duration)  # np.clip takes twice as long
-        return np.asarray(self.initial + self.rate * into)
+        return np.asarray(self.initial + self.rate * ramped_for(t, self.start, self.duration))
 
     @property
     def kinks(self) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp, ramped_for
 from ded_bench.problem.quantities import (
     MAX_POINTS,
     Array,
@@ -82,11 +82,6 @@ class ScenarioLoad(Record):
     def fluctuation_at(self, t: Array) -> Array:
         """Fluctuation in pu at times `t` in s (any shape)."""
         return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
-
-
-def ramped_for(t: Array, start: float, duration: float) -> Array:
-    """How long a ramp has gone on at times `t`, s."""
-    return np.minimum(np.maximum(t - start, 0.0), duration)  # np.clip takes twice as long
 
 
 class Scenario(Fingerprinted):

@@ -32,17 +32,12 @@ REFRESH_S = 5.0
 _children = Children()
 
 
-def open_workers(count: int, scheduler: str | None) -> Workers:
-    """`count` workers here, or those of a Dask scheduler.
+class Cluster(Workers):
+    """Runs calls on the workers of a Dask cluster, however many there are at the moment.
 
     Raises:
         InputError: no scheduler answers at the address, or Dask is not installed.
     """
-    return Cluster(scheduler) if scheduler else Workers(count)
-
-
-class Cluster(Workers):
-    """Runs calls on the workers of a Dask cluster, however many there are at the moment."""
 
     def __init__(self, scheduler: str) -> None:
         try:

@@ -14,8 +14,9 @@ from ded_bench.methods.solution import Solution, named
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.results.rows import Results, Row
-from ded_bench.run.cluster import open_workers
+from ded_bench.run.cluster import Cluster
 from ded_bench.run.environment import commit, host, now, version
+from ded_bench.run.pool import Workers
 from ded_bench.run.scoring import scored_row
 from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score, trace_of
 
@@ -55,7 +56,7 @@ def run(
         WorkersLostError: it answers no more, or its workers cannot run this package.
     """
     todo, plant = unfinished(tasks, results), plant_of(case).name
-    with open_workers(workers, scheduler) as pool, results.packed():
+    with Cluster(scheduler) if scheduler else Workers(workers) as pool, results.packed():
         sent = todo if scheduler is None else _packed(todo)
         calls = ((solve_and_score, (case, task, plant)) for task in sent)
         limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]

@@ -23,6 +23,6 @@ def draw_figures(sources: Sources) -> dict[str, list[Picture]]:
     for topic, draw in FIGURES:
         placed = pictures.setdefault(topic, [])
         for drawn in draw(sources):
-            save_figure(drawn.figure, sources.results.paths.figures / drawn.name)
-            placed.append(Picture(f"figures/{drawn.name}", drawn.caption))
+            save_figure(drawn.figure, sources.results.paths.figures / f"{drawn.file}.png")
+            placed.append(Picture(f"figures/{drawn.file}.png", drawn.caption))
     return pictures

@@ -9,9 +9,8 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -55,18 +54,12 @@ STYLE: dict[Any, Any] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """A figure, the name of its file without suffix, and what stands below it."""
 
     file: str
     caption: str
     figure: Figure
-
-    @property
-    def name(self) -> str:
-        """The file's name, whatever a method is called."""
-        return re.sub(r"[^A-Za-z0-9_.-]+", "-", self.file) + ".png"
 
 
 @contextmanager

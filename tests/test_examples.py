@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -48,16 +49,27 @@ def run_example(code: str, folder: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_policy_learns_through_the_plant(ninebus: Case, tmp_path: Path) -> None:
-    """Whatever it has learned in a few steps, it keeps bounds, ramps and P_0."""
-    code = """
-import ded_bench, learned_policy
+@pytest.mark.parametrize(
+    ("example", "package", "allowed"),
+    [
+        ("learned_policy", "torch", 1e-8),
+        ("neuromancer_policy", "neuromancer", 1e-8),
+        ("optimisation_layer", "cvxpylayers", 1e-6),  # what its solver leaves open
+    ],
+)
+def test_policies_learn_through_the_plant(example: str, package: str, allowed: float, tmp_path: Path) -> None:
+    """Whatever they have learned in a few steps, they keep bounds, ramps and P_0."""
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    code = f"""
+import ded_bench, {example} as mine
 from ded_bench.problem.sampling import sample_instance
-learned_policy.train(steps=2, batch=4)
+mine.train("9bus", "NO", steps=2, batch=4)
 case = ded_bench.Case.load("9bus")
 instance = sample_instance(case, 1_500_000, 0)
-verdict = ded_bench.score(instance, learned_policy.solve(instance, "NO", case), "NO")
-assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8, verdict
+verdict = ded_bench.score(instance, mine.solve(instance, "NO", case), "NO")
+worst = max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation)
+assert worst < {allowed}, verdict
 """
     run_example(code, tmp_path)
 

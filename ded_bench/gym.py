@@ -21,7 +21,6 @@ from ded_bench.plants.plant import Plant, SimulationError, as_plant, servable
 from ded_bench.plants.score import judge
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import LARGEST_DEVIATION_HZ, Instance, State
-from ded_bench.problem.limits import Bounds
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
@@ -143,7 +142,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         self._knots.append(last)
         new = slice(first + bool(first), last + 1)
         cost = float((run.p_gen[new] @ self._cost[0] + self._cost[1] * np.abs(run.p_slack[new])).sum())
-        excess = max(_counting(self._bounds, ended).excess_hz(run.omega[new]).values())
+        excess = max(self._bounds.excess_hz(run.omega[new], ended).values())
         info["cost"] = excess
         if ended:
             info |= {
@@ -189,15 +188,6 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         }
         spaces = self._spaces.items()
         return {name: np.clip(found[name], s.low, s.high).astype(np.float32) for name, s in spaces}
-
-
-def _counting(bounds: Bounds, ended: bool) -> Bounds:
-    """The bounds that count in a step: those at the end in the last one only."""
-    if ended or not bounds.at_end.any():
-        return bounds
-    kept = ~bounds.at_end
-    kinds = tuple(kind for kind, keep in zip(bounds.kinds, kept, strict=True) if keep)
-    return Bounds(bounds.matrix[kept], bounds.limit[kept], bounds.at_end[kept], kinds)
 
 
 def _seen(state: State) -> dict[str, Array]:

@@ -181,16 +181,15 @@ def _cases(a: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    rows = [["case", "buses", "generators", "loads", "instances", "version"]]
-    folders = {path.parent: Case.load(path) for path in SHIPPED_CASES.glob("*/case.json")}
-    for folder, case in sorted(folders.items(), key=lambda item: item[1].n_bus):
-        split, manifest = load_split(folder), load_manifest(folder)
-        sizes = case.n_bus, len(case.generators), len(case.loads)
-        instances = f"{len(split.train)}+{len(split.test)}"
-        rows.append([case.id, *map(str, sizes), instances, manifest.version if manifest else ""])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+    import pandas as pd
+
+    rows = []
+    for path in SHIPPED_CASES.glob("*/case.json"):
+        case, split, manifest = Case.load(path), load_split(path.parent), load_manifest(path.parent)
+        sizes = case.n_bus, len(case.generators), len(case.loads), f"{len(split.train)}+{len(split.test)}"
+        rows.append((case.id, *sizes, manifest.version if manifest else ""))
+    heads = ["case", "buses", "generators", "loads", "instances", "version"]
+    print(pd.DataFrame(rows, columns=heads).sort_values("buses").to_string(index=False))
     print("\nGenerators without the slack; instances for training + testing.")
     return 0
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.methods.knots import control_times
 from ded_bench.plants.plant import Plant, as_plant
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
@@ -111,11 +112,7 @@ def condense(
 def _points(case: Case, instance: Instance, schedule: Schedule, interval_s: float) -> Indices:
     """Grid points of a model's knots, strictly increasing from the first to the last."""
     dt_s, last = instance.dt_s, instance.steps
-    times = [np.arange(0.0, instance.horizon_s, interval_s), schedule.t]
-    if (agc := case.agc) is not None:
-        given = instance.initial.agc
-        first = agc.period_s if given is None or given.next_s is None else given.next_s
-        times.append(np.arange(first, instance.horizon_s, agc.period_s))
+    times = np.arange(0.0, instance.horizon_s, interval_s), schedule.t, control_times(case, instance)
     places = np.concatenate(times) / dt_s  # a row between grid points is a bend at both of them
     both = np.concatenate([np.floor(places + BETWEEN), np.ceil(places - BETWEEN), [last]]).astype(np.intp)
     return np.unique(np.clip(both, 0, last))

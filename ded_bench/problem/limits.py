@@ -30,22 +30,23 @@ class Bounds:
         """Bounds that are smaller by a part of them, and by so many rad/s."""
         return replace(self, limit=(1.0 - part) * self.limit - by)
 
-    def beyond(self, outputs: Array) -> Array:
+    def beyond(self, outputs: Array, ended: bool = True) -> Array:
         """How far outputs are beyond their bounds, negative within; -inf at times that a bound leaves free.
 
         Args:
             outputs: y up to the last time, shape (n, n_out), rad/s.
+            ended: whether that is the end, where all bounds count.
 
         Returns:
             Of the same shape, rad/s.
         """
         beyond = np.abs(outputs) - self.limit
-        beyond[:-1, self.at_end] = -np.inf
+        beyond[: -1 if ended else None, self.at_end] = -np.inf
         return beyond
 
-    def excess_hz(self, omega: Array) -> dict[str, float]:
+    def excess_hz(self, omega: Array, ended: bool = True) -> dict[str, float]:
         """Largest excess over the bounds of each kind, Hz, along frequency deviations (n, n_gen), rad/s."""
-        excess = np.maximum(self.beyond(omega @ self.matrix.T).max(axis=0), 0.0) / (2 * np.pi)
+        excess = np.maximum(self.beyond(omega @ self.matrix.T, ended).max(axis=0), 0.0) / (2 * np.pi)
         found = dict.fromkeys(self.kinds, 0.0)
         for kind, value in zip(self.kinds, excess.tolist(), strict=True):
             found[kind] = max(found[kind], value)

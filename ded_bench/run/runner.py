@@ -84,7 +84,7 @@ def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
     """Tasks with the files that their answers depend on."""
     files = functools.cache(pack)
     for task in tasks:
-        yield dataclasses.replace(task, files=files(task.settings, task.artifacts))
+        yield dataclasses.replace(task, files=files(task.artifacts))
 
 
 def unscored_row(

@@ -32,10 +32,8 @@ from ded_bench.run.environment import host
 from ded_bench.run.pool import NoAnswerError, WorkerDiedError
 from ded_bench.solvers.status import Status
 
-#: Contents of files by their path below a results folder, or below `_GIVEN`.
+#: Contents of files by their path below a results folder.
 Files = tuple[tuple[str, bytes], ...]
-#: Folder of files that the settings name by their paths.
-_GIVEN = "given"
 #: A call in a traceback: file, line, function, code.
 _CALL = re.compile(r'File "(.+)", line (\d+), in (.+)\n +(.+)')
 #: Errors that say all there is to know.
@@ -191,9 +189,9 @@ def trace_of(error: object) -> str:
     return str(notes[-1]) if notes else "".join(traceback.format_exception(error))
 
 
-def pack(settings: Settings, artifacts: Iterable[Artifact]) -> Files:
+def pack(artifacts: Iterable[Artifact]) -> Files:
     """Read every file that an answer depends on."""
-    return tuple((_place(a.kind, a.path, settings), a.path.read_bytes()) for a in artifacts if a.path)
+    return tuple((_place(a.kind, a.path), a.path.read_bytes()) for a in artifacts if a.path)
 
 
 @contextlib.contextmanager
@@ -204,20 +202,12 @@ def unpacked(settings: Settings, files: Files) -> Iterator[Settings]:
         for place, content in files:
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             (folder / place).write_bytes(content)
-        policy, model = settings.policy and folder / _given("policy", settings.policy), settings.model
-        if model and (given := folder / _given("model", model)).is_file():
+        policy, model = settings.policy and folder / _place("policy", settings.policy), settings.model
+        if model and (given := folder / _place("model", model)).is_file():
             model = str(given)
         yield dataclasses.replace(settings, search=(folder,), policy=policy, model=model)
 
 
-def _place(kind: str, path: Path, settings: Settings) -> str:
-    """Where methods look for a file: by its path in the settings, else below a folder to search."""
-    if path not in (settings.policy, Path(settings.model)):
-        for folder in settings.search:
-            if path.is_relative_to(folder):
-                return path.relative_to(folder).as_posix()
-    return _given(kind, path)
-
-
-def _given(kind: str, path: str | Path) -> str:
-    return f"{_GIVEN}/{kind}/{Path(path).name}"
+def _place(kind: str, path: str | Path) -> str:
+    """Where a results folder, and a worker, has a file."""
+    return f"{'policies' if kind == 'policy' else 'koopman'}/{Path(path).name}"

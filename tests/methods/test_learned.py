@@ -62,7 +62,7 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
     (task, *_) = make_tasks(chosen.case, chosen.instances, ["learned"], ["TO"], settings)
     here = solve_task(chosen.case, task).solution
     assert here.schedule is not None
-    files = pack(settings, LEARNED.artifacts(chosen.case, "TO", settings))
+    files = pack(LEARNED.artifacts(chosen.case, "TO", settings))
     assert sorted(name for name, _ in files) == [
         "koopman/koopman.safetensors",
         "policies/learned-TO.safetensors",

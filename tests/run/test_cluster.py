@@ -229,14 +229,14 @@ def test_what_is_shipped_is_what_was_there(threebus: Case, tmp_path: Path) -> No
         model_artifact(threebus, dataclasses.replace(settings, model="koopman")),
         Artifact("policy", "m", "3", second / "policies" / "m-TO-long.safetensors"),
     )
-    with unpacked(settings, pack(settings, artifacts)) as own:
+    with unpacked(settings, pack(artifacts)) as own:
         (folder,) = own.search
         assert own.policy is not None
         assert own.policy.read_bytes() == b"given"
         for name in (own.model, "koopman"):
             assert find_model(threebus, name, own.search).fingerprint == model.fingerprint
         there = {path.name: path.read_bytes() for path in (folder / "policies").iterdir()}
-        assert there == {"m-TO-long.safetensors": b"second m-TO-long"}
+        assert there == {"m-TO-long.safetensors": b"second m-TO-long", "own.safetensors": b"given"}
         with pytest.raises(InputError, match="koopman-paper"):
             find_model(threebus, "koopman-paper", own.search)
     assert not folder.exists()

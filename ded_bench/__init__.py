@@ -137,11 +137,11 @@ def simulate(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import simulate
-    from ded_bench.plants.plant import as_plant
+    from ded_bench.plants.plant import plant_of
     from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
-    return simulate.simulate(own, instance, as_schedule(schedule, own), as_plant(own, plant))
+    return simulate.simulate(own, instance, as_schedule(schedule, own), plant_of(own, plant))
 
 
 def simulate_many(
@@ -169,7 +169,7 @@ def simulate_many(
         InputError: there are not as many instances as schedules, or the case or plant is unknown.
     """
     from ded_bench.files.errors import InputError
-    from ded_bench.plants.plant import as_plant
+    from ded_bench.plants.plant import plant_of
     from ded_bench.plants.simulate import in_threads
     from ded_bench.problem.instance import Instance
 
@@ -179,7 +179,7 @@ def simulate_many(
     if not many:
         return []
     own = _case_of(many[0], case)
-    chosen = as_plant(own, plant)
+    chosen = plant_of(own, plant)
     return in_threads(lambda pair: simulate(*pair, own, chosen), zip(many, schedules, strict=True), threads)
 
 
@@ -204,11 +204,11 @@ def score(
         SimulationError: the plant cannot follow this schedule.
     """
     from ded_bench.plants import score
-    from ded_bench.plants.plant import as_plant
+    from ded_bench.plants.plant import plant_of
     from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
-    return score.score(own, instance, as_schedule(schedule, own), regime, as_plant(own, plant))
+    return score.score(own, instance, as_schedule(schedule, own), regime, plant_of(own, plant))
 
 
 def _case_of(instance: Instance, case: Case | None) -> Case:

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import Plant, SimulationError, as_plant, servable
+from ded_bench.plants.plant import Plant, SimulationError, plant_of, servable
 from ded_bench.plants.score import judge
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import LARGEST_DEVIATION_HZ, Instance, State
@@ -77,7 +77,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         render_mode: None = None,
     ) -> None:
         self.case = case if isinstance(case, Case) else Case.load(case)
-        self.regime, self.plant, self.render_mode = regime, as_plant(self.case, plant), render_mode
+        self.regime, self.plant, self.render_mode = regime, plant_of(self.case, plant), render_mode
         self._bounds = self.case.bounds(regime)
         ranges = self.case.sampling
         self._points = max(round(STEP_S / ranges.dt_s), 1)

@@ -12,7 +12,7 @@ import pyomo.environ as pyo
 
 from ded_bench import Case, Instance, Schedule, Settings, Trajectory, load_instances, simulate, solve
 from ded_bench.methods import ded, ed
-from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.ipopt import CasadiIpopt
 
 
 def random_schedule(case: Case, instance: Instance) -> Schedule:
@@ -45,7 +45,7 @@ def main(count: int) -> None:
     case = Case.load("9bus")
     instances = load_instances("9bus", limit=count)
     model = ded.build_ded(case, instances[0].steps, instances[0].dt_s)
-    compiled = compile_model(model, "ipopt", {"min_refinement_steps": 0})
+    compiled = CasadiIpopt(model, {"min_refinement_steps": 0})
     rows = []
     for regime in case.regimes:
         for instance in instances:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.learning.linear_maps import INTERVAL_S, from_schedule, linearised_along
-from ded_bench.plants.plant import Plant, SimulationError, as_plant
+from ded_bench.plants.plant import Plant, SimulationError, plant_of
 from ded_bench.plants.simulate import in_threads, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -110,7 +110,7 @@ def simulated(
         raise InputError("power", "", f"has the shape {tuple(power.shape)}, but needs {shape}")
     if len({(i.horizon_s, i.dt_s) for i in instances}) != 1:
         raise InputError("instances", "", "must be some, with the same grid of time")
-    batch = _Runs(as_plant(case, plant), instances, np.asarray(t, dtype=np.float64), interval_s, threads)
+    batch = _Runs(plant_of(case, plant), instances, np.asarray(t, dtype=np.float64), interval_s, threads)
     omega, p_slack, p_gen = _SimulationLayer.apply(power, batch)  # type: ignore[no-untyped-call]
     return omega, p_slack, p_gen
 

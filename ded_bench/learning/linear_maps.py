@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.methods.knots import control_times
-from ded_bench.plants.plant import Plant, as_plant
+from ded_bench.plants.plant import Plant, plant_of
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
@@ -50,7 +50,7 @@ def linearise(
         SimulationError: the plant cannot follow the schedule.
         InputError: as `simulate`.
     """
-    chosen = as_plant(case, plant)
+    chosen = plant_of(case, plant)
     trajectory = simulate(case, instance, schedule, chosen)
     return linearised_along(chosen, instance, schedule, trajectory, interval_s)
 

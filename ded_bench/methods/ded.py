@@ -25,9 +25,10 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import compile_model, fix
+from ded_bench.solvers.compile import fix
+from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.linear_program import assign
-from ded_bench.solvers.status import Compiled, Status
+from ded_bench.solvers.status import Status
 
 #: Raised when answers change.
 VERSION = 1
@@ -102,8 +103,8 @@ def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled(case: Case, steps: int, dt: float) -> Compiled:
-    return compile_model(_built(case, steps, dt), "ipopt", _IPOPT_OPTIONS)
+def _compiled(case: Case, steps: int, dt: float) -> CasadiIpopt:
+    return CasadiIpopt(_built(case, steps, dt), _IPOPT_OPTIONS)
 
 
 @functools.lru_cache(maxsize=2)

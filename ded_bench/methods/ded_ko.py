@@ -23,16 +23,13 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import compile_model, fix, reset
-from ded_bench.solvers.ipopt import LINEAR_OPTIONS
-from ded_bench.solvers.status import Compiled, Status
+from ded_bench.solvers.compile import SOLVERS, OnArrays, fix, reset
+from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 
 #: Raised when answers change.
 VERSION = 1
-#: Solvers of the Pyomo model, and their options.
-SOLVERS: dict[str, dict[str, Any] | None] = {"piqp": None, "ipopt": LINEAR_OPTIONS, "highs": None}
 #: Entries of the equations up to which the default is a Pyomo model; half of it takes 10 s and 0.5 GB
 #: (two-area), once.
 PYOMO_ENTRIES = 1_000_000
@@ -144,8 +141,8 @@ def _built(program: _Program) -> pyo.ConcreteModel:
 
 
 @functools.lru_cache(maxsize=1)
-def _compiled(program: _Program, solver: str) -> Compiled:
-    return compile_model(_built(program), solver, SOLVERS[solver])
+def _compiled(program: _Program, solver: str) -> OnArrays:
+    return OnArrays(_built(program), solver)
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:

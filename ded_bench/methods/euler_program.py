@@ -17,8 +17,7 @@ import scipy.sparse as sp
 
 from ded_bench.methods.slp import Attempt, Parts, sequence
 from ded_bench.methods.solution import Solution
-from ded_bench.plants.lossless.network import Network, PowerFlowError
-from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -54,7 +53,7 @@ def injections_along(network: Network, theta_gen: Array, p_load: Array) -> Injec
         p_load: load injections, shape (n, n_load), pu.
 
     Raises:
-        PowerFlowError: the loads cannot be served at these angles.
+        SimulationError: the loads cannot be served at these angles.
     """
     gen, alg = network.generators, network.algebraic
     theta = np.zeros((len(theta_gen), network.n_bus))
@@ -124,10 +123,7 @@ class EulerPrograms:
         initial = network.initial_angles(instance)[network.generators]
 
         def follow(theta: Array) -> Injections:
-            try:
-                return injections_along(network, theta, load)
-            except PowerFlowError as error:
-                raise SimulationError(str(error)) from None
+            return injections_along(network, theta, load)
 
         def solve(along: Injections, _: int) -> Attempt[tuple[Injections, Array]]:
             found = solve_form(self._program(instance, along))
@@ -140,7 +136,11 @@ class EulerPrograms:
 
         deadline = started + (np.inf if time_limit_s is None else time_limit_s)
         still = np.tile(initial, (len(load), 1))
-        end = sequence(Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1), [still], deadline)
+        end = sequence(
+            Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1),
+            [still],
+            deadline,
+        )
         schedule, objective = None, None
         if end.status == Status.OPTIMAL and end.answer and end.answer.solution and end.followed:
             power = np.vstack([instance.p_initial(self._case), end.answer.solution[1][self._p_gen]])

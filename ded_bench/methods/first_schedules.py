@@ -26,8 +26,8 @@ def slow_dispatch(case: Case, instance: Instance, points: Indices) -> Array:
     On an island, where what is missing moves all frequencies, it is followed as fast as turbines can.
     """
     if case.slack is None:
-        return _within_ramps(case, instance, static_dispatch(case, instance), points, 1.0)
-    return _within_ramps(case, instance, ed.dispatch(case, instance, 1.0), points, PACE)
+        return within_ramps(case, instance, static_dispatch(case, instance), points)
+    return within_ramps(case, instance, ed.dispatch(case, instance, 1.0), points, PACE)
 
 
 def static_dispatch(case: Case, instance: Instance) -> Schedule:
@@ -40,11 +40,6 @@ def static_dispatch(case: Case, instance: Instance) -> Schedule:
     except SimulationError:
         p_initial = instance.p_initial(case)
         return Schedule(np.array([0.0, instance.horizon_s]), np.stack([p_initial, p_initial]))
-
-
-def corrected(case: Case, instance: Instance, plan: Schedule, points: Indices) -> Array:
-    """A plan in force from P_0 on, within the ramp limits: powers at the knots, (n_knots, n_gen), pu."""
-    return _within_ramps(case, instance, plan, points, 1.0)
 
 
 def first_schedules(case: Case, instance: Instance, wanted: Array, points: Indices) -> Iterator[Array]:
@@ -67,7 +62,8 @@ def first_schedules(case: Case, instance: Instance, wanted: Array, points: Indic
     yield (constant + shared) / 2
 
 
-def _within_ramps(case: Case, instance: Instance, plan: Schedule, points: Indices, pace: float) -> Array:
+def within_ramps(case: Case, instance: Instance, plan: Schedule, points: Indices, pace: float = 1.0) -> Array:
+    """A plan from P_0 on, at this part of the ramp limits: powers at the knots, (n_knots, n_gen), pu."""
     p_gen = plan.at(instance.grid[points])
     p_gen[0] = instance.p_initial(case)
     reach = pace * np.outer(np.diff(points) * instance.dt_s, case.ramp)

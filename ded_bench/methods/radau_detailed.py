@@ -229,10 +229,6 @@ class DetailedProgram:
         _assign(self._p_set[1:].ravel(), p_set[1:].ravel())
         _assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
 
-    def speeds(self) -> Array:
-        """Frequency deviations of the generators at the points, (n_points, n_gen), rad/s."""
-        return np.array([[variable.value for variable in row] for row in self._x[:, self._speed]])
-
     def schedule(self) -> Schedule:
         """The set-points of the solved model; IPOPT keeps bounds to 1e-8 only, so they are put back."""
         p = np.array([[variable.value for variable in row] for row in self._p_set])

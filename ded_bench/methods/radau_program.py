@@ -138,7 +138,7 @@ class RadauProgram:
             ends: grid indices of the element ends, shape (elements + 1,).
 
         Raises:
-            PowerFlowError: the loads cannot be served at t = 0.
+            SimulationError: the loads cannot be served at t = 0.
         """
         case, network = self.case, self.network
         steps = np.diff(ends).astype(float)

@@ -35,7 +35,7 @@ class StackedInstances:
         """Stack instances.
 
         Raises:
-            PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
+            SimulationError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
         """
         machines = case.priced
         return StackedInstances(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.first_schedules import corrected, first_schedules, slow_dispatch
+from ded_bench.methods.first_schedules import first_schedules, slow_dispatch, within_ramps
 from ded_bench.methods.knot_program import KnotProgram, Prediction
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.reserve import Reserve
@@ -92,7 +92,7 @@ def solve_on_surrogate(
         if plan is None or plan.last is None:
             wanted = slow_dispatch(case, instance, points)
         else:
-            wanted = corrected(case, instance, plan.last, points)
+            wanted = within_ramps(case, instance, plan.last, points)
         first = first_schedules(case, instance, wanted, points)
         end = sequence(Parts(follow, solve, stop=None), first, np.inf)
         status, reason, attempt = end.status, end.message, end.answer

@@ -95,7 +95,7 @@ class TrainedPolicy(abc.ABC):
 
         Raises:
             InputError: an instance belongs to another case or horizon, or cannot be served.
-            PowerFlowError: an instance has no equilibrium at t = 0.
+            SimulationError: an instance has no equilibrium at t = 0.
         """
         batch = [instances] if isinstance(instances, Instance) else list(instances)
         self.scope.check(batch)

@@ -149,25 +149,18 @@ PLANTS: dict[str, str] = {
 }
 
 
-def plant_of(case: Case, name: str | None = None) -> Plant:
-    """The plant of a case, by its name in PLANTS; None: the case's own.
+def plant_of(case: Case, given: str | Plant | None = None) -> Plant:
+    """A plant of a case: the one given, or that of this name in PLANTS; None: the case's own.
 
     Raises:
         InputError: there is no such plant, or the case lacks its data.
     """
-    name = name or case.plant_name
+    if given is not None and not isinstance(given, str):
+        return given
+    name = given or case.plant_name
     if name not in PLANTS:
         raise InputError("plant", name[:40], f"is not one of {', '.join(PLANTS)}")
     return _made(case, name)
-
-
-def as_plant(case: Case, given: str | Plant | None) -> Plant:
-    """A plant of a case that is given, or by its name; None: the case's own.
-
-    Raises:
-        InputError: as `plant_of`.
-    """
-    return plant_of(case, given) if given is None or isinstance(given, str) else given
 
 
 @functools.lru_cache(maxsize=16)

@@ -129,15 +129,13 @@ class TimeVarying:
             x[j + 1] = f @ x[j] + force
         return x
 
-    def outputs(self, u: Array, x: Array | None = None) -> tuple[Array, Array]:
+    def outputs(self, u: Array) -> tuple[Array, Array]:
         """ω, shape (n_points, n_gen) in rad/s, and P_s, shape (n_points,) in pu, at all grid points.
 
         Args:
             u: δP at the knots, shape (n_knots, n_gen), pu.
-            x: deviations at the knots if they are known (see `states`).
         """
-        x = self.states(u) if x is None else x
-        length = self.lengths
+        x, length = self.states(u), self.lengths
         slope = np.diff(u, axis=0) / length[:, None]
         state, force = x[:-1], (self.step.g @ u[:-1, :, None] + self.step.h @ slope[:, :, None])[..., 0]
         growth = (self.step.g @ slope[:, :, None])[..., 0]

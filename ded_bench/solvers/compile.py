@@ -1,9 +1,8 @@
-"""Solvers of Pyomo models by name: IPOPT, PIQP, HiGHS; see the modules of these names.
+"""Linear Pyomo models for solvers by name: IPOPT, PIQP, HiGHS; see the modules of these names.
 
-A Pyomo model is compiled once and solved many times: between solves only variable bounds and
-initial values may change. What differs between instances is therefore written as variables fixed
-by equal bounds, which the solvers remove before they start. Every solve starts cold: it never
-depends on the ones before it.
+A Pyomo model is read once and solved many times: between solves only variable bounds and values may change.
+What differs between instances is therefore written as variables fixed by equal bounds, which are removed
+before a solver sees the program. Every solve starts cold: it never depends on the ones before it.
 """
 
 from __future__ import annotations
@@ -15,72 +14,56 @@ from collections.abc import Callable
 import numpy as np
 import pyomo.environ as pyo
 
-from ded_bench.files.errors import InputError
-from ded_bench.solvers import highs, piqp
-from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt
+from ded_bench.solvers import highs, ipopt, piqp
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, read_linear
-from ded_bench.solvers.status import Compiled, Options, Outcome, Status
+from ded_bench.solvers.status import Outcome, Status
 
-
-class OnArrays:
-    """A linear Pyomo model for a solver of arrays; what PIQP does not solve, IPOPT decides."""
-
-    def __init__(self, model: pyo.ConcreteModel, solve: Callable[[FreeForm, float], FormAnswer]) -> None:
-        started = time.perf_counter()
-        self._program, self._solve = read_linear(model), solve
-        self._fallback: CasadiIpopt | None = None
-        self._setup_s = time.perf_counter() - started
-
-    def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """See `Compiled`."""
-        started = time.perf_counter()
-        numbers = self._program.numbers()
-        form = self._program.free_form(numbers)
-        setup = self._setup_s + time.perf_counter() - started
-        self._setup_s = 0.0  # paid once, by the first solve
-        started = time.perf_counter()
-        answer = self._solve(form, np.inf if time_limit_s is None else time_limit_s)
-        elapsed = time.perf_counter() - started
-        objective = None
-        if answer.status == Status.OPTIMAL:
-            values = np.array(numbers.lower)
-            values[numbers.free] = answer.x
-            assign(self._program.columns, values)
-            objective = self._program.objective(numbers, values)
-        said = answer.iterations, setup, elapsed, objective, answer.version, answer.message
-        outcome = Outcome(answer.status, answer.status == Status.OPTIMAL, *said)
-        if answer.status != Status.FAILED or self._solve is not piqp.solve_form:
-            return outcome
-        rest = None if time_limit_s is None else max(time_limit_s - elapsed, 1e-3)  # IPOPT wants some
-        self._fallback = self._fallback or CasadiIpopt(self._program, LINEAR_OPTIONS)
-        verdict = self._fallback.solve(rest)
-        return dataclasses.replace(
-            verdict,
-            setup_s=setup + verdict.setup_s,
-            solve_s=elapsed + verdict.solve_s,
-            version=f"{answer.version}, {verdict.version}",
-            message=f"{answer.message}, {verdict.message}",
-        )
-
-
-#: Solvers by name; linear solvers take no options.
-SOLVERS: dict[str, Callable[[pyo.ConcreteModel, Options | None], Compiled]] = {
-    "ipopt": CasadiIpopt,
-    "piqp": lambda model, _: OnArrays(model, piqp.solve_form),
-    "highs": lambda model, _: OnArrays(model, highs.solve_form),
+#: Linear solvers by name.
+SOLVERS: dict[str, Callable[[FreeForm, float], FormAnswer]] = {
+    "piqp": piqp.solve_form,
+    "ipopt": ipopt.solve_form,
+    "highs": highs.solve_form,
 }
 
 
-def compile_model(model: pyo.ConcreteModel, solver: str, options: Options | None = None) -> Compiled:
-    """Compile a Pyomo model for a solver by name.
+class OnArrays:
+    """A linear Pyomo model for a solver of arrays; what PIQP does not solve, IPOPT decides.
 
     Raises:
-        InputError: unknown solver.
-        ValueError: a linear solver is asked to solve a model that is not linear.
+        ValueError: the model is not linear.
     """
-    if solver not in SOLVERS:
-        raise InputError("solver", solver, f"unknown (known: {', '.join(SOLVERS)})")
-    return SOLVERS[solver](model, options)
+
+    def __init__(self, model: pyo.ConcreteModel, solver: str) -> None:
+        started = time.perf_counter()
+        self._program, self._solver = read_linear(model), solver
+        self._setup_s = time.perf_counter() - started
+
+    def solve(self, time_limit_s: float | None = None) -> Outcome:
+        """Solve for the current variable bounds; the first call pays for set-up.
+
+        Raises:
+            ValueError: two variables that are free multiply each other.
+        """
+        started = time.perf_counter()
+        now = self._program.now()
+        setup = self._setup_s + time.perf_counter() - started
+        self._setup_s = 0.0  # paid once, by the first solve
+        started = time.perf_counter()
+        left = np.inf if time_limit_s is None else time_limit_s
+        answer = SOLVERS[self._solver](now.form, left)
+        if answer.status == Status.FAILED and self._solver == "piqp":
+            spent = time.perf_counter() - started
+            other = ipopt.solve_form(now.form, max(left - spent, 1e-3))  # IPOPT wants some
+            version, message = f"{answer.version}, {other.version}", f"{answer.message}, {other.message}"
+            answer = dataclasses.replace(other, version=version, message=message)
+        elapsed, objective = time.perf_counter() - started, None
+        has_values = answer.status in (Status.OPTIMAL, Status.FEASIBLE)
+        if has_values:
+            now.values[now.free] = answer.x
+            assign(self._program.columns, now.values)
+            objective = float(now.form.cost @ answer.x) + now.constant
+        said = answer.iterations, setup, elapsed, objective, answer.version, answer.message
+        return Outcome(answer.status, has_values, *said)
 
 
 def fix(variable: pyo.Var, value: float) -> None:

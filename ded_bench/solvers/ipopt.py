@@ -11,10 +11,11 @@ from typing import Any
 import casadi
 import numpy as np
 import pyomo.environ as pyo
+import scipy.sparse as sp
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.problem.case import Array
-from ded_bench.solvers.linear_program import LinearProgram, assign, bounds, read_linear
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, bounds
 from ded_bench.solvers.status import Options, Outcome, Status
 
 #: IPOPT's return values as CasADi spells them; everything else is a failure.
@@ -38,46 +39,67 @@ _IPOPT_VERSION = f"ipopt (casadi {importlib.metadata.version('casadi')})"
 
 
 class CasadiIpopt:
-    """IPOPT and MUMPS from the `casadi` wheel: on a linear model's arrays, else on its .nl form.
+    """IPOPT and MUMPS from the `casadi` wheel on a Pyomo model's .nl form.
 
     Args:
-        model: the Pyomo model, or its arrays; its structure must not change afterwards.
+        model: the Pyomo model; its structure must not change afterwards.
         options: IPOPT options beyond the defaults.
     """
 
-    def __init__(self, model: pyo.ConcreteModel | LinearProgram, options: Options | None = None) -> None:
+    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
         started = time.perf_counter()
         self._options = dict(options or {})
-        try:
-            program = model if isinstance(model, LinearProgram) else read_linear(model)
-            program.numbers()
-            self._source: _Arrays | _Nl = _Arrays(program)
-        except ValueError:  # not linear, or not until its data are fixed
-            self._source = _Nl(model)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "model.nl")
+            with path.open("w") as stream:
+                info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
+            builder = casadi.NlpBuilder()
+            builder.import_nl(str(path))
+        self._nlp = {
+            "x": casadi.vertcat(*builder.x),
+            "f": builder.f,
+            "g": casadi.vertcat(*builder.g),
+        }
+        self._columns = tuple(info.variables)
+        self._rows = {"lbg": np.array(builder.g_lb), "ubg": np.array(builder.g_ub)}
         self._solver: casadi.Function | None = None
         self._limit: float | None = None
         self._setup_s = time.perf_counter() - started
 
     def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """See `Compiled`; the first call also pays for symbolic derivatives."""
+        """Solve for the current variable bounds and initial values.
+
+        The first call also pays for set-up and symbolic derivatives.
+        """
         started = time.perf_counter()
-        source = self._source
         if self._solver is None or self._limit != time_limit_s:
-            self._solver, self._limit = self._make(time_limit_s), time_limit_s
-        arguments, constant = source.current()
-        start = np.array([0.0 if v.value is None else v.value for v in source.columns])
+            # Scalar expressions must be expanded, or every evaluation takes several times as long.
+            self._solver = make_ipopt(self._nlp, self._options, time_limit_s, {"expand": True})
+            self._limit = time_limit_s
+        lower, upper = bounds(self._columns)
+        start = np.array([0.0 if v.value is None else v.value for v in self._columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
-        arguments |= {"x0": start, "lbg": source.g_lower, "ubg": source.g_upper}
-        outcome, x = run_ipopt(self._solver, arguments, constant, setup)
+        arguments = {"x0": start, "lbx": lower, "ubx": upper, **self._rows}
+        outcome, x = run_ipopt(self._solver, arguments, 0.0, setup)
         if x is not None:
-            assign(source.columns, x)
+            assign(self._columns, x)
         return outcome
 
-    def _make(self, time_limit_s: float | None) -> casadi.Function:
-        # Scalar expressions must be expanded, or every evaluation takes several times as long.
-        options = {"expand": isinstance(self._source, _Nl)}
-        return make_ipopt(self._source.nlp, self._options, time_limit_s, options)
+
+def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
+    """Solve a linear program; a time limit in s may be infinite."""
+    a, n = sp.csc_matrix(sp.vstack([form.equal, form.between])), len(form.cost)
+    x, pattern = casadi.MX.sym("x", n), casadi.Sparsity(*a.shape, a.indptr.tolist(), a.indices.tolist())
+    g = casadi.mtimes(casadi.DM(pattern, a.data), x)
+    limit = time_limit_s if np.isfinite(time_limit_s) else None
+    solver = make_ipopt({"x": x, "f": casadi.dot(form.cost, x), "g": g}, LINEAR_OPTIONS, limit, {})
+    arguments = {"x0": np.zeros(n), "lbx": form.lower, "ubx": form.upper}
+    rows = {"lbg": np.append(form.right, form.low), "ubg": np.append(form.right, form.high)}
+    said, found = run_ipopt(solver, arguments | rows, 0.0, 0.0)
+    return FormAnswer(
+        said.status, np.zeros(n) if found is None else found, said.iterations or 0, said.version, said.message
+    )
 
 
 def make_ipopt(
@@ -108,46 +130,3 @@ def run_ipopt(
         x, objective = result["x"].full().ravel(), float(result["f"]) + constant
     said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
     return Outcome(status, x is not None, *said), x
-
-
-#: What IPOPT is called with, and what its objective leaves out.
-_Current = tuple[dict[str, Array], float]
-
-
-class _Arrays:
-    """A linear program for CasADi: constant matrices, costs as parameters."""
-
-    def __init__(self, program: LinearProgram) -> None:
-        n_rows, n = program.a.shape
-        pattern = casadi.Sparsity(n_rows, n, program.a.indptr.tolist(), program.a.indices.tolist())
-        x, cost = casadi.MX.sym("x", n), casadi.MX.sym("cost", n)
-        g = casadi.mtimes(casadi.DM(pattern, program.a.data), x)
-        self.nlp: dict[str, Any] = {"x": x, "p": cost, "f": casadi.dot(cost, x), "g": g}
-        self.columns = program.columns
-        self.g_lower, self.g_upper = program.row_lower, program.row_upper
-        self._program = program
-
-    def current(self) -> _Current:
-        numbers = self._program.numbers()
-        arguments = {"lbx": numbers.lower, "ubx": numbers.upper, "p": numbers.cost}
-        return arguments, numbers.constant
-
-
-class _Nl:
-    """A Pyomo model for CasADi through its .nl form."""
-
-    def __init__(self, model: pyo.ConcreteModel) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "model.nl")
-            with path.open("w") as stream:
-                info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
-            builder = casadi.NlpBuilder()
-            builder.import_nl(str(path))
-        g = casadi.vertcat(*builder.g)
-        self.nlp: dict[str, Any] = {"x": casadi.vertcat(*builder.x), "f": builder.f, "g": g}
-        self.columns = tuple(info.variables)
-        self.g_lower, self.g_upper = np.array(builder.g_lb), np.array(builder.g_ub)
-
-    def current(self) -> _Current:
-        lower, upper = bounds(self.columns)
-        return {"lbx": lower, "ubx": upper}, 0.0

@@ -23,21 +23,6 @@ Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Numbers:
-    """One instance of a linear program: minimise cost·x + constant with lower <= x <= upper."""
-
-    lower: Array
-    upper: Array
-    cost: Array
-    constant: float
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Which columns are no data, shape (n_columns,)."""
-        return np.asarray(self.lower != self.upper)
-
-
-@dataclass(frozen=True, eq=False)
 class FreeForm:
     """One instance without its data: equal x = right, low <= between x <= high, lower <= x <= upper."""
 
@@ -105,7 +90,7 @@ class Basis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FormAnswer:
-    """What a solver says to one linear program; x has values of use only with status `Optimal`."""
+    """What a solver says to one linear program; x is of use with status `Optimal` or `Feasible`."""
 
     status: Status
     x: Array
@@ -126,6 +111,15 @@ def told(form: FreeForm, answer: FormAnswer) -> FormAnswer:
     return answer
 
 
+class Instantiated(NamedTuple):
+    """One instance of a Pyomo model."""
+
+    form: FreeForm
+    values: Array  # of all columns, zero where they are free
+    free: NDArray[np.bool_]
+    constant: float  # what the form's objective leaves out
+
+
 @dataclass(frozen=True, eq=False)
 class LinearProgram:
     """row_lower <= a x <= row_upper, and an objective linear in x once the data are known."""
@@ -138,8 +132,8 @@ class LinearProgram:
     bilinear: sp.csr_matrix  # (n_columns, n_columns), symmetric: objective ½ xᵀ Q x + linear·x
     constant: float
 
-    def numbers(self) -> Numbers:
-        """The current bounds of the Pyomo variables, and the costs that follow.
+    def now(self) -> Instantiated:
+        """The program under the current bounds of the Pyomo variables.
 
         Raises:
             ValueError: two variables that are free multiply each other.
@@ -149,30 +143,19 @@ class LinearProgram:
         data = np.where(free, 0.0, lower)
         if (self.bilinear @ free.astype(float))[free].any():
             raise ValueError("the objective is not linear in the free variables")
-        slope = self.bilinear @ data
-        cost = np.where(free, self.linear + slope, 0.0)
-        constant = self.constant + float(data @ (self.linear + 0.5 * slope))
-        return Numbers(lower, upper, cost, constant)
-
-    def free_form(self, numbers: Numbers) -> FreeForm:
-        """Remove the data, and tell equalities from inequalities."""
-        free, rows = numbers.free, self.a.tocsr()
-        shift = self.a @ np.where(free, 0.0, numbers.lower)
+        slope, rows, shift = self.bilinear @ data, self.a.tocsr(), self.a @ data
         equal = self.row_lower == self.row_upper
-        return FreeForm(
-            cost=numbers.cost[free],
+        form = FreeForm(
+            cost=(self.linear + slope)[free],
             equal=sp.csc_matrix(rows[equal][:, free]),
             right=(self.row_lower - shift)[equal],
             between=sp.csc_matrix(rows[~equal][:, free]),
             low=(self.row_lower - shift)[~equal],
             high=(self.row_upper - shift)[~equal],
-            lower=numbers.lower[free],
-            upper=numbers.upper[free],
+            lower=lower[free],
+            upper=upper[free],
         )
-
-    def objective(self, numbers: Numbers, values: Array) -> float:
-        """The Pyomo model's objective at values of all columns."""
-        return float(numbers.cost @ values) + numbers.constant
+        return Instantiated(form, data, free, self.constant + float(data @ (self.linear + 0.5 * slope)))
 
 
 def bounds(columns: Sequence[Any]) -> Array:

@@ -1,11 +1,11 @@
-"""What a solver claims, in a word and in a sentence; what it reports, and what a compiled model can do."""
+"""What a solver claims, in a word and in a sentence, and what it reports."""
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 #: A solver's own options by name.
 Options = Mapping[str, Any]
@@ -46,11 +46,3 @@ class Outcome:
     objective: float | None
     version: str
     message: str
-
-
-class Compiled(Protocol):
-    """A model ready to be solved again and again."""
-
-    def solve(self, time_limit_s: float | None = None) -> Outcome:
-        """Solve for the current variable bounds and initial values; the first call pays for set-up."""
-        ...

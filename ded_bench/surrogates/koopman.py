@@ -148,22 +148,15 @@ class Koopman:
     def _check_shapes(self, path: str | Path, case: Case) -> None:
         n = self.k.shape[0] if self.k.ndim else 0
         n_gen, n_in = len(case.generators), len(case.generators) + len(case.loads)
-        expected = {
-            "k": (n, n),
-            "b": (n, n_in),
-            "g": (n, n_in),
-            "lift": (n, 2 * case.n_bus + n_in + 1),
-        }
+        wanted = {"k": (n, n), "b": (n, n_in), "g": (n, n_in), "lift": (n, 2 * case.n_bus + n_in + 1)}
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(path, name, f"has shape {getattr(self, name).shape}, expected {shape}")
         width = 2 * n_gen + 1
         for i, (weight, bias) in enumerate(self.mlp):
             if bias.ndim != 1 or weight.shape != (len(bias), width):
                 raise InputError(path, f"mlp.{i}", "has the wrong shape")
             width = len(bias)
-        for name in ("k", "b", "g", "lift"):
-            if getattr(self, name).shape != expected[name]:
-                raise InputError(
-                    path, name, f"has shape {getattr(self, name).shape}, expected {expected[name]}"
-                )
         if n < n_gen + 1 or (width > n - n_gen - 1 and self.mlp):
             raise InputError(path, "k", "has too few observables")
 

@@ -11,7 +11,7 @@ from ded_bench.methods.admm.problems import draw
 from ded_bench.methods.admm.torch_iterations import TorchIterations
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
-from ded_bench.methods.dpc.policy_network import StagedNetwork
+from ded_bench.methods.dpc.training import StagedNetwork
 from ded_bench.methods.dpc_paper.paper_policy import PaperPolicy, n_channels
 from ded_bench.methods.dpc_paper.paper_training import PaperNetwork
 from ded_bench.methods.stacked_instances import StackedInstances

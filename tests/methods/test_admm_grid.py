@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods.admm.modal_grid import SMALLEST_COST
-from ded_bench.methods.admm.network_kernels import MISMATCH
+from ded_bench.methods.admm.modal_grid import MISMATCH, SMALLEST_COST
 from ded_bench.methods.admm.problems import POINTS, problems_of, sampled
 from ded_bench.methods.stacked_instances import load_segments
 from ded_bench.plants.simulate import simulate

@@ -9,14 +9,14 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_ko
-from ded_bench.methods.ded_ko import SOLVERS, build_ded_ko, set_instance
+from ded_bench.methods.ded_ko import build_ded_ko, set_instance
 from ded_bench.methods.first_schedules import slow_dispatch
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Artifact, Settings
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.compile import SOLVERS, OnArrays
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.instance_model import model_along
 from ded_bench.surrogates.koopman import Koopman
@@ -55,7 +55,7 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Ko
     again = solve(last)
     model = build_ded_ko(case, koopman, last.steps)
     set_instance(model, case, koopman, last, "TO")
-    fresh = compile_model(model, slug, SOLVERS[slug]).solve()
+    fresh = OnArrays(model, slug).solve()
     # PIQP leaves a relative gap of 1e-7.
     assert again.solver_objective == pytest.approx(fresh.objective, rel=2e-7 if slug == "piqp" else 1e-9)
     assert again.build_s < 0.5  # built before

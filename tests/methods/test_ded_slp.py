@@ -21,7 +21,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.compile import OnArrays
 from ded_bench.solvers.status import Status
 from tests.methods import on_surrogates
 from tests.methods.pyomo_models import build_ded_slp
@@ -53,7 +53,7 @@ def test_program_is_the_model_with_every_point(case, index):
     assert answer.status == Status.OPTIMAL
     prediction = made.predict(answer.x)
     whole = build_ded_slp(case, instance, bounds, made.model)
-    outcome = compile_model(whole, "highs").solve()
+    outcome = OnArrays(whole, "highs").solve()
     assert outcome.status == Status.OPTIMAL
     # Within a piece P_s of both signs costs the program too little: its answer may be a little dearer,
     # the more so the shorter the horizon is.

@@ -16,7 +16,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.limits import IslandRegime
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.compile import compile_model
+from ded_bench.solvers.compile import OnArrays
 from ded_bench.solvers.status import Status
 from tests.lagged_plant import LAG_S, lagged, lagged_case
 from tests.methods.on_surrogates import short
@@ -93,7 +93,7 @@ def test_the_program_is_the_model_with_every_point(slow: Case, bounded: str) -> 
     model = plant_of(slow).linearise_along(along, POINTS)
     program = KnotProgram(slow, instance, bounds, model)
     attempt = solve_with_rows_added(program, set(), Rows(1e-7, 1e-7), np.inf)
-    outcome = compile_model(build_ded_slp(slow, instance, bounds, model), "highs").solve()
+    outcome = OnArrays(build_ded_slp(slow, instance, bounds, model), "highs").solve()
     assert attempt.status == outcome.status == Status.OPTIMAL
     # Within a piece P_s of both signs costs the program too little.
     assert outcome.objective <= attempt.solution.objective * (1 + 1e-8)

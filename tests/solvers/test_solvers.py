@@ -9,9 +9,9 @@ import pyomo.environ as pyo
 import pytest
 import scipy.sparse as sp
 
-from ded_bench.files.errors import InputError
 from ded_bench.solvers import highs, piqp
-from ded_bench.solvers.compile import SOLVERS, compile_model, fix
+from ded_bench.solvers.compile import SOLVERS, OnArrays, fix
+from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.solvers.status import Status
 
@@ -84,7 +84,7 @@ def transport(size: int = 60) -> pyo.ConcreteModel:
 def test_known_optima_before_and_after_new_numbers(solver: str) -> None:
     """Per unit of need, x costs its price and y half of it; then data and bounds change in place."""
     model = diet()
-    compiled = compile_model(model, solver)
+    compiled = OnArrays(model, solver)
     for prices, need, x, y in (((2.0, 3.0), 4.0, 0, 2), ((1.0, 3.0), 4.0, 3, 0.5), ((1.0, 3.0), 2.0, 2, 0)):
         for i in (0, 1):
             fix(model.price[i], prices[i])
@@ -103,12 +103,12 @@ def test_known_optima_before_and_after_new_numbers(solver: str) -> None:
 def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails(solver: str) -> None:
     model = diet()
     model.y.setub(0.25)
-    outcome = compile_model(model, solver).solve()
+    outcome = OnArrays(model, solver).solve()
     assert outcome.status == Status.INFEASIBLE
     assert not outcome.has_values
     assert outcome.objective is None
     model = diet(prices=(2.0, -1.0))
-    outcome = compile_model(model, solver).solve()
+    outcome = OnArrays(model, solver).solve()
     assert outcome.status == Status.FAILED
     assert outcome.message
 
@@ -116,7 +116,7 @@ def test_what_cannot_be_is_infeasible_and_what_has_no_end_fails(solver: str) -> 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
     model = transport()
-    compiled = compile_model(model, solver)
+    compiled = OnArrays(model, solver)
     whole = compiled.solve()
     assert whole.status == Status.OPTIMAL
     assert compiled.solve(1e-4).status == Status.TIME_LIMIT
@@ -125,32 +125,27 @@ def test_a_time_limit_stops_one_solve_and_not_the_next(solver: str) -> None:
     assert again.objective == pytest.approx(whole.objective, rel=1e-7)
 
 
-@pytest.mark.parametrize("solver", ["piqp", "highs"])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_linear_solvers_refuse_what_is_not_linear(solver: str) -> None:
     model = diet()
     model.curved = pyo.Constraint(expr=model.x**2 + model.y <= 9)
     with pytest.raises(ValueError, match="curved is not linear"):
-        compile_model(model, solver)
+        OnArrays(model, solver)
     model = diet()
     model.need.setub(None)
     model.total.expr += model.need * model.x
     with pytest.raises(ValueError, match="not linear in the free variables"):
-        compile_model(model, solver).solve()
+        OnArrays(model, solver).solve()
     with pytest.raises(ValueError, match="not linear"):
-        compile_model(rosenbrock(), solver).solve()
+        OnArrays(rosenbrock(), solver).solve()
 
 
 def test_ipopt_solves_nonlinear_models() -> None:
     model = rosenbrock()
-    outcome = compile_model(model, "ipopt").solve()
+    outcome = CasadiIpopt(model).solve()
     assert outcome.status == Status.OPTIMAL
     assert outcome.iterations > 5
     assert (model.x.value, model.y.value) == pytest.approx((1.0, 1.0))
     model.x.setub(0.5)  # the valley's floor is y = x²
-    outcome = compile_model(model, "ipopt").solve()
+    outcome = CasadiIpopt(model).solve()
     assert outcome.objective == pytest.approx(0.25, abs=1e-6)
-
-
-def test_an_unknown_solver_is_named() -> None:
-    with pytest.raises(InputError, match="known: ipopt"):
-        compile_model(diet(), "simplex")

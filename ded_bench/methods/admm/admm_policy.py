@@ -23,7 +23,7 @@ from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
-from ded_bench.plants.lossless.network import PowerFlowError
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -76,7 +76,7 @@ class AdmmPolicy(TrainedPolicy):
         self.scope.check(instances)
         try:
             return problems_of(self.scope.case, instances, self.grid.points)
-        except PowerFlowError as error:
+        except SimulationError as error:
             raise InputError(f"instance {instances[0].id}", "initial", str(error)) from None
 
     def powers(self, problems: StackedInstances, further: CompiledIterations | None = None) -> Array:

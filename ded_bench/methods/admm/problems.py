@@ -32,7 +32,7 @@ def problems_of(case: Case, instances: Sequence[Instance], points: Array) -> Sta
         points: the time grid, (n_points,), s.
 
     Raises:
-        PowerFlowError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
+        SimulationError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
     """
     given = StackedInstances.of(case, instances)
     return dataclasses.replace(given, load=sampled(given.load, points))

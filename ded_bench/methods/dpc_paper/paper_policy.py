@@ -81,7 +81,7 @@ def channels(network: Network, instances: Sequence[Instance], knots: Array) -> A
         Shape (batch, n_channels, n_knots): pu, cost per pu, rad, pu, rad/s, pu.
 
     Raises:
-        PowerFlowError: an instance has no angles at t = 0.
+        SimulationError: an instance has no angles at t = 0.
     """
     case = network.case
     theta = np.stack([network.initial_angles(instance) for instance in instances])

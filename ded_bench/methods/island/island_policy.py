@@ -49,11 +49,6 @@ class IslandPolicy(TrainedPolicy):
         """The iterations."""
         return IslandIterations(self.grid, self.weights["settings"])
 
-    @functools.cached_property
-    def mend(self) -> IslandIterations:
-        """Iterations without costs."""
-        return mending_of(self.grid)
-
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
         return np.stack([self.powers(instance) for instance in instances])
@@ -87,7 +82,7 @@ class IslandPolicy(TrainedPolicy):
                 found = self.grid.follow(asked, answer)
                 if found.excess <= -NEAR:
                     break
-                answer, _ = self.mend(asked, found, self.training["mending"], False)
+                answer, _ = mending_of(self.grid)(asked, found, self.training["mending"], False)
         except SimulationError:
             pass
         return answer

@@ -28,6 +28,7 @@ from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import AgcState, Instance, State
 from ded_bench.problem.quantities import Array
+from ded_bench.problem.sampling import rounded
 from ded_bench.problem.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -190,8 +191,13 @@ class DetailedPlant:
         return columns | ({"agc": found.held} if self.case.agc is not None else {})
 
     def balanced(self, instance: Instance) -> Instance:
-        """See `Plant.balanced`: on an island all machines take what powers and losses differ by."""
-        return instance if self.case.slack else self.dispatcher.balanced_instance(instance)
+        """See `Plant.balanced`: on an island all machines take what powers and losses differ by, rounded."""
+        if self.case.slack is not None:
+            return instance
+        p_load, start = instance.p_load(self.case, np.zeros(1))[0], instance.initial
+        power = rounded(self.dispatcher.balanced(instance.p_initial(self.case), p_load).power)
+        by_name = dict(zip(self.case.generators, power.tolist(), strict=True))
+        return instance.model_copy(update={"initial": start.model_copy(update={"power": by_name})})
 
     def nominal(self) -> NominalPoint:
         """See `Plant.nominal`; phase shifts of transformers are part of angles across them."""

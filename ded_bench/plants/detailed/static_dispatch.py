@@ -18,7 +18,6 @@ from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import rounded
 from ded_bench.problem.schedule import Schedule
 
 #: Balanced is what is short of less than this, pu; powers that move by less in a program stay.
@@ -226,17 +225,6 @@ class StaticDispatch:
         if agc is None or control is None:
             return 0.0
         return -control.k * agc.integral_rad if agc.next_s == 0.0 else agc.held_pu
-
-    def balanced_instance(self, instance: Instance) -> Instance:
-        """An instance whose powers at t = 0 are balanced, rounded as the sampler does.
-
-        Raises:
-            SimulationError: there are none within limits.
-        """
-        p_load = instance.p_load(self.case, np.zeros(1))[0]
-        power = self.balanced(instance.p_initial(self.case), p_load).power
-        by_name = dict(zip(self.case.generators, rounded(power).tolist(), strict=True))
-        return instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": by_name})})
 
     def regulated(self, near: Balance, p_load: Array, v_ref: Array) -> OperatingPoint:
         """The power flow whose voltages at machines are what exciters make of their references.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.lossless.network import Network, PowerFlowError
+from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, series_step
 from ded_bench.problem.case import Array, Case
@@ -67,10 +67,7 @@ class LosslessPlant:
 
     def initial(self, instance: Instance) -> LosslessState:
         """See `Plant.initial`; angles are those of `Network.initial_angles`."""
-        try:
-            theta = self.network.initial_angles(instance)
-        except PowerFlowError as error:
-            raise SimulationError(f"the system cannot follow this schedule: {error}") from None
+        theta = self.network.initial_angles(instance)
         fastest = float(np.abs(self.network.linearise(theta).modes()).max())
         omega, p_gen = instance.omega_initial(self.case), instance.p_initial(self.case)
         return LosslessState(theta, omega, p_gen, fastest / STEP_BY_MODE)
@@ -150,7 +147,7 @@ class LosslessPlant:
         case, network = self.case, self.network
         try:
             theta = network.power_flow(case.p_nominal, case.load_nominal)
-        except PowerFlowError as error:
+        except SimulationError as error:
             raise SimulationError(f"nominal powers: {error}") from None
         across = np.abs(theta @ network.incidence.T).max()
         p_slack = float(-case.p_nominal.sum() - case.load_nominal.sum())
@@ -183,18 +180,18 @@ class LosslessPlant:
         given = "power" if instance.initial.theta is None else "theta"
         if given == "power":
             both = np.vstack([instance.p_initial(case), p_gen]), np.vstack([p_load[:1], p_load])
-            with contextlib.suppress(PowerFlowError):  # at once is faster, one by one tells where it fails
+            with contextlib.suppress(SimulationError):  # at once is faster, one by one tells where it fails
                 self.network.power_flow(*both)
                 return
         try:
             self.network.initial_angles(instance)
-        except PowerFlowError as error:
+        except SimulationError as error:
             problem = f"initial loads and {given} cannot be served: {error}"
             raise InputError(source, f"load, initial.{given}", problem) from None
         for t, gen, load in zip(times, p_gen, p_load, strict=True):
             try:
                 self.network.power_flow(gen, load)
-            except PowerFlowError as error:
+            except SimulationError as error:
                 raise InputError(source, "load", f"loads at t = {t:g} s cannot be served: {error}") from None
 
 

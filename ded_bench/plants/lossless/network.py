@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
-
-
-class PowerFlowError(ArithmeticError):
-    """The network cannot carry the powers asked of it: the power flow has no stable solution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +117,7 @@ class Network:
             θ, rad, and f(θ), pu; each of shape (..., n_bus).
 
         Raises:
-            PowerFlowError: no solution from this guess.
+            SimulationError: no solution from this guess.
         """
         return self._newton(theta, injection, self.grid)
 
@@ -128,7 +125,7 @@ class Network:
         """Equilibrium angles for given generator and load injections, shape (..., n_bus), rad.
 
         Raises:
-            PowerFlowError: there is no solution, or it is not a stable one (an angle across a line
+            SimulationError: there is no solution, or it is not a stable one (an angle across a line
                 beyond 90 degrees).
         """
         shape = np.broadcast_shapes(p_gen.shape[:-1], p_load.shape[:-1])
@@ -138,7 +135,7 @@ class Network:
         theta = wanted @ self._first_step  # Newton's first step from θ = 0
         theta, _ = self._newton(theta, wanted[..., self.unknown], self._whole)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
-            raise PowerFlowError("an angle across a line exceeds 90 degrees")
+            raise SimulationError("an angle across a line exceeds 90 degrees")
         return theta
 
     def initial_angles(self, instance: Instance) -> Array:
@@ -148,7 +145,7 @@ class Network:
         the loads fix the others.
 
         Raises:
-            PowerFlowError: there are no such angles.
+            SimulationError: there are no such angles.
         """
         p_load = instance.p_load(self.case, np.zeros(1))[0]
         theta = instance.theta_initial(self.case)
@@ -188,5 +185,5 @@ class Network:
         except np.linalg.LinAlgError:
             solved = False
         if not solved:
-            raise PowerFlowError("the power flow has no solution")
+            raise SimulationError("the power flow has no solution")
         return theta, f

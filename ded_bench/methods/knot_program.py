@@ -88,8 +88,7 @@ class KnotProgram:
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
         radius: most that a set-point may move, pu (trust region).
-        condensed: whether states are substituted; None: on islands. An interior point with rows at many
-            points of every interval leaves less excess between them where its price is all that limits it.
+        condensed: whether states are substituted; None: on islands.
         before: the program along the trajectory before, near whose end to start.
     """
 
@@ -186,7 +185,7 @@ class KnotProgram:
         return self._at_all_knots(once, time_limit_s), widest
 
     def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with a priced excess of outputs in every interval, and with the reserve; not condensed.
+        """Solve with a priced excess of outputs in every interval, and with the reserve.
 
         Args:
             limits, time_limit_s: see `solve`.
@@ -195,6 +194,8 @@ class KnotProgram:
             As `solve`; the objective is not that of the plan alone.
         """
 
+        if self.condensed:
+            return self._at_all_knots(functools.partial(self._soft_condensed, limits), time_limit_s)
         deadline = time.perf_counter() + time_limit_s
         form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
         if self._reserve is not None:
@@ -206,6 +207,19 @@ class KnotProgram:
         if answer.status == Status.FAILED:
             answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
         return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
+
+    def _soft_condensed(self, limits: Indices, left_s: float) -> tuple[FormAnswer, Array]:
+        """The program with priced excess, from where the last one ended; how far limits are widened."""
+        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
+        places = self._output_rows.places(self._held, limits)
+        both = np.append(places, -1 - places)
+        start = None if self._basis is None else self._basis.start(both)
+        answer = solve_by_highs(form, max(left_s, 0.0), start)
+        if answer.status != Status.OPTIMAL:
+            return answer, np.zeros(self._n)
+        if answer.basis is not None:
+            self._basis = BasisByPlaces.of(answer.basis, both)
+        return replace(answer, x=answer.x[place]), answer.x[excess]
 
     def _at_all_knots(
         self, once: Callable[[float], tuple[FormAnswer, Array]], time_limit_s: float
@@ -268,7 +282,10 @@ class KnotProgram:
         model = self.model
         p_gen = np.array(model.p_gen)
         p_gen[1:] = np.clip(p_gen[1:] + columns[self._columns.u], self._case.p_min, self._case.p_max)
-        outputs, p_slack = model.outputs(p_gen - model.p_gen)
+        if self.condensed:
+            outputs, p_slack = self._output_rows.outputs(p_gen - model.p_gen), model.p_slack
+        else:
+            outputs, p_slack = model.outputs(p_gen - model.p_gen)
         if model.delivered is None:
             generation = float((self._columns.generation * p_gen).sum())
         else:
@@ -337,15 +354,20 @@ class KnotProgram:
         return np.searchsorted(self.model.points, points) - 1
 
     @functools.cached_property
-    def _speed_at_knots(self) -> Array:
-        """C of outputs at all knots but the first: a knot belongs to the interval after it."""
+    def _speed(self) -> Array:
+        """C of outputs in all intervals, (n_intervals, n_out, n_state)."""
         speed = self.model.speed
         if isinstance(speed, slice):
             n_out = len(self.bounds.limit)
             columns = np.zeros((self._n, n_out, self.model.slack.shape[1]))
             columns[:, :, speed] = np.eye(n_out)
             return columns
-        return np.concatenate([speed[1:], speed[-1:]])
+        return speed
+
+    @property
+    def _speed_at_knots(self) -> Array:
+        """C of outputs at all knots but the first: a knot belongs to the interval after it."""
+        return np.concatenate([self._speed[1:], self._speed[-1:]])
 
     def _rows_held(self, limits: Indices) -> sp.csc_matrix:
         """Outputs at knots and between them whose limits have rows."""
@@ -355,7 +377,7 @@ class KnotProgram:
 
     @functools.cached_property
     def _output_rows(self) -> OutputRows:
-        return OutputRows(self.model, self._speed_at_knots)
+        return OutputRows(self.model, self._speed)
 
     @functools.cached_property
     def _all_knots(self) -> sp.csc_matrix:

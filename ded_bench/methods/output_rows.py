@@ -1,11 +1,11 @@
 """Rows of outputs in the set-points alone, for condensed programs, and a simplex basis by them.
 
-Every limit of an output has a place: those at knots come first, by knots; those between knots follow, by grid
-points.
+Every limit of an output has a place, by grid points.
 """
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -21,46 +21,82 @@ ROUND_OFF = 1e-13
 
 
 class OutputRows:
-    """Rows of one model; each is found once.
+    """Rows of one model at all grid points, found once.
 
     Args:
         model: a linear model along a trajectory.
-        at_knots: C of outputs at all knots but the first, (n_intervals, n_out, n_state).
+        speed: C of outputs, (n_intervals, n_out, n_state).
     """
 
-    def __init__(self, model: TimeVarying, at_knots: Array) -> None:
-        self._model, self._at_knots = model, at_knots
-        self._n_out = at_knots.shape[1]
-        self._known: dict[int, Array] = {}
+    def __init__(self, model: TimeVarying, speed: Array) -> None:
+        self._model, self._speed, self._n_out = model, speed, speed.shape[1]
+        self._in_set_points: dict[int, Array] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
-        between = held.size + limits[:, 1] * self._n_out + limits[:, 0]
-        return np.append(np.flatnonzero(held), between)
+        knot, output = np.nonzero(held)
+        point = np.append(self._model.points[1:][knot], limits[:, 1])
+        return point * self._n_out + np.append(output, limits[:, 0])
 
     def matrix(self, places: Indices) -> sp.csc_matrix:
         """Rows of limits at places, columns by knots but the first and generators."""
-        new, first = sorted(set(places.tolist()) - self._known.keys()), self._at_knots[..., 0].size
-        for some, rows in (
-            (np.array([place for place in new if place < first], dtype=int), self._knot_rows),
-            (np.array([place for place in new if place >= first], dtype=int), self._rows_between),
-        ):
-            if len(some):
-                found = self._model.by_set_points(rows(some))[:, 1:].reshape(len(some), -1)
-                found[np.abs(found) < ROUND_OFF] = 0.0
-                self._known.update(zip(some.tolist(), found, strict=True))
+        new = np.array(sorted(set(places.tolist()) - self._in_set_points.keys()), dtype=int)
+        if len(new):
+            found = self._model.by_set_points(self._local(new))[:, 1:].reshape(len(new), -1)
+            found[np.abs(found) < ROUND_OFF] = 0.0
+            self._in_set_points.update(zip(new.tolist(), found, strict=True))
         n_columns = self._model.p_gen[1:].size
-        values = np.array([self._known[place] for place in places.tolist()]).reshape(-1, n_columns)
-        return sp.csc_matrix(values)
+        values = [self._in_set_points[place] for place in places.tolist()]
+        return sp.csc_matrix(np.array(values).reshape(-1, n_columns))
 
-    def _knot_rows(self, places: Indices) -> LocalRows:
-        knot, output = np.divmod(places, self._n_out)
-        none = np.zeros((len(places), self._model.p_gen.shape[1]))
-        return LocalRows(knot + 1, self._at_knots[knot, output], none, none)
+    def outputs(self, u: Array) -> Array:
+        """Outputs at all grid points, (n_points, n_out), rad/s, under increments (n_knots, n_gen), pu."""
+        model, at, found = self._model, self._at_points, self._model.omega.copy()
+        for j, (x, first, last) in enumerate(
+            zip(model.states(u), model.points, model.points[1:], strict=False)
+        ):
+            found[first] += at.x[first] @ x
+            after = model.after_reset(x[None], np.array([j]))[0]
+            between = slice(first + 1, last)
+            found[between] += at.x[between] @ after + at.start[between] @ u[j] + at.end[between] @ u[j + 1]
+        found[-1] += at.x[-1] @ model.states(u)[-1]
+        return found
 
-    def _rows_between(self, places: Indices) -> LocalRows:
-        point, output = np.divmod(places - self._at_knots[..., 0].size, self._n_out)
-        return self._model.frequency_rows(output, point)
+    def _local(self, places: Indices) -> LocalRows:
+        """Rows in the variables of intervals; a knot's are those of the interval after it."""
+        (point, output), model = np.divmod(places, self._n_out), self._model
+        interval = np.searchsorted(model.points, point, side="right") - 1
+        rows = LocalRows(interval, *(part[point, output] for part in self._at_points[1:]))
+        between = np.flatnonzero(point > model.points[interval])
+        rows.x[between] = model.before_reset(rows.x[between], interval[between])
+        return rows
+
+    @functools.cached_property
+    def _at_points(self) -> LocalRows:
+        """All outputs at all grid points, (n_points, n_out, any), as if no interval began with a reset.
+
+        C times the map from an interval's start, from grid point to grid point.
+        """
+        model, (n_state, n_gen) = self._model, self._model.step.g.shape[1:]
+        interval, length = np.arange(len(model.lengths)), model.lengths
+        shape, owner = (len(model.omega), self._n_out), np.repeat(interval, length)
+        x, start, end = np.zeros((*shape, n_state)), np.zeros((*shape, n_gen)), np.zeros((*shape, n_gen))
+        x[-1] = self._speed[-1]
+        costate, (f, g, h) = self._speed, model.step
+        on_start = on_slope = np.zeros((len(interval), self._n_out, n_gen))
+        for r in range(int(length.max())):
+            if not (more := length[interval] > r).all():
+                interval, costate, on_start, on_slope = (
+                    part[more] for part in (interval, costate, on_start, on_slope)
+                )
+                f, g, h = model.step.take(interval)
+            point = model.points[interval] + r
+            rise = on_slope / length[interval, None, None]
+            x[point], start[point], end[point] = costate, on_start - rise, rise
+            on_slope = on_slope + on_start + costate @ h
+            on_start = on_start + costate @ g
+            costate = costate @ f
+        return LocalRows(np.append(owner, len(length)), x, start, end)
 
 
 class BasisByPlaces(NamedTuple):

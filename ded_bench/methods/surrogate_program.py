@@ -16,6 +16,7 @@ from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.reserve import Reserve
 from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
+from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -37,6 +38,7 @@ class Plan:
 
     last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
     reserve: Reserve | None = None
+    state: PlantState = None  # of the plant at t = 0; None: the instance's
 
 
 def solve_on_surrogate(
@@ -74,13 +76,12 @@ def solve_on_surrogate(
         rows = Rows(left, left, soft=True)
 
     def follow(p_gen: Array) -> TimeVarying:
-        return model_along(case, surrogate, instance, p_gen, points, exact=plan is None)
+        return model_along(case, surrogate, instance, p_gen, points, plan is None, plan and plan.state)
 
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
         reserve = None if plan is None else plan.reserve
-        condensed = None if plan is None else False
-        program = KnotProgram(case, instance, bounds, model, reserve, condensed=condensed)
+        program = KnotProgram(case, instance, bounds, model, reserve)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
         limits = program.near(program.model.omega) if is_near else set()

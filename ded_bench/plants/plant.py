@@ -64,8 +64,12 @@ class Plant(Protocol):
     def fingerprint(self) -> str:
         """Twelve hex digits that change with the plant's data."""
 
-    def initial(self, instance: Instance) -> PlantState:
+    def initial(self, instance: Instance, estimate: PlantState = None) -> PlantState:
         """The state at t = 0.
+
+        Args:
+            instance: what is measured of it.
+            estimate: has all that a measurement does not give; None: that is stationary.
 
         Raises:
             SimulationError: there is none.

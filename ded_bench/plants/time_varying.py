@@ -142,9 +142,7 @@ class TimeVarying:
         deviation = np.zeros((len(self.omega), x.shape[1]))
         deviation[self.points] = x
         interval = np.arange(len(length))
-        if self.reset is not None:
-            state = state.copy()
-            state[self.reset.intervals] = state[self.reset.intervals] @ self.reset.f.T
+        state = self.after_reset(state, interval)
         for r in range(1, int(length.max())):
             if not (length[interval] > r).all():
                 some = length[interval] > r
@@ -154,6 +152,22 @@ class TimeVarying:
             force = force + growth
             deviation[self.points[interval] + r] = state
         return self._outputs(deviation)
+
+    def after_reset(self, states: Array, intervals: Indices) -> Array:
+        """Deviations at the start of intervals, (n, n_state), after the reset that some begin with."""
+        if self.reset is None:
+            return states
+        begun = np.isin(intervals, self.reset.intervals)
+        return np.where(begun[:, None], states @ self.reset.f.T, states)
+
+    def before_reset(self, rows: Array, intervals: Indices) -> Array:
+        """Rows in the state after the start of intervals, (n, ..., n_state), as rows in that before it."""
+        if self.reset is None:
+            return rows
+        begun = np.isin(intervals, self.reset.intervals)
+        rows = rows.copy()
+        rows[begun] = rows[begun] @ self.reset.f
+        return rows
 
     @property
     def _intervals(self) -> Indices:
@@ -327,9 +341,7 @@ class TimeVarying:
                 on_start += through
                 on_slope += (r - 1) * through + costate @ h
                 costate = costate @ f
-        if self.reset is not None:
-            begun = np.isin(chosen, self.reset.intervals)
-            costate[begun] = costate[begun] @ self.reset.f
+        costate = self.before_reset(costate, chosen)
         end = on_slope / lengths[:, None, None]
         return LocalRows(np.arange(n), costate, on_start - end, end)
 

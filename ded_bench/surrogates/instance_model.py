@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import PlantState
 from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, repeated
 from ded_bench.problem.case import Array, Case
@@ -15,7 +16,13 @@ from ded_bench.surrogates.koopman import Koopman
 
 
 def model_along(
-    case: Case, surrogate: Surrogate, instance: Instance, p_gen: Array, points: Indices, exact: bool = True
+    case: Case,
+    surrogate: Surrogate,
+    instance: Instance,
+    p_gen: Array,
+    points: Indices,
+    exact: bool = True,
+    state: PlantState = None,
 ) -> TimeVarying:
     """The linear model of one instance by which a surrogate answers to schedules linear between knots.
 
@@ -28,6 +35,7 @@ def model_along(
             dispatch of every second.
         points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
         exact: see `Plant.advance`.
+        state: of the plant at t = 0; None: the instance's.
 
     Raises:
         SimulationError: the system cannot follow these powers.
@@ -37,7 +45,7 @@ def model_along(
         surrogate.check_step(instance)
         return _lifted_along(case, surrogate, instance, p_gen, points)
     schedule, plant = Schedule(t=instance.grid[points], p=p_gen), surrogate.plant
-    return plant.linearise_along(simulate(case, instance, schedule, plant, exact=exact), points)
+    return plant.linearise_along(simulate(case, instance, schedule, plant, state, exact), points)
 
 
 def _lifted_along(

@@ -21,7 +21,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed.detailed_linearisation import linearised
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem
-from ded_bench.plants.detailed.start import initial_point, start
+from ded_bench.plants.detailed.start import corrected, initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import Indices, TimeVarying
@@ -77,13 +77,15 @@ class DetailedPlant:
         """Its static dispatch."""
         return StaticDispatch(self.system)
 
-    def initial(self, instance: Instance) -> DetailedState:
-        """See `Plant.initial` and `start`.
+    def initial(self, instance: Instance, estimate: DetailedState | None = None) -> DetailedState:
+        """See `Plant.initial`, `start` and `corrected`.
 
         Raises:
             InputError: powers and loads at t = 0 are not balanced.
         """
-        return start(self.system, instance)
+        if estimate is None or instance.initial.measured is None:
+            return start(self.system, instance)
+        return corrected(self.system, instance, estimate)
 
     def control(self, state: DetailedState, dt_s: float) -> SecondaryControl:
         """Secondary control by the points of a grid.

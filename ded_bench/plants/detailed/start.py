@@ -25,6 +25,7 @@ from ded_bench.plants.detailed.machine_arrays import (
 from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import Array
 
@@ -94,12 +95,37 @@ def start(system: PowerSystem, instance: Instance) -> DetailedState:
     if (given := instance.mechanical_initial(case)) is not None:
         mechanical[machines] = given
     x[GATE] = reference - data.droop * x[SPEED]
-    through = 1.0 - data.reheat
-    lagging = np.divide(mechanical - data.reheat * x[GATE], through, out=x[GATE].copy(), where=through != 0.0)
-    x[TURBINE] = lagging
+    x[TURBINE] = _turbine(system, x, mechanical)
     x[WASHOUT] = data.ks * x[SPEED]
     x[LEAD_A] = x[LEAD_B] = 0.0
     return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
+
+
+def corrected(system: PowerSystem, instance: Instance, estimate: DetailedState) -> DetailedState:
+    """An estimate of the state at t = 0 with what an instance has measured of it in its place."""
+    case, data, machines = system.case, system.data, system.scheduled
+    x = estimate.x.copy()
+    x[SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
+    if (theta := instance.theta_initial(case)) is not None:
+        x[DELTA, machines] = theta
+        x[DELTA] -= data.inertia @ x[DELTA]
+    held, next_s = estimate.held, estimate.next_s
+    if (agc := instance.initial.agc) is not None:
+        held, next_s = agc.held_pu, next_s if agc.next_s is None else agc.next_s
+        x[DELTA] += agc.integral_rad
+    if (mechanical := instance.mechanical_initial(case)) is not None:
+        x[TURBINE, machines] = _turbine(system, x, mechanical, machines)
+    p_set = instance.p_initial(case)
+    return estimate._replace(x=x, held=held, next_s=next_s, p_set=p_set, carried=None)
+
+
+def _turbine(
+    system: PowerSystem, x: Array, mechanical: Array, machines: Indices | slice = slice(None)
+) -> Array:
+    """States of turbines that deliver given powers, (n,), pu; those of gates where they do not lag."""
+    gate, reheat = x[GATE, machines], system.data.reheat[machines]
+    through = 1.0 - reheat
+    return np.divide(mechanical - reheat * gate, through, out=gate.copy(), where=through != 0.0)
 
 
 def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Array) -> Array:

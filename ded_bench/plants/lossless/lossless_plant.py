@@ -65,7 +65,7 @@ class LosslessPlant:
         """That of the case, which holds all of its data."""
         return self.case.fingerprint
 
-    def initial(self, instance: Instance) -> LosslessState:
+    def initial(self, instance: Instance, estimate: LosslessState | None = None) -> LosslessState:
         """See `Plant.initial`; angles are those of `Network.initial_angles`."""
         theta = self.network.initial_angles(instance)
         fastest = float(np.abs(self.network.linearise(theta).modes()).max())

@@ -1,0 +1,75 @@
+"""What a measurement does not give, in operation: fluxes, exciters, valves; from a simulation of the plan.
+
+A planner that is asked again and again knows the plan that it gave, and what it planned it for. Its own
+simulation of that plan, from its own estimate then, has all states of the plant; what is measured replaces
+what it has of that. So with a forecast that comes true the estimate is the plant's state.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ded_bench.plants.plant import Plant, PlantState, SimulationError
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
+
+#: A plan in force that differs by more from the last one given is another, pu.
+SAME = 1e-6
+
+
+class _Given(NamedTuple):
+    """A plan, and what it was made for."""
+
+    instance: Instance
+    state: PlantState
+    schedule: Schedule
+
+
+class StateEstimate:
+    """Estimates of one plant's states, from plan to plan.
+
+    Args:
+        plant: what plans are made for.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant, self._given = plant, None
+
+    def initial(self, instance: Instance, in_force: Schedule | None) -> PlantState:
+        """The state at t = 0.
+
+        Args:
+            instance: what is measured.
+            in_force: the plan in force, on the time of the instance.
+
+        Raises:
+            SimulationError: see `Plant.initial`.
+        """
+        return self._plant.initial(instance, self._ahead(in_force))
+
+    def keep(self, instance: Instance, state: PlantState, schedule: Schedule | None) -> None:
+        """Remember the plan that was given for an instance and a state."""
+        self._given = None if schedule is None else _Given(instance, state, schedule)
+
+    def _ahead(self, in_force: Schedule | None) -> PlantState:
+        """What the last plan has led to at the instance's t = 0; None if another one is in force."""
+        if self._given is None or in_force is None or len(in_force.t) < 3:
+            return None
+        instance, state, schedule = self._given
+        passed_s = instance.horizon_s - float(
+            in_force.t[-2]
+        )  # the end of the plan in force lies before the last
+        k, ahead = round(passed_s / instance.dt_s), in_force.t[:-1]
+        if (
+            not 0 < k <= instance.steps
+            or np.abs(schedule.at(ahead + passed_s) - in_force.p[:-1]).max() > SAME
+        ):
+            return None
+        p_load = instance.p_load(self._plant.case)[: k + 1]
+        try:
+            p_set = schedule.at(instance.grid[: k + 1])
+            return self._plant.advance(state, p_set, p_load, instance.dt_s, exact=False).end
+        except SimulationError:
+            return None

@@ -115,8 +115,9 @@ class RealTimeSolver:
     @functools.cached_property
     def _estimate(self) -> StateEstimate | None:
         """On islands, where not all is measured."""
-        is_all = self.case.slack is not None or isinstance(self.surrogate, Koopman)
-        return None if is_all else StateEstimate(self.surrogate.plant)
+        if self.case.slack is not None or isinstance(self.surrogate, Koopman):
+            return None
+        return StateEstimate(self.surrogate.plant)
 
     @functools.cached_property
     def _reserve(self) -> Reserve | None:

@@ -36,7 +36,7 @@ class OutputRows:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
         knot, output = np.nonzero(held)
         point = np.append(self._model.points[1:][knot], limits[:, 1])
-        return point * self._n_out + np.append(output, limits[:, 0])
+        return np.asarray(point * self._n_out + np.append(output, limits[:, 0]))
 
     def matrix(self, places: Indices) -> sp.csc_matrix:
         """Rows of limits at places, columns by knots but the first and generators."""
@@ -86,9 +86,8 @@ class OutputRows:
         on_start = on_slope = np.zeros((len(interval), self._n_out, n_gen))
         for r in range(int(length.max())):
             if not (more := length[interval] > r).all():
-                interval, costate, on_start, on_slope = (
-                    part[more] for part in (interval, costate, on_start, on_slope)
-                )
+                interval, costate = interval[more], costate[more]
+                on_start, on_slope = on_start[more], on_slope[more]
                 f, g, h = model.step.take(interval)
             point = model.points[interval] + r
             rise = on_slope / length[interval, None, None]

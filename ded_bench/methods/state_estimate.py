@@ -35,7 +35,8 @@ class StateEstimate:
     """
 
     def __init__(self, plant: Plant) -> None:
-        self._plant, self._given = plant, None
+        self._plant = plant
+        self._given: _Given | None = None
 
     def initial(self, instance: Instance, in_force: Schedule | None) -> PlantState:
         """The state at t = 0.
@@ -47,7 +48,8 @@ class StateEstimate:
         Raises:
             SimulationError: see `Plant.initial`.
         """
-        return self._plant.initial(instance, self._ahead(in_force))
+        estimate = self._ahead(in_force)
+        return self._plant.initial(instance) if estimate is None else self._plant.initial(instance, estimate)
 
     def keep(self, instance: Instance, state: PlantState, schedule: Schedule | None) -> None:
         """Remember the plan that was given for an instance and a state."""

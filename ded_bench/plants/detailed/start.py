@@ -124,8 +124,9 @@ def _turbine(
 ) -> Array:
     """States of turbines that deliver given powers, (n,), pu; those of gates where they do not lag."""
     gate, reheat = x[GATE, machines], system.data.reheat[machines]
-    through = 1.0 - reheat
-    return np.divide(mechanical - reheat * gate, through, out=gate.copy(), where=through != 0.0)
+    through, lagging = 1.0 - reheat, gate.copy()
+    np.divide(mechanical - reheat * gate, through, out=lagging, where=through != 0.0)
+    return lagging
 
 
 def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Array) -> Array:

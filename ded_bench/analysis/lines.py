@@ -64,21 +64,16 @@ def newest(frame: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     Returns:
         Rows in their order, and a sentence for each line with older ones.
     """
-    kept, notes = [], []
-    for regime, key, group in groups(frame):
-        made = group["made_with"]
-        dates = group["date"].groupby(made).max()
-        if len(dates) > 1:
-            last = max(dates.items(), key=lambda pair: pair[1])[0]
-            left = int((made != last).sum())
-            notes.append(
-                f"{left} rows of {title(*key)} {regime} are of an older model or policy and left out; "
-                f"those of {last} count."
-            )
-            group = group[made == last]
-        kept.append(group.sort_values("date", kind="stable").drop_duplicates("instance", keep="last"))
-    rows = pd.concat(kept).sort_index() if kept else frame
-    return rows, notes
+    dated = frame.sort_values("date", kind="stable")
+    dated = dated.assign(last=dated.groupby(GROUP)["made_with"].transform("last"))
+    is_new = dated["made_with"] == dated["last"]
+    notes = [
+        f"{len(old)} rows of {title(*key)} {regime} are of an older model or policy and left out; "
+        f"those of {old['last'].iloc[0]} count."
+        for regime, key, old in groups(dated[~is_new])
+    ]
+    rows = dated[is_new].drop_duplicates([*GROUP, "instance"], keep="last").sort_index()
+    return rows.drop(columns="last"), notes
 
 
 def groups(frame: pd.DataFrame) -> Iterator[tuple[str, tuple[str, str, str], pd.DataFrame]]:

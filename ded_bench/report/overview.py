@@ -161,11 +161,8 @@ def points(grids: Sequence[Sources]) -> pd.DataFrame:
     rows = main_lines(pd.concat([grid.judged.assign(case=grid.case.id) for grid in grids], ignore_index=True))
     parts = []
     for grid in grids:
-        found = summary(rows[rows["case"] == grid.case.id])
-        timing = grid.timing.set_index(GROUP)
-        keys = pd.MultiIndex.from_frame(found[GROUP])
-        for name in ("solve_s", "peak_memory_mib"):
-            found[name] = timing[name].reindex(keys).to_numpy(dtype=float)
+        timing = grid.timing.set_index(GROUP)[["solve_s", "peak_memory_mib"]]
+        found = summary(rows[rows["case"] == grid.case.id]).join(timing, on=GROUP)
         found["is_reference"] = found["method"] == grid.reference.method
         parts.append(found.assign(case=grid.case.id, generators=len(grid.case.generators)))
     return pd.concat(parts, ignore_index=True)

@@ -1,4 +1,4 @@
-"""A CSV table that several processes add rows to: appended under a lock, compacted now and then.
+"""A CSV table that several processes add rows to: appended under a lock, compacted at the end of a run.
 
 A later line replaces an earlier one of the same key. A process that is killed leaves at most a torn last
 line: readers pass over it, the next writer cuts it off. Compacting replaces the file in one step; every
@@ -20,9 +20,6 @@ from ded_bench.files.table import Table, records
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T", bound="Keyed")
-
-#: A table is compacted when more lines than it has rows, and than this, are superseded.
-FEW_SUPERSEDED = 100
 
 
 class Keyed(Protocol):
@@ -99,8 +96,6 @@ class KeyedTable(Generic[K, T]):
                 os.fsync(file.fileno())
             self._take(rows)
             self._seen = _Seen(_mark(self.path.stat()), self._seen.end + len(text))
-            if self._superseded > max(len(self.rows), FEW_SUPERSEDED):
-                self._write_all()
 
     def compact(self) -> None:
         """Leave one line per key."""

@@ -62,8 +62,8 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
         made += [f"## {heading}", *blocks] if blocks else []
     if not found["solve_s"].notna().any():
         made.append("No method was timed alone yet; run `ded-bench bench`.")
-    folders_here = {grid.case.id: Path(os.path.relpath(grid.folder, out)).as_posix() for grid in grids}
-    items = [f"`{case}`: `{folder}`, seen from this page" for case, folder in folders_here.items()]
+    places = {grid.case.id: Path(os.path.relpath(grid.results.folder, out)) for grid in grids}
+    items = [f"`{case}`: `{place.as_posix()}`, seen from this page" for case, place in places.items()]
     hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]

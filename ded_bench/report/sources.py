@@ -63,11 +63,6 @@ class Sources:
     notes: list[str] = field(default_factory=list)
 
     @property
-    def folder(self) -> Path:
-        """The results folder."""
-        return self.results.folder
-
-    @property
     def tightest(self) -> str:
         """The regime with the tightest bound."""
         return min(self.case.regimes, key=lambda name: self.case.regimes[name].largest_hz)
@@ -90,12 +85,12 @@ class Sources:
     @cached_property
     def online(self) -> pd.DataFrame:
         """Rows of the closed loop: see `online_rows`."""
-        return online_rows(OnlineResults(self.folder), self.case.id)
+        return online_rows(OnlineResults(self.results.folder), self.case.id)
 
     @cached_property
     def practice(self) -> pd.DataFrame:
         """Rows of the closed loop on an island: see `practice_rows`."""
-        return practice_rows(OnlineResults(self.folder), self.case.id)
+        return practice_rows(OnlineResults(self.results.folder), self.case.id)
 
     def has_schedule(self, key: Key) -> bool:
         """Whether a row can be drawn: its instance is known and its schedule is in the folder."""

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.files import keyed_table
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table
@@ -75,14 +74,6 @@ def test_later_lines_win_and_rows_keep_their_places(tmp_path: Path) -> None:
     table.compact()
     assert (tmp_path / "table.csv").stat() == before
     assert [p.name for p in tmp_path.iterdir() if p.name != ".lock"] == ["table.csv"]
-
-
-def test_a_table_does_not_grow_without_end(tmp_path: Path) -> None:
-    table = old(tmp_path)
-    for i in range(5 * keyed_table.FEW_SUPERSEDED):
-        table.add([Old("a", i)])
-        assert len(lines(tmp_path)) <= keyed_table.FEW_SUPERSEDED + 2
-    assert old(tmp_path).rows == {"a": Old("a", i)}
 
 
 def test_others_rows_are_seen_and_kept(tmp_path: Path) -> None:

@@ -146,6 +146,7 @@ def operate(
     rows = [table.rows[o.row.key] for o in operations]
     if later := [row for row in (_compared(r, results) for r in rows) if row != table.rows[row.key]]:
         table.add(later)  # hindsight that was found after them
+    table.compact()
     return [table.rows[o.row.key] for o in operations]
 
 

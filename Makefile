@@ -2,7 +2,7 @@
 # What a target runs on which grid stands in studies/runs/<case>.toml; studies/run.py runs it.
 .DEFAULT_GOAL := help
 .PHONY: help venv instances train-ko solve-baselines train-dpc solve-dpc bench report online suite quick radau \
-  models certify test types tests clean
+  models certify docs test types tests clean
 
 PYTHON    ?= python3
 CASE      ?= 9bus
@@ -59,6 +59,9 @@ suite: $(STAMP)  ## the reports of all cases, then one page over them
 
 quick: $(STAMP)  ## the same road with 4 instances (1 for full DED) and little training, about three minutes
 	$(RUN) report --runs quick --results results/quick --limit 4 --workers "$(WORKERS)"
+
+docs: $(STAMP)  ## the API reference, from docstrings and types, in build/reference
+	$(BIN)/python docs/reference.py build/reference
 
 test: $(STAMP)  ## lint, type check and tests
 	$(BIN)/ruff check

@@ -26,6 +26,8 @@ from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, s
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.loop import History
 
+__all__ = ["DispatchEnv", "register"]
+
 Observed = dict[str, NDArray[np.float32]]
 
 #: A step, and times ahead at which loads are forecast, s.

@@ -98,6 +98,7 @@ def test_it_weighs_little(wheel: Path) -> None:
     """Models, policies and objectives of the reference runs; no rows, no schedules, no figures."""
     with zipfile.ZipFile(wheel) as archive:
         kept = [item for item in archive.infolist() if "_reference_runs/" in item.filename]
+        assert "ded_bench/py.typed" in archive.namelist()
         whole = sum(item.compress_size for item in archive.infolist())
     assert {Path(item.filename).suffix for item in kept} == {".safetensors", ".csv"}
     assert {Path(item.filename).name for item in kept if item.filename.endswith("csv")} == {"objectives.csv"}

@@ -63,7 +63,7 @@ class CasadiModel:
 
 
 def casadi_model(case: Case, plant: str | None = None) -> CasadiModel:
-    """The equations of a case's plant, its own unless another is named.
+    """The equations of a case's plant, by its name; None: the case's own.
 
     Raises:
         InputError: there is no such plant, or its equations are not known to CasADi.

@@ -127,7 +127,9 @@ def cost_and_excess(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What the scorer says of a batch of schedules, to be differentiated by their powers.
 
-    Arguments are those of `simulated`, and a regime of the case.
+    Args:
+        case, instances, t, power, plant, interval_s, threads: as for `simulated`.
+        regime: one of the case's.
 
     Returns:
         `objective` (batch,) and `freq_violation_hz` (batch,) of `Score`; the second changes with the point

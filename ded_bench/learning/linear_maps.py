@@ -43,8 +43,9 @@ def linearise(
 ) -> TimeVarying:
     """Simulate a schedule and linearise the plant along it: x⁺ = f x + g u + h Δu from point to point.
 
-    The plant may be named; None is the case's own. Knots of the model lie `interval_s` apart, and where the
-    schedule has rows or secondary control acts.
+    Args:
+        case, instance, schedule, plant: as for `simulate`.
+        interval_s: between knots of the model, s; more lie at the schedule's rows and where AGC acts.
 
     Raises:
         SimulationError: the plant cannot follow the schedule.
@@ -76,7 +77,8 @@ def condense(
 ) -> CondensedMap:
     """The linear map from a schedule's powers to frequencies and the slack's power, along its trajectory.
 
-    Its times are the knots of `linearise`.
+    Args:
+        case, instance, schedule, plant, interval_s: as for `linearise`; the knots are the map's times.
 
     Raises:
         SimulationError: the plant cannot follow the schedule.

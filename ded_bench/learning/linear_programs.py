@@ -86,8 +86,7 @@ def export_programs(
         LISTENERS.remove(keep)
     if not told:
         raise InputError("method", method, "solves no linear programs")
-    for name, values in zip(("start_s", "objective", "solver"), zip(*told, strict=True), strict=True):
-        arrays[name] = np.array(values)
+    arrays["start_s"], arrays["objective"], arrays["solver"] = map(np.array, zip(*told, strict=True))
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
     write_atomically(Path(path), content.getvalue())

@@ -19,9 +19,7 @@ from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, Column
-from ded_bench.report.figures.growth import growth_figure
-from ded_bench.report.figures.style import save_figure
-from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, write_page
+from ded_bench.report.page import Block, PageTable, bullets, folded, write_page
 from ded_bench.report.sources import Sources, read_sources
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
@@ -39,7 +37,7 @@ EXPLANATION = (
 
 
 def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write `overview.md`, `overview.html`, tables as CSV and a figure.
+    """Write `overview.md`, `overview.html` and tables as CSV.
 
     Args:
         folders: results folders, one shipped case each.
@@ -58,7 +56,7 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
         *_findings(grids),
         *folded("How to read this page", bullets(EXPLANATION)),
     ]
-    for heading, blocks in _parts(grids, found, out).items():
+    for heading, blocks in _parts(grids, found).items():
         made += [f"## {heading}", *blocks] if blocks else []
     if not found["solve_s"].notna().any():
         made.append("No method was timed alone yet; run `ded-bench bench`.")
@@ -81,8 +79,8 @@ def _findings(grids: Sequence[Sources]) -> list[Block]:
     return [bullets(said)]
 
 
-def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str, list[Block]]:
-    """Tables and the figure by the heading that they stand under."""
+def _parts(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, list[Block]]:
+    """Tables by the heading that they stand under."""
     cases = (REGIME, TITLE, *(Column(grid.case.id, grid.case.id) for grid in grids))
 
     def table(file: str, frame: pd.DataFrame, columns: tuple[Column, ...], caption: str) -> list[Block]:
@@ -93,7 +91,6 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
 
     operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
     excess = "Largest excess over the frequency bound, Hz"
-    with_slack = [grid.case.id for grid in grids if grid.case.slack is not None]
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
         "The grids": table("grids", sizes(grids), GRIDS, "The grids"),
@@ -107,7 +104,6 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame, out: Path) -> dict[str
             *side_by_side("violations", _number("freq_violation_hz_max"), excess),
         ],
         "Time and memory against size": [
-            *_growth(found[found["case"].isin(with_slack)], out),
             *side_by_side("times", _number("solve_s"), "Median time of a schedule, s"),
             *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
         ],
@@ -183,18 +179,6 @@ def across(table: pd.DataFrame, cell: Callable[[dict[str, Any]], str]) -> pd.Dat
             known = {name: cells.get(name) or "–" for name in order}
             rows.append({"regime": regime, "title": part["title"].iloc[0]} | known)
     return pd.DataFrame(rows, columns=["regime", "title", *order])
-
-
-def _growth(found: pd.DataFrame, out: Path) -> list[Block]:
-    """The figure, drawn into the page's folder."""
-    if not len(found):
-        return []
-    save_figure(growth_figure(found), out / "figures" / "growth.png")
-    caption = (
-        "Time, memory and mean gap of each method against the number of generators, on grids with a slack "
-        "bus; gaps are linear within ±0.01 %. Hollow: some schedules are infeasible."
-    )
-    return [Picture("figures/growth.png", caption)]
 
 
 def _gap(row: dict[str, Any]) -> str:

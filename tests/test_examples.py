@@ -93,3 +93,25 @@ ask = lambda i, _: Planned(do_mpc_dispatch.solve(i, "TO", case))
 assert len(run_loop(case, scenario, ask, LoopOptions()).answers) == 2
 """
     run_example(code, tmp_path)
+
+
+def test_an_agent_is_trained_and_answers(tmp_path: Path) -> None:
+    """What is written is the network that Stable-Baselines3 trained; ours keeps every limit of power."""
+    if importlib.util.find_spec("stable_baselines3") is None:
+        pytest.skip("stable_baselines3 is not installed")
+    code = """
+import ded_bench, numpy as np, trained_agent
+from pathlib import Path
+from ded_bench.problem.sampling import sample_instance
+mine = Path("mine.safetensors")
+agent, env = trained_agent.train(480, mine)
+seen = env.get_original_obs()[0]
+theirs, _ = agent.predict(env.normalize_obs(seen), deterministic=True)
+assert np.allclose(trained_agent.act(seen, mine), theirs, atol=1e-4)  # 32 bits, scales folded in
+case = ded_bench.Case.load("two-area")
+instance = sample_instance(case, 1_500_000, 0)
+for file in (mine, trained_agent.FILE):
+    verdict = ded_bench.score(instance, trained_agent.solve(instance, "TO", case, file), "TO")
+    assert max(verdict.ramp_violation, verdict.bound_violation, verdict.initial_violation) < 1e-8, verdict
+"""
+    run_example(code, tmp_path)

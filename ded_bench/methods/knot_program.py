@@ -282,10 +282,7 @@ class KnotProgram:
         model = self.model
         p_gen = np.array(model.p_gen)
         p_gen[1:] = np.clip(p_gen[1:] + columns[self._columns.u], self._case.p_min, self._case.p_max)
-        if self.condensed:
-            outputs, p_slack = self._output_rows.outputs(p_gen - model.p_gen), model.p_slack
-        else:
-            outputs, p_slack = model.outputs(p_gen - model.p_gen)
+        outputs, p_slack = model.outputs(p_gen - model.p_gen)
         if model.delivered is None:
             generation = float((self._columns.generation * p_gen).sum())
         else:

@@ -5,7 +5,6 @@ Every limit of an output has a place, by grid points.
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ ROUND_OFF = 1e-13
 
 
 class OutputRows:
-    """Rows of one model at all grid points, found once.
+    """Rows of one model; those of an interval are found once, when one is asked for.
 
     Args:
         model: a linear model along a trajectory.
@@ -31,6 +30,7 @@ class OutputRows:
     def __init__(self, model: TimeVarying, speed: Array) -> None:
         self._model, self._speed, self._n_out = model, speed, speed.shape[1]
         self._in_set_points: dict[int, Array] = {}
+        self._known: dict[int, tuple[Array, Array, Array]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -49,53 +49,40 @@ class OutputRows:
         values = [self._in_set_points[place] for place in places.tolist()]
         return sp.csc_matrix(np.array(values).reshape(-1, n_columns))
 
-    def outputs(self, u: Array) -> Array:
-        """Outputs at all grid points, (n_points, n_out), rad/s, under increments (n_knots, n_gen), pu."""
-        model, at, found = self._model, self._at_points, self._model.omega.copy()
-        for j, (x, first, last) in enumerate(
-            zip(model.states(u), model.points, model.points[1:], strict=False)
-        ):
-            found[first] += at.x[first] @ x
-            after = model.after_reset(x[None], np.array([j]))[0]
-            between = slice(first + 1, last)
-            found[between] += at.x[between] @ after + at.start[between] @ u[j] + at.end[between] @ u[j + 1]
-        found[-1] += at.x[-1] @ model.states(u)[-1]
-        return found
-
     def _local(self, places: Indices) -> LocalRows:
         """Rows in the variables of intervals; a knot's are those of the interval after it."""
         (point, output), model = np.divmod(places, self._n_out), self._model
         interval = np.searchsorted(model.points, point, side="right") - 1
-        rows = LocalRows(interval, *(part[point, output] for part in self._at_points[1:]))
+        (n_state, n_gen), n = model.step.g.shape[1:], len(places)
+        x, (start, end) = np.zeros((n, n_state)), np.zeros((2, n, n_gen))
+        for i, (j, k, of) in enumerate(zip(interval.tolist(), point.tolist(), output.tolist(), strict=True)):
+            if k == model.points[j]:
+                x[i] = self._speed[min(j, len(self._speed) - 1), of]
+            else:
+                x[i], start[i], end[i] = (part[k - model.points[j] - 1, of] for part in self._inside(j))
         between = np.flatnonzero(point > model.points[interval])
-        rows.x[between] = model.before_reset(rows.x[between], interval[between])
-        return rows
+        x[between] = model.before_reset(x[between], interval[between])
+        return LocalRows(interval, x, start, end)
 
-    @functools.cached_property
-    def _at_points(self) -> LocalRows:
-        """All outputs at all grid points, (n_points, n_out, any), as if no interval began with a reset.
+    def _inside(self, j: int) -> tuple[Array, Array, Array]:
+        """Outputs at all points inside of an interval, (n_points, n_out, any), after a reset at its start.
 
-        C times the map from an interval's start, from grid point to grid point.
+        C times the map from its start, from grid point to grid point.
         """
-        model, (n_state, n_gen) = self._model, self._model.step.g.shape[1:]
-        interval, length = np.arange(len(model.lengths)), model.lengths
-        shape, owner = (len(model.omega), self._n_out), np.repeat(interval, length)
-        x, start, end = np.zeros((*shape, n_state)), np.zeros((*shape, n_gen)), np.zeros((*shape, n_gen))
-        x[-1] = self._speed[-1]
-        costate, (f, g, h) = self._speed, model.step
-        on_start = on_slope = np.zeros((len(interval), self._n_out, n_gen))
-        for r in range(int(length.max())):
-            if not (more := length[interval] > r).all():
-                interval, costate = interval[more], costate[more]
-                on_start, on_slope = on_start[more], on_slope[more]
-                f, g, h = model.step.take(interval)
-            point = model.points[interval] + r
-            rise = on_slope / length[interval, None, None]
-            x[point], start[point], end[point] = costate, on_start - rise, rise
+        if j in self._known:
+            return self._known[j]
+        model, length = self._model, int(self._model.lengths[j])
+        f, g, h = (part[j] for part in model.step)
+        (n_state, n_gen), n = g.shape, length - 1
+        x, (start, end) = np.empty((n, self._n_out, n_state)), np.empty((2, n, self._n_out, n_gen))
+        costate, on_start, on_slope = self._speed[j], 0.0, 0.0
+        for k in range(n):
             on_slope = on_slope + on_start + costate @ h
             on_start = on_start + costate @ g
             costate = costate @ f
-        return LocalRows(np.append(owner, len(length)), x, start, end)
+            x[k], start[k], end[k] = costate, on_start - on_slope / length, on_slope / length
+        self._known[j] = x, start, end
+        return x, start, end
 
 
 class BasisByPlaces(NamedTuple):

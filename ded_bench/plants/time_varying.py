@@ -142,7 +142,9 @@ class TimeVarying:
         deviation = np.zeros((len(self.omega), x.shape[1]))
         deviation[self.points] = x
         interval = np.arange(len(length))
-        state = self.after_reset(state, interval)
+        if self.reset is not None:
+            state = state.copy()
+            state[self.reset.intervals] = state[self.reset.intervals] @ self.reset.f.T
         for r in range(1, int(length.max())):
             if not (length[interval] > r).all():
                 some = length[interval] > r
@@ -152,13 +154,6 @@ class TimeVarying:
             force = force + growth
             deviation[self.points[interval] + r] = state
         return self._outputs(deviation)
-
-    def after_reset(self, states: Array, intervals: Indices) -> Array:
-        """Deviations at the start of intervals, (n, n_state), after the reset that some begin with."""
-        if self.reset is None:
-            return states
-        begun = np.isin(intervals, self.reset.intervals)
-        return np.where(begun[:, None], states @ self.reset.f.T, states)
 
     def before_reset(self, rows: Array, intervals: Indices) -> Array:
         """Rows in the state after the start of intervals, (n, ..., n_state), as rows in that before it."""

@@ -136,7 +136,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m.dtheta = dae.DerivativeVar(m.theta, wrt=m.t, initialize=0.0)
     m.domega = dae.DerivativeVar(m.omega, wrt=m.t, initialize=0.0)
     m.angle = pyo.Var(m.algebraic, m.t, initialize=0.0)
-    m.p_gen = pyo.Var(m.gen, m.t, bounds=power_limits(case))
+    m.p_gen = pyo.Var(m.gen, m.t, bounds=lambda m, g, t: (case.machines[g].p_min, case.machines[g].p_max))
     m.p_slack_up = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     m.p_slack_down = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     pyo.TransformationFactory("dae.finite_difference").apply_to(m, nfe=steps, wrt=m.t, scheme="BACKWARD")
@@ -189,11 +189,6 @@ def eliminated(m: pyo.ConcreteModel, derivative: dae.DerivativeVar) -> dict[Any,
     m.del_component(equations)
     m.del_component(derivative)
     return quotients
-
-
-def power_limits(case: Case) -> Callable[[Any, str, float], tuple[float, float]]:
-    """Bounds of a generator's power at any time, pu."""
-    return lambda m, g, t: (case.machines[g].p_min, case.machines[g].p_max)
 
 
 def injections(m: pyo.ConcreteModel, times: Any, case: Case, network: Network) -> Callable[[str, float], Any]:

@@ -19,7 +19,7 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.problem.case import Array, Case
@@ -101,23 +101,23 @@ def _on_island(case: Case, instance: Instance, interval_s: float | None, lead: b
     base = Schedule(times, plant.static_dispatch(instance, times))
     if not lead:
         return base
-    wanted = plant.set_points_delivering(base.at(instance.grid), dt_s)
-    within = np.clip(wanted, case.p_min, case.p_max)[None, 1:]
-    power = follow(within, instance.p_initial(case)[None], case.ramp * dt_s)[0]
+    power = plant.set_points_delivering(base.at(instance.grid), dt_s)
+    power[0] = instance.p_initial(case)
+    track(power[None], case.p_min, case.p_max, case.ramp * dt_s)
     points = np.append(np.arange(0, instance.steps, max(round(LEAD_S / dt_s), 1)), instance.steps)
     return Schedule(instance.grid[points], power[points])
 
 
 def follow_set_points(case: Case, instance: Instance, targets: Array, interval_s: float) -> Schedule:
-    """Move from P_0 to one set-point after another, as fast as the ramp limit lets.
+    """Move from P_0 to one set-point after another, within bounds, as fast as the ramp limit lets.
 
     Args:
         targets: set-points of the intervals, shape (n_intervals, n_gen), pu.
         interval_s: time between set-points, s.
     """
     starts, ends = _intervals(instance, interval_s)
-    at_points = np.repeat(targets, np.subtract(ends, starts), axis=0)
-    power = follow(at_points[None], instance.p_initial(case)[None], case.ramp * instance.dt_s)[0]
+    power = np.vstack([instance.p_initial(case), np.repeat(targets, np.subtract(ends, starts), axis=0)])
+    track(power[None], case.p_min, case.p_max, case.ramp * instance.dt_s)
     return Schedule(t=instance.grid, p=power)
 
 

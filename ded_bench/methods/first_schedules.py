@@ -84,4 +84,4 @@ def _shared_load(case: Case, instance: Instance) -> Array:
         target = instance.p_initial(case) + np.outer(change, case.p_nominal)
     else:
         target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
-    return ed.follow_set_points(case, instance, np.clip(target, case.p_min, case.p_max)[1:], 1.0).p
+    return ed.follow_set_points(case, instance, target[1:], 1.0).p

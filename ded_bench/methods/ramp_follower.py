@@ -8,8 +8,6 @@ P_0 is. Between knots a schedule is linear, so no two neighbouring grid points d
 
 from __future__ import annotations
 
-import numpy as np
-
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
@@ -30,19 +28,3 @@ def track(p_gen: Array, low: Array, high: Array, step: Array) -> None:
                 before = p_gen[b, j - 1, g]
                 target = min(max(p_gen[b, j, g], low[g]), high[g])
                 p_gen[b, j, g] = min(max(target, before - step[g]), before + step[g])
-
-
-def follow(targets: Array, p_initial: Array, step: Array) -> Array:
-    """Follow the targets of a batch, which are within the bounds.
-
-    Args:
-        targets: shape (batch, n_knots - 1, n_gen), pu.
-        p_initial: P_0, shape (batch, n_gen), pu.
-        step: largest change between two knots, (n_gen,), pu.
-
-    Returns:
-        Shape (batch, n_knots, n_gen), pu.
-    """
-    p_gen = np.concatenate([p_initial[:, None], targets], axis=1)
-    track(p_gen, np.full_like(step, -np.inf), np.full_like(step, np.inf), step)
-    return p_gen

@@ -24,7 +24,6 @@ from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate
-from ded_bench.surrogates.instance_model import model_along
 
 #: What a program may leave open between points that have rows, rad/s: half of what strict feasibility allows.
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7
@@ -76,7 +75,7 @@ def solve_on_surrogate(
         rows = Rows(left, left, soft=True)
 
     def follow(p_gen: Array) -> TimeVarying:
-        return model_along(case, surrogate, instance, p_gen, points, plan is None, plan and plan.state)
+        return surrogate.along(case, instance, p_gen, points, plan is None, plan and plan.state)
 
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built

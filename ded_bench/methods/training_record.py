@@ -10,12 +10,12 @@ history has one row per look at the loss, and columns
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.policy_file import DEFAULT_MODEL
@@ -79,8 +79,5 @@ def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:
         rows: numbers by column; `epoch` and `seconds` are needed.
     """
     columns = dict.fromkeys([*HISTORY, *(name for row in rows for name in row)])
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(policy.with_suffix(".history.csv"), text.getvalue())
+    text = pd.DataFrame(rows, columns=list(columns)).to_csv(index=False)
+    write_atomically(policy.with_suffix(".history.csv"), text)

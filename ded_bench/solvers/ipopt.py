@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import tempfile
 import time
@@ -48,22 +49,23 @@ class CasadiIpopt:
 
     def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
         started = time.perf_counter()
-        self._options = dict(options or {})
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "model.nl")
             with path.open("w") as stream:
                 info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
             builder = casadi.NlpBuilder()
             builder.import_nl(str(path))
-        self._nlp = {
+        nlp = {
             "x": casadi.vertcat(*builder.x),
             "f": builder.f,
             "g": casadi.vertcat(*builder.g),
         }
         self._columns = tuple(info.variables)
         self._rows = {"lbg": np.array(builder.g_lb), "ubg": np.array(builder.g_ub)}
-        self._solver: casadi.Function | None = None
-        self._limit: float | None = None
+        # Scalar expressions must be expanded, or every evaluation takes several times as long.
+        self._made = functools.lru_cache(maxsize=1)(
+            lambda limit: make_ipopt(nlp, dict(options or {}), limit, {"expand": True})
+        )
         self._setup_s = time.perf_counter() - started
 
     def solve(self, time_limit_s: float | None = None) -> Outcome:
@@ -72,16 +74,13 @@ class CasadiIpopt:
         The first call also pays for set-up and symbolic derivatives.
         """
         started = time.perf_counter()
-        if self._solver is None or self._limit != time_limit_s:
-            # Scalar expressions must be expanded, or every evaluation takes several times as long.
-            self._solver = make_ipopt(self._nlp, self._options, time_limit_s, {"expand": True})
-            self._limit = time_limit_s
+        solver = self._made(time_limit_s)
         lower, upper = bounds(self._columns)
         start = np.array([0.0 if v.value is None else v.value for v in self._columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
         arguments = {"x0": start, "lbx": lower, "ubx": upper, **self._rows}
-        outcome, x = run_ipopt(self._solver, arguments, 0.0, setup)
+        outcome, x = run_ipopt(solver, arguments, 0.0, setup)
         if x is not None:
             assign(self._columns, x)
         return outcome

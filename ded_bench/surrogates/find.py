@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import Plant, plant_of
-from ded_bench.problem.case import Case
+from ded_bench.plants.plant import Plant, PlantState, plant_of
+from ded_bench.plants.simulate import simulate
+from ded_bench.plants.time_varying import Indices, TimeVarying
+from ded_bench.problem.case import Array, Case
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
@@ -24,7 +28,7 @@ MODELS = (*TRAINED, "linear", TRAJECTORY)
 
 @dataclass(frozen=True)
 class AlongTrajectory:
-    """The surrogate that is made anew for each instance: nothing of it is trained (see `instance_model`)."""
+    """The surrogate that is made anew for each instance: nothing of it is trained."""
 
     plant: Plant
     kind: str = TRAJECTORY
@@ -33,6 +37,28 @@ class AlongTrajectory:
     def fingerprint(self) -> str:
         """Twelve hex digits that change with the plant."""
         return hashlib.sha256(f"{self.kind}|{self.plant.fingerprint}".encode()).hexdigest()[:12]
+
+    def along(
+        self,
+        case: Case,
+        instance: Instance,
+        p_gen: Array,
+        points: Indices,
+        exact: bool = True,
+        state: PlantState = None,
+    ) -> TimeVarying:
+        """The plant linearised along the simulation of powers at the knots; see `Koopman.along`.
+
+        Args, but for those there:
+            exact: see `Plant.advance`.
+            state: of the plant at t = 0; None: the instance's.
+
+        Raises:
+            SimulationError: the system cannot follow these powers.
+        """
+        schedule = Schedule(t=instance.grid[points], p=p_gen)
+        run = simulate(case, instance, schedule, self.plant, state, exact)
+        return self.plant.linearise_along(run, points)
 
 
 #: A lifted model has one K for all instances and times; the other kind is made for each instance.

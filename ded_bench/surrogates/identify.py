@@ -54,7 +54,9 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     training: dict[str, int | float] = {"seed": seed, "trajectories": len(data.kinds)}
 
     def residuals(x: Array) -> Array:
-        return _residuals(make_model(case, unpack(start, x)), network, data)
+        unit = np.append(np.full(len(network.generators), OMEGA_UNIT), SLACK_UNIT)
+        error = predict(make_model(case, unpack(start, x)), network, data) - data.outputs
+        return np.asarray((error[::STRIDE] / unit).ravel())
 
     result = least_squares(residuals, np.zeros(n_parameters(*start.feedthrough.shape)), max_nfev=EVALUATIONS)
     return make_model(case, unpack(start, result.x), training | {"cost": float(result.cost)})
@@ -120,13 +122,6 @@ def rollout_errors(model: Koopman, network: Network, data: Trajectories) -> tupl
     """Largest |Δω| (rad/s) and root mean square of ΔP_s (pu) of a model's rollouts of trajectories."""
     error = predict(model, network, data) - data.outputs
     return float(np.abs(error[..., :-1]).max()), float(np.sqrt(np.square(error[..., -1]).mean()))
-
-
-def _residuals(model: Koopman, network: Network, data: Trajectories) -> Array:
-    n_gen = len(network.generators)
-    unit = np.append(np.full(n_gen, OMEGA_UNIT), SLACK_UNIT)
-    error = (predict(model, network, data) - data.outputs)[::STRIDE] / unit
-    return np.asarray(error.ravel())
 
 
 def _shifted(matrix: Array, entries: tuple[Any, ...], values: Array) -> Array:

@@ -22,6 +22,8 @@ from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import plain_name
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import PlantState
+from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, repeated
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
@@ -86,6 +88,53 @@ class Koopman:
         start = np.broadcast_to(psi - steady[0], np.broadcast_shapes(psi.shape, steady.shape[1:]))
         increments = np.broadcast_to(increments, (len(increments), *start.shape))
         return linear_recurrence(self.k, start, increments) + steady
+
+    def along(
+        self,
+        case: Case,
+        instance: Instance,
+        p_gen: Array,
+        points: Indices,
+        exact: bool = True,
+        state: PlantState = None,
+    ) -> TimeVarying:
+        """The linear model of one instance by which it answers to schedules linear between knots.
+
+        It is made around its own rollout, with K, B and G those of all intervals: answers do not depend
+        on `p_gen` but for round-off.
+
+        Args:
+            case: the grid.
+            instance: x_0 and the loads.
+            p_gen: powers at the knots, shape (n_knots, n_gen), pu.
+            points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
+            exact: of no meaning here; likewise `state`.
+
+        Raises:
+            InputError: the model was identified at another time step than the instance's.
+        """
+        self.check_step(instance)
+        n_gen, lengths = len(case.generators), np.diff(points)
+        psi = self.initial(Network(case), [instance])[0]
+        steps = np.arange(points[-1] + 1)
+        powers = np.stack([np.interp(steps, points, p) for p in p_gen.T], axis=1)
+        outputs = self.rollout(psi, np.hstack([powers, instance.p_load(case)]))
+        b, h = self.b[:, :n_gen], self.g[:, :n_gen]
+        one = Hold(self.k[None], (b - self.k @ b)[None], h[None])
+        kinds, kind = np.unique(lengths, return_inverse=True)
+        over = [repeated(one, int(length)) for length in kinds]
+        slack = np.zeros((1, len(psi)))
+        slack[0, n_gen] = 1.0
+        return TimeVarying(
+            points=points,
+            step=Hold(*(np.broadcast_to(part, (len(lengths), *part.shape[1:])) for part in one)),
+            across=Hold(*(np.concatenate(parts)[kind] for parts in zip(*over, strict=True))),
+            speed=slice(0, n_gen),
+            slack=np.broadcast_to(slack, (len(lengths), len(psi))),
+            omega=outputs[:, :n_gen],
+            p_slack=outputs[:, n_gen],
+            p_gen=p_gen,
+        )
 
     def check_step(self, instance: Instance) -> None:
         """Raise InputError unless the model's time step is the instance's."""

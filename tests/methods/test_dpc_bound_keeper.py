@@ -7,7 +7,7 @@ import pytest
 
 from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper, predict
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
@@ -34,7 +34,9 @@ def random_powers(case: Case, inputs: StackedInstances, size: float) -> Array:
     knots, rng = case.knot_times(case.sampling.horizon_s), np.random.default_rng(0)
     middle, half = 0.5 * (case.p_min + case.p_max), 0.5 * (case.p_max - case.p_min)
     targets = middle + size * half * rng.uniform(-1.0, 1.0, (len(inputs), len(knots) - 1, len(half)))
-    return follow(np.clip(targets, case.p_min, case.p_max), inputs.p_initial, case.ramp * knots[1])
+    powers = np.concatenate([inputs.p_initial[:, None], targets], axis=1)
+    track(powers, case.p_min, case.p_max, case.ramp * knots[1])
+    return powers
 
 
 def keeper_of(case: Case, scale: float = 1.0) -> BoundKeeper:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.methods.ramp_follower import follow, track
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.torch_follower import follow_within
 from ded_bench.problem.compiled import compiled
 
@@ -18,14 +18,15 @@ def test_follower_compiled_in_torch_and_one_by_one_agree() -> None:
     targets, start = rng.uniform(-1, 1, (7, 20, 3)), np.full((7, 3), 0.1)
     p = np.concatenate([start[:, None], targets], axis=1)
     track(p, LOW, HIGH, STEP)
-    np.testing.assert_array_equal(follow(np.clip(targets, LOW, HIGH), start, STEP), p)
     for b in range(7):
-        alone = follow(np.clip(targets[b : b + 1], LOW, HIGH), start[:1], STEP)
+        alone = np.concatenate([start[:1], targets[b]])[None]
+        track(alone, LOW, HIGH, STEP)
         np.testing.assert_array_equal(alone[0], p[b])
     found = follow_within(*map(torch.as_tensor, (targets, start, LOW, HIGH, STEP)))
     np.testing.assert_array_equal(found.numpy(), p)
     np.testing.assert_allclose(np.abs(np.diff(p, axis=1)).max(axis=(0, 1)), STEP)
-    slow = follow(targets, start, np.full(3, 10.0))
+    slow, endless = np.concatenate([start[:, None], targets], axis=1), np.full(3, np.inf)
+    track(slow, -endless, endless, np.full(3, 10.0))
     np.testing.assert_array_equal(slow[:, 1:], targets)  # without a limit it is where it should be
 
 

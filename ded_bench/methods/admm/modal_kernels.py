@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, inlined
 
 Array32 = NDArray[np.float32]
 #: Of either precision.
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int_]
 
-#: For parts of a loop that a call would slow down.
-inlined = numba.njit(inline="always")
 #: Grid points for which C is held: it changes over many seconds.
 HELD = 4
 #: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in

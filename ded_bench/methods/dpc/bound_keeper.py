@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
@@ -103,8 +103,9 @@ class BoundKeeper:
             rows = self.of_power[g, k, 1:].reshape(len(g), -1) * np.sign(now[g, k])[:, None]
             excess = np.abs(now[g, k]) - aim[k]
             change = np.linalg.solve(rows.T @ rows + damping, rows.T @ excess)
-            targets = np.clip(tried[1:] - change.reshape(tried[1:].shape), self.case.p_min, self.case.p_max)
-            tried = follow(targets[None], tried[:1], self.step)[0]
+            tried = tried.copy()
+            tried[1:] -= change.reshape(tried[1:].shape)
+            track(tried[None], self.case.p_min, self.case.p_max, self.step)
             now = omega + np.tensordot(self.of_power, tried - p_gen, 2)
             if (left := self._excess(now)) < least:
                 best, least = tried, left

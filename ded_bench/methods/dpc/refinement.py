@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
@@ -116,8 +116,7 @@ class Refiner:
             y = x @ rows.T + fixed
             dual += DUAL_STEP * (y - z)
         refined = np.concatenate([p_gen[:, :1], x.reshape(batch, n_knots - 1, n_gen)], axis=1)
-        targets = np.minimum(np.maximum(refined[:, 1:], self.case.p_min), self.case.p_max)
-        refined = follow(targets, p_gen[:, 0], self.step)
+        track(refined, self.case.p_min, self.case.p_max, self.step)
         better = self._merit(inputs, fixed, refined) < self._merit(inputs, fixed, p_gen)
         return np.where(better[:, None, None], refined, p_gen)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.ramp_follower import follow
+from ded_bench.methods.ramp_follower import track
 from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.case import Array, Case
@@ -217,6 +217,7 @@ class _Loop:
     def _followed(self, until: int) -> Array:
         """Set-points from now to `until` on the way to the plan's, within ramp limits."""
         now = self.history.now
-        wanted = self.course.at(now, until)
-        power: Array = follow(wanted[None, 1:], self.history.p_set[None, now], self.case.ramp * self.dt)[0]
+        power = np.vstack([self.history.p_set[now], self.course.at(now, until)[1:]])
+        endless = np.full_like(self.case.ramp, np.inf)
+        track(power[None], -endless, endless, self.case.ramp * self.dt)
         return power

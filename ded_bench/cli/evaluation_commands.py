@@ -17,15 +17,11 @@ from ded_bench.cli.arguments import (
     say,
 )
 from ded_bench.files.errors import InputError
-from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
-from ded_bench.results.rows import Results
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.find import MODELS
 
 
 def add_commands(commands: Any) -> None:
@@ -76,7 +72,11 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
+    from ded_bench.methods.registry import get_method, registered
+    from ded_bench.plants.plant import servable
+    from ded_bench.results.rows import Results
     from ded_bench.results.timing import model_name, timing_summary
+    from ded_bench.surrogates.find import MODELS
 
     chosen = select_split(a.case)
     case = chosen.case
@@ -118,6 +118,8 @@ def _bench(a: argparse.Namespace) -> int:
 
 
 def _certify(a: argparse.Namespace) -> int:
+    from ded_bench.methods.registry import get_method
+
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
@@ -152,6 +154,8 @@ def _compare(a: argparse.Namespace) -> int:
 
 
 def _report(a: argparse.Namespace) -> int:
+    from ded_bench.results.rows import Results
+
     case = Case.load(a.case)
     folder = a.results or default_results(case)
     if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):

@@ -15,7 +15,6 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.methods.options import described
 from ded_bench.methods.registry import Method, get_method, registered
-from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.problem.benchmark import (
     Manifest,
     copy_case,
@@ -81,6 +80,8 @@ def add_commands(commands: Any) -> None:
 
 
 def _instances(a: argparse.Namespace) -> int:
+    from ded_bench.plants.plant import servable
+
     case = Case.load(a.case)
     home = problem_folder(a.case, case)
     split = load_split(home) if (home / "split.json").is_file() else None
@@ -137,6 +138,7 @@ def _path(a: argparse.Namespace) -> int:
 
 def _import(a: argparse.Namespace) -> int:
     from ded_bench.analysis.matpower_case import imported
+    from ded_bench.plants.plant import SimulationError
 
     path = a.out / "case.json"
     if path.exists():
@@ -194,6 +196,7 @@ def _list() -> int:
 
 def _check(case: Case, count: int) -> int:
     from ded_bench.analysis.inspect_case import check_case, implausible
+    from ded_bench.plants.plant import SimulationError
 
     sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
     print(f"case {case.id}: {sizes}", flush=True)
@@ -239,6 +242,8 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 
 
 def _scenarios(a: argparse.Namespace) -> int:
+    from ded_bench.plants.plant import servable
+
     case = Case.load(a.case)
     try:
         check_whole_steps(f"a scenario's duration of {DURATION_S:g} s", DURATION_S, case.sampling.dt_s)

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ded_bench.cli.arguments import (
     CASE_HELP,
@@ -25,7 +25,7 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
-from ded_bench.plants.plant import PLANTS, SimulationError, plant_of, servable
+from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import (
     Selection,
     check_own_name,
@@ -38,8 +38,10 @@ from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, check_plausible
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import default_results, search_folders
-from ded_bench.results.rows import Results, Row
 from ded_bench.solvers.status import Status
+
+if TYPE_CHECKING:
+    from ded_bench.results.rows import Results, Row
 
 
 def add_commands(commands: Any) -> None:
@@ -93,6 +95,7 @@ def _add_score(commands: Any) -> None:
 
 
 def _solve(a: argparse.Namespace) -> int:
+    from ded_bench.results.rows import Results
     from ded_bench.run.runner import fallbacks, run, unfinished
     from ded_bench.run.tasks import make_tasks
 
@@ -149,6 +152,7 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
+    from ded_bench.plants.plant import SimulationError, plant_of
     from ded_bench.plants.score import score
 
     try:
@@ -197,6 +201,7 @@ def _score_results(a: argparse.Namespace) -> int:
 
 def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance], results: Results) -> int:
     """The schedules kept in a results folder, on the plant of `--plant`."""
+    from ded_bench.plants.plant import plant_of
     from ded_bench.run.scoring import validate
 
     plant_of(case, a.plant)  # says what the case lacks
@@ -245,6 +250,8 @@ def _referee(a: argparse.Namespace) -> int:
 
 def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]:
     """The rows of a results folder, their case, and its instances by id, wherever they come from."""
+    from ded_bench.results.rows import Results
+
     results = Results(a.results)
     if not results.rows:
         raise InputError(results.path, "", "is missing or has no rows")
@@ -263,6 +270,7 @@ def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]
 
 
 def _score_folder(a: argparse.Namespace) -> int:
+    from ded_bench.results.rows import Results
     from ded_bench.run.submit import submit
 
     if not a.name:
@@ -285,6 +293,8 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
+    from ded_bench.plants.plant import plant_of, servable
+
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
     else:

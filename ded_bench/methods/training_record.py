@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.policy_file import DEFAULT_MODEL
 from ded_bench.problem.case import Case
@@ -79,5 +77,7 @@ def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:
         rows: numbers by column; `epoch` and `seconds` are needed.
     """
     columns = dict.fromkeys([*HISTORY, *(name for row in rows for name in row)])
+    import pandas as pd  # help waits for no data frames
+
     text = pd.DataFrame(rows, columns=list(columns)).to_csv(index=False)
     write_atomically(policy.with_suffix(".history.csv"), text)

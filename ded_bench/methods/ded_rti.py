@@ -29,7 +29,7 @@ from ded_bench.methods.options import option, read_options
 from ded_bench.methods.reserve import LIMIT, Reserve
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
-from ded_bench.methods.surrogate_program import Plan, solve_on_surrogate
+from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, Plan, solve_on_surrogate
 from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Case
@@ -84,6 +84,8 @@ class RealTimeSolver:
     def __call__(self, instance: Instance) -> Solution:
         """Solve by two steps; the first, from the static dispatch, is `setup_s`."""
         bounds = self.case.bounds(self.regime)
+        if self.case.slack is None:  # condensed programs leave open what they may
+            bounds = bounds.tightened(part=SOFT_TOLERANCE)
         first = self._step(bounds, instance, receding_knots(self.case, instance, None), None)
         if first.schedule is None:
             return first

@@ -157,11 +157,9 @@ class TimeVarying:
 
     def before_reset(self, rows: Array, intervals: Indices) -> Array:
         """Rows in the state after the start of intervals, (n, ..., n_state), as rows in that before it."""
-        if self.reset is None:
-            return rows
-        begun = np.isin(intervals, self.reset.intervals)
-        rows = rows.copy()
-        rows[begun] = rows[begun] @ self.reset.f
+        if self.reset is not None:
+            begun, rows = np.isin(intervals, self.reset.intervals), rows.copy()
+            rows[begun] = rows[begun] @ self.reset.f
         return rows
 
     @property

@@ -42,8 +42,8 @@ from ded_bench.surrogates.koopman import Koopman
 
 #: Raised when answers change.
 VERSION = 3
-#: Part of the bound that plans leave free beside a slack. On an island it costs 0.2 to 0.5 % and makes peaks
-#: under forecasts no lower, drawn scenarios say.
+#: Part of the bound that plans leave free beside a slack. On an island it costs half a per cent and makes
+#: peaks of the mean under announcements no lower (studies/hidden_states.md).
 MARGIN = 0.5
 
 

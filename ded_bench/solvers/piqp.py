@@ -12,7 +12,7 @@ from ded_bench.solvers.linear_program import FormAnswer, FreeForm, told
 from ded_bench.solvers.status import Status
 
 #: The programs of this suite take 15 to 60 iterations.
-MAX_ITERATIONS = 150
+MAX_ITERATIONS = 100
 #: Relative duality gap that is small enough: round-off lets some programs stall at 5e-9.
 GAP = 1e-7
 #: What keeps factors of singular matrices finite: PIQP's own value.
@@ -36,7 +36,8 @@ def solve_form(
         staged: columns are ordered by stages, as in optimal control, and rows join neighbouring ones only.
             Dense blocks along the diagonal are then factorised instead of a sparse matrix; that pays where
             stages have tens of columns.
-        regularisation: least one of the factorised matrix. A smaller one gives more accurate steps; a sparse
+        regularisation: least one of the factorised matrix, also near a solution, where PIQP by itself goes on
+            down until some programs end as no numbers. A smaller one gives more accurate steps; a sparse
             factorisation does not stand it.
         residual: of rows, absolute and relative, that is small enough; PIQP's own values if not given.
 
@@ -52,7 +53,7 @@ def solve_form(
     solver.settings.eps_duality_gap_rel = GAP
     if residual is not None:
         solver.settings.eps_abs = solver.settings.eps_rel = residual
-    solver.settings.reg_lower_limit = regularisation
+    solver.settings.reg_lower_limit = solver.settings.reg_finetune_lower_limit = regularisation
     n = len(form.cost)
     solver.setup(
         sp.csc_matrix((n, n)),

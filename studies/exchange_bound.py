@@ -21,7 +21,7 @@ import pandas as pd
 from ded_bench import Case, Instance, Schedule, SimulationError, simulate
 from ded_bench.plants.plant import servable
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
-from ded_bench.surrogates.identification_data import KINDS
+from ded_bench.surrogates.identify import KINDS
 
 #: First of the draws that are exchanged; those of identification lie before.
 FIRST = 2_000_000

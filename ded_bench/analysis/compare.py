@@ -6,16 +6,20 @@ surrogate, the newest of each. Status, feasibility, objective and violations dec
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from ded_bench.analysis.lines import title
 from ded_bench.files.errors import InputError
-from ded_bench.results.rows import Results, Row
+from ded_bench.results.rows import Results, Row, differences
 from ded_bench.results.timing import model_name
+
+#: Rows that a section of the printed comparison names; the rest are counted.
+SHOWN = 10
 
 
 class Asked(NamedTuple):
@@ -29,17 +33,14 @@ class Asked(NamedTuple):
     model: str
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """Largest change that is none: of the objective relative, of violations absolute."""
-
-    objective: float = 1e-6
-    hz: float = 1e-6
-    pu: float = 1e-8
+def limits(objective: float = 1e-6, hz: float = 1e-6, pu: float = 1e-8) -> dict[str, float]:
+    """Largest change that is none, by the columns that decide, in the order in which they are printed."""
+    powers = "ramp_violation", "bound_violation", "initial_violation"
+    exact = dict.fromkeys(("status", "feasible"), 0.0)
+    return exact | {"objective": objective, "freq_violation_hz": hz} | dict.fromkeys(powers, pu)
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """One value of one row, before (in A) and after (in B); None is an empty cell."""
 
     key: Asked
@@ -68,13 +69,15 @@ class Comparison:
         return not (self.incomparable or self.only_a or self.only_b or self.changes)
 
 
-def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: bool = False) -> Comparison:
+def compare(
+    a: Path, b: Path, largest: Mapping[str, float] | None = None, common_only: bool = False
+) -> Comparison:
     """Compare two results folders.
 
     Args:
         a: the folder that sets the standard.
         b: the folder that is compared with it.
-        tolerance: changes up to this are none; None: the default ones.
+        largest: changes up to these are none, see `limits`; None: the default ones.
         common_only: rows that only one folder has count as no difference.
 
     Raises:
@@ -87,9 +90,13 @@ def compare(a: Path, b: Path, tolerance: Tolerance | None = None, common_only: b
         return Comparison(*facts, reason, (), (), ())
     only_a = () if common_only else tuple(key for key in before if key not in after)
     only_b = () if common_only else tuple(key for key in after if key not in before)
-    limits = tolerance or Tolerance()
-    changes = [change for key in shared for change in _changes(before[key], after[key], limits)]
-    changes.sort(key=lambda change: (list(_limits(limits)).index(change.column), -change.size, change.key))
+    changes = [
+        Change(key, column, getattr(before[key], column), getattr(after[key], column), size)
+        for key in shared
+        for column, size in differences(before[key], after[key], largest or limits()).items()
+    ]
+    order = list(limits())
+    changes.sort(key=lambda change: (order.index(change.column), -change.size, change.key))
     return Comparison(*facts, "", only_a, only_b, tuple(changes))
 
 
@@ -130,36 +137,57 @@ def _problems(row: Row) -> str:
     return f"{row.case} {row.problems_version or '(no version)'}"
 
 
-def _limits(tolerance: Tolerance) -> dict[str, float]:
-    """Columns that decide, in the order in which they are printed, with the size of a change."""
-    return {
-        "status": 0.0,
-        "feasible": 0.0,
-        "objective": tolerance.objective,
-        "freq_violation_hz": tolerance.hz,
-        "ramp_violation": tolerance.pu,
-        "bound_violation": tolerance.pu,
-        "initial_violation": tolerance.pu,
-    }
-
-
-def _changes(before: Row, after: Row, tolerance: Tolerance) -> Iterator[Change]:
-    for column, limit in _limits(tolerance).items():
-        x, y = getattr(before, column), getattr(after, column)
-        size = _distance(x, y, relative=column == "objective")
-        if size > limit:
-            yield Change(_asked(before), column, x, y, size)
-
-
-def _distance(x: object, y: object, relative: bool) -> float:
-    if x == y:
-        return 0.0
-    if not (isinstance(x, float) and isinstance(y, float)):
-        return math.inf
-    return abs(y - x) / max(abs(x), abs(y)) if relative else abs(y - x)
-
-
 def name_of(key: Asked) -> str:
     """What a row answers as a reader sees it; the usual settings and surrogate go without saying."""
     unusual = title(key.method, key.settings, key.model).removeprefix(title(key.method))
     return f"{key.instance} {key.regime} {key.method}{unusual}"
+
+
+def to_text(comparison: Comparison) -> str:
+    """The comparison for a terminal: a few lines for each kind of change, one verdict."""
+    c = comparison
+    lines = [f"A  {c.a}: {c.heads[0]}", f"B  {c.b}: {c.heads[1]}"]
+    if c.incomparable:
+        return "\n".join([*lines, f"not comparable: {c.incomparable}"]) + "\n"
+    counts = []
+    for name, keys in (("only in A", c.only_a), ("only in B", c.only_b)):
+        if keys:
+            counts.append(f"{len(keys)} rows {name}")
+            lines += _section(f"{name}: {len(keys)} rows", map(name_of, keys))
+    for column in dict.fromkeys(change.column for change in c.changes):
+        found = [change for change in c.changes if change.column == column]
+        counts.append(f"{len(found)} × {column}")
+        said = (f"{name_of(change.key)}: {_arrow(change)}" for change in found)
+        lines += _section(f"{column}: {len(found)} of {c.common} common rows", said)
+    verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
+    return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
+
+
+def to_json(comparison: Comparison) -> str:
+    """The comparison as one JSON object; infinite sizes and missing numbers are null."""
+    c = comparison
+    changes = [
+        change.key._asdict()
+        | {"column": change.column, "before": change.before, "after": change.after}
+        | {"size": change.size if math.isfinite(change.size) else None}
+        for change in c.changes
+    ]
+    made = {name: getattr(c, name) for name in ("a", "b", "same", "incomparable", "common")}
+    made |= {name: [key._asdict() for key in getattr(c, name)] for name in ("only_a", "only_b")}
+    return json.dumps(made | {"changes": changes}, default=str)
+
+
+def _section(heading: str, items: Iterable[str]) -> list[str]:
+    said = [f"  {item}" for item in items]
+    rest = [f"  … and {len(said) - SHOWN} more"] if len(said) > SHOWN else []
+    return [heading, *said[:SHOWN], *rest]
+
+
+def _arrow(change: Change) -> str:
+    numbers = isinstance(change.before, float) and isinstance(change.after, float)
+    by = f" ({'relative ' if change.column == 'objective' else ''}{change.size:.2g})" if numbers else ""
+    return f"{_cell(change.before)} → {_cell(change.after)}{by}"
+
+
+def _cell(value: object) -> str:
+    return "(none)" if value is None else f"{value:.10g}" if isinstance(value, float) else str(value)

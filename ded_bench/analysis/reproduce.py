@@ -20,7 +20,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.folder import search_folders
-from ded_bench.results.rows import Results, Row
+from ded_bench.results.rows import Results, Row, differences
 from ded_bench.results.timing import model_name
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import Task, make_tasks
@@ -28,7 +28,7 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import MODELS, TRAINED
 
 #: Largest change that is none: of the objective relative, of the frequency violation in Hz.
-OBJECTIVE_RELATIVE, VIOLATION_HZ = 1e-6, 1e-6
+LIMITS = {"objective": 1e-6, "freq_violation_hz": 1e-6}
 #: Seed of the sample, with the name of its line.
 SEED = 0
 
@@ -155,17 +155,15 @@ def _compare(line: Sampled, row: Row, again: Row) -> None:
         line.note(line.skipped, f"{row.instance}: ended by its limit this time")
         return
     line.rows += 1
-    numbers = (getattr(r, name) for r in (row, again) for name in ("objective", "freq_violation_hz"))
-    objective, hz, objective_now, hz_now = numbers
-    if objective_now is None:
+    apart = dict.fromkeys(LIMITS, 0.0) | differences(row, again, dict.fromkeys(LIMITS, 0.0))
+    line.objective = max(line.objective, apart["objective"])
+    if again.objective is None:
         line.note(line.differences, f"{row.instance}: no score this time ({again.error or again.status})")
-        line.objective = float("inf")
         return
-    relative, apart = abs(objective_now - objective) / (abs(objective) or 1.0), abs(hz_now - hz)
-    line.objective, line.hz = max(line.objective, relative), max(line.hz, apart)
-    if relative > OBJECTIVE_RELATIVE or apart > VIOLATION_HZ:
-        said = f"objective {objective!r}, now {objective_now!r}; freq_violation_hz {hz!r}, now {hz_now!r}"
-        line.note(line.differences, f"{row.instance}: {said}")
+    line.hz = max(line.hz, apart["freq_violation_hz"])
+    if any(apart[name] > limit for name, limit in LIMITS.items()):
+        said = (f"{name} {getattr(row, name)!r}, now {getattr(again, name)!r}" for name in LIMITS)
+        line.note(line.differences, f"{row.instance}: {'; '.join(said)}")
 
 
 def table_of(lines: Sequence[Sampled]) -> str:

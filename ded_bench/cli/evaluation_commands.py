@@ -144,11 +144,10 @@ def _certify(a: argparse.Namespace) -> int:
 def _compare(a: argparse.Namespace) -> int:
     if all(ResultsFolder(folder).results.is_file() for folder in (a.a, a.b)):
         say(f"comparing {a.a} with {a.b}")
-    from ded_bench.analysis.compare import Tolerance, compare
-    from ded_bench.cli.comparison import to_json, to_text
+    from ded_bench.analysis.compare import compare, limits, to_json, to_text
 
-    limits = Tolerance(a.tolerance, a.tolerance_hz, a.tolerance_pu)
-    found = compare(a.a, a.b, limits, common_only=a.common)
+    largest = limits(a.tolerance, a.tolerance_hz, a.tolerance_pu)
+    found = compare(a.a, a.b, largest, common_only=a.common)
     print(to_json(found) if a.json else to_text(found), end="\n" if a.json else "")
     return 0 if found.same else 1
 

@@ -271,7 +271,7 @@ def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]
 
 def _score_folder(a: argparse.Namespace) -> int:
     from ded_bench.results.rows import Results
-    from ded_bench.run.submit import submit
+    from ded_bench.run.runner import submit
 
     if not a.name:
         raise InputError("--schedules", str(a.schedules), "needs a --name for the rows")

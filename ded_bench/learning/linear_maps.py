@@ -14,7 +14,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.problem.trajectory import Trajectory
-from ded_bench.surrogates.condensed import hat_functions
+from ded_bench.surrogates.koopman import hat_functions
 
 #: Slopes are those of intervals of this length, s: gradients are then right to a ten-thousandth.
 INTERVAL_S = 0.1

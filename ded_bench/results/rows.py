@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Container, Iterator
+import math
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -131,6 +132,22 @@ class ValidatedRow(Row):
     def key(self) -> tuple[Key, str]:  # type: ignore[override]  # rows of several plants share a table
         """The row's place in the table."""
         return super().key, self.plant
+
+
+def differences(before: Row, after: Row, limits: Mapping[str, float]) -> dict[str, float]:
+    """How far two rows are apart, by column, where that is beyond a limit.
+
+    Distances of objectives are relative; what are no two numbers is infinitely far apart.
+    """
+    found = {}
+    for column, limit in limits.items():
+        x, y = getattr(before, column), getattr(after, column)
+        apart = 0.0 if x == y else math.inf
+        if apart and isinstance(x, float) and isinstance(y, float):
+            apart = abs(y - x) / (max(abs(x), abs(y)) if column == "objective" else 1.0)
+        if apart > limit:
+            found[column] = apart
+    return found
 
 
 ROWS = Table(Row, since="method_version", upgrade=upgraded)

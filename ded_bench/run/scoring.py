@@ -17,15 +17,23 @@ from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import SCORING_FAILED, VALIDATED, Key, Results, Row, ValidatedRow
+from ded_bench.results.rows import (
+    SCORING_FAILED,
+    VALIDATED,
+    Key,
+    Results,
+    Row,
+    ValidatedRow,
+    differences,
+)
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import Question, reason_of, score_all
 
 #: Schedules scored in one call of a worker, which costs some milliseconds.
 BATCH = 50
-#: What a kept schedule, scored again, may differ by from its row.
-OBJECTIVE_RELATIVE, VIOLATION_HZ, VIOLATION_PU = 1e-9, 1e-9, 1e-9
 _SCORE = tuple(field.name for field in dataclasses.fields(Score))
+#: What a kept schedule, scored again, may differ by from its row, in parts of the objective, Hz and pu.
+SAME = dict.fromkeys(_SCORE, 1e-9)
 
 #: What a kept schedule is worth, or why that cannot be told.
 Verdict = Score | Exception
@@ -115,23 +123,18 @@ def rescore(
         InputError: none of the rows' schedules is kept.
     """
     kept = results.kept(instances)
-    rows, differences = [], []
+    rows, found = [], []
     with Workers(workers) as pool:
         for old, verdict in verdicts(case, kept, instances, results, pool):
             rows.append(scored_row(old, verdict))
             for sentence in _differences(old, rows[-1]):
-                differences.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
-                on_difference(differences[-1])
+                found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
+                on_difference(found[-1])
     if update:
         results.add(rows)
         results.compact()
     unknown = sum(row.instance not in instances for row in results.rows.values())
-    return Check(
-        rows,
-        differences,
-        without_schedule=len(results.rows) - unknown - len(kept),
-        unknown=unknown,
-    )
+    return Check(rows, found, len(results.rows) - unknown - len(kept), unknown)
 
 
 def validate(
@@ -154,19 +157,11 @@ def validate(
 
 def _differences(old: Row, new: Row) -> Iterator[str]:
     """What a row says and its schedule, scored again, does not."""
-    for name in _SCORE:
-        was, now = getattr(old, name), getattr(new, name)
-        if was is None or now is None:
-            same = was is now  # numbers that only islands have, or no score at all
-        elif name == "objective":
-            same = math.isclose(was, now, rel_tol=OBJECTIVE_RELATIVE)
-        else:
-            same = abs(was - now) <= (VIOLATION_HZ if name.endswith("_hz") else VIOLATION_PU)
-        if not same:
-            why = f" ({old.error or new.error})" if was is None or now is None else ""
-            yield f"{name} {was!r} in the row, {now!r} scored again{why}"
-            if was is None or now is None:
-                return
+    for name, apart in differences(old, new, SAME).items():
+        why = f" ({old.error or new.error})" if math.isinf(apart) else ""
+        yield f"{name} {getattr(old, name)!r} in the row, {getattr(new, name)!r} scored again{why}"
+        if math.isinf(apart):
+            return
     if old.objective is not None and new.objective is not None:
         own = Score(**{name: getattr(old, name) for name in _SCORE})
         if (old.feasible, old.feasible_strict) != (own.feasible, own.feasible_strict):

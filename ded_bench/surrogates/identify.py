@@ -8,14 +8,25 @@ parameters the linearisation itself is the model.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import SimulationError, servable
+from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.identification_data import Trajectories, sample_trajectories
+from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import lossless
+from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
+from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.trajectory import Trajectory
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import (
     EnergyForm,
@@ -24,6 +35,135 @@ from ded_bench.surrogates.linear import (
     injection_lift,
     steady_state,
 )
+
+#: Range of a uniform draw.
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Simulated trajectories side by side, time first."""
+
+    kinds: tuple[str, ...]
+    inputs: Array  # (n_points, batch, n_gen + n_load), pu
+    theta_initial: Array  # (batch, n_bus), rad
+    theta: Array  # of the generators, (n_points, batch, n_gen), rad
+    omega: Array  # (n_points, batch, n_gen), rad/s
+    p_slack: Array  # (n_points, batch), pu
+
+    @property
+    def outputs(self) -> Array:
+        """(ω, P_s), shape (n_points, batch, n_gen + 1)."""
+        return np.concatenate([self.omega, self.p_slack[..., None]], axis=-1)
+
+
+def _signals(run: Trajectory) -> tuple[Array, ...]:
+    """Inputs, first angles, angles of the generators, ω and P_s: not the angles of all buses at all times."""
+    initial = np.array([run.columns[f"theta_{bus.id}"][0] for bus in lossless(run.case).buses])
+    theta = np.stack([run.columns[f"theta_{g}"] for g in run.case.generators], axis=1)
+    return np.hstack([run.p_gen, run.p_load]), initial, theta, run.omega, run.p_slack
+
+
+def sample_trajectories(
+    case: Case, seed: int, count: int, first: int = 0, mix: Sequence[str] | None = None
+) -> Trajectories:
+    """Simulate `count` fresh instances under the kinds of schedules in `mix` (default: all) in turn.
+
+    Those that the system cannot follow, as on weak grids, are left out.
+
+    Raises:
+        InputError: it cannot follow most of them.
+    """
+    mix = mix or list(KINDS)
+    kinds, runs = [], []
+    for i, instance in enumerate(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable)):
+        kind = mix[i % len(mix)]
+        rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
+        schedule = Schedule(instance.grid, KINDS[kind](case, instance, rng))
+        with contextlib.suppress(SimulationError):
+            runs.append(_signals(simulate(case, instance, schedule)))
+            kinds.append(kind)
+    if 2 * len(runs) < count:
+        lost = f"the system cannot follow {count - len(runs)} of {count} drawn schedules"
+        raise InputError(f"case {case.id}", "", f"{lost}: the power flow has no solution")
+    inputs, initial, *signals = zip(*runs, strict=True)
+    stacked = (np.stack(signal, axis=1) for signal in signals)
+    return Trajectories(tuple(kinds), np.stack(inputs, axis=1), np.stack(initial), *stacked)
+
+
+def tracking(
+    case: Case,
+    instance: Instance,
+    rng: np.random.Generator,
+    lag_s: Span = (0.1, 3.0),
+    smooth_s: Span = (0.02, 0.5),
+    rate: Span = (0.4, 1.0),
+) -> Array:
+    """Follow the static dispatch with a lag and limited rates, smoothed: looks like an optimum.
+
+    The rate is a fraction of the ramp limit, drawn below it since a tight frequency bound allows no more.
+    """
+    p_load = instance.p_load(case)
+    target = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
+    gain = instance.dt_s / rng.uniform(*lag_s)
+    smooth = instance.dt_s / rng.uniform(*smooth_s)
+    most = rng.uniform(*rate) * case.ramp * instance.dt_s
+    p = np.empty_like(target)
+    p[0] = instance.p_initial(case)
+    step = np.zeros(target.shape[1])
+    for k in range(len(p) - 1):
+        step += smooth * (np.clip(gain * (target[k + 1] - p[k]), -most, most) - step)
+        p[k + 1] = p[k] + step
+    return p
+
+
+def hurried(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """`tracking` at the ramp limit with little lag: an optimum where frequency bounds do not bind."""
+    return tracking(case, instance, rng, lag_s=(0.1, 1.0), smooth_s=(0.02, 0.1), rate=(1.0, 1.0))
+
+
+def bang_bang(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """Ramp up, down or not at all at the limit, for random whiles, within the bounds."""
+    n_gen, n = len(case.generators), instance.steps
+    rate = np.zeros((n, n_gen))
+    for j in range(n_gen):
+        k = 0
+        while k < n:
+            stop = k + int(rng.uniform(0.5, 8.0) / instance.dt_s)
+            rate[k:stop, j] = rng.integers(-1, 2)
+            k = stop
+    return _within(case, instance, rate * case.ramp * instance.dt_s)
+
+
+def random_knots(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """A random walk over the policy's knots, linear between them, within the ramp limit."""
+    knots = case.knot_times(instance.horizon_s)
+    slopes = rng.uniform(-1, 1, (len(knots) - 1, len(case.generators))) * case.ramp
+    at = np.minimum(np.searchsorted(knots, instance.grid[1:], side="left") - 1, len(knots) - 2)
+    return _within(case, instance, slopes[at] * instance.dt_s)
+
+
+def load_ramps(case: Case, instance: Instance, rng: np.random.Generator) -> Array:
+    """Generators stay where they are; only the loads move."""
+    return np.tile(instance.p_initial(case), (instance.steps + 1, 1))
+
+
+def _within(case: Case, instance: Instance, increments: Array) -> Array:
+    p = np.empty((instance.steps + 1, len(case.generators)))
+    p[0] = instance.p_initial(case)
+    for k, increment in enumerate(increments):
+        p[k + 1] = np.clip(p[k] + increment, case.p_min, case.p_max)
+    return p
+
+
+KINDS: dict[str, Callable[[Case, Instance, np.random.Generator], Array]] = {
+    "tracking": tracking,
+    "hurried": hurried,
+    "bang-bang": bang_bang,
+    "random knots": random_knots,
+    "load ramps": load_ramps,
+}
+
 
 TRAIN, HELD_OUT = 120, 60
 #: The whole energy form is fitted if it has at most so many parameters: each costs a rollout of all

@@ -1,4 +1,4 @@
-"""The Koopman surrogate: observables, K, B and G; sequential rollout (condensed: see `condensed`).
+"""The Koopman surrogate: observables, K, B and G; its rollout, step by step and condensed.
 
     ψ(x) = (ω, P_s, N(x))
     ψ_{k+1} = K (ψ_k - B P_k) + B P_k + G (P_{k+1} - P_k)
@@ -6,6 +6,12 @@
 G = 0 is the paper's eq. (KO_dyn); G = (I - K) B is the same form with the newer input sample; any
 other G is a first-order hold. Inputs are P = (generators, loads). B's ω rows are zero and its P_s
 row is -1, so equilibria are exact: ψ = B P gives ω = 0 and P_s = -Σ P.
+
+A rollout is affine in its inputs, and a schedule is linear between knots, so that
+
+    (ω, P_s) = free response + Γ knots
+
+where the free response has ψ_0 and the loads but no generator power (`CondensedRollout`).
 """
 
 from __future__ import annotations
@@ -73,21 +79,33 @@ class Koopman:
         p_load = np.stack([i.p_load(case, np.zeros(1))[0] for i in instances])
         return self.observables(network, theta, omega, p_load)
 
-    def rollout(self, psi: Array, inputs: Array) -> Array:
+    def rollout(self, psi: Array, inputs: Array, columns: slice = slice(None), stride: int = 1) -> Array:
         """Run the model from ψ_0.
+
+        A step of `stride` points sums what the input increments inside it contribute at its end.
 
         Args:
             psi: ψ_0, shape (..., n_psi).
-            inputs: P_k, shape (n_points, ..., n_gen + n_load), pu.
+            inputs: P at all points, shape (n_points, ..., n_columns), pu.
+            columns: which of the model's inputs these are; the others are zero.
+            stride: ψ is wanted at every so many points; it divides the number of steps.
 
         Returns:
-            ψ_k, shape (n_points, ..., n_psi).
+            ψ there, shape (n_steps / stride + 1, ..., n_psi).
         """
-        steady = inputs @ self.b.T
-        increments = np.diff(inputs, axis=0) @ (self.g - self.b).T
+        b = self.b[:, columns]
+        steady = inputs[::stride] @ b.T
+        at_end, power = [(self.g[:, columns] - b).T], self.k
+        for _ in range(stride - 1):
+            at_end.append(at_end[-1] @ self.k.T)
+            power = power @ self.k
+        change = np.diff(inputs, axis=0)
+        change = np.moveaxis(change.reshape(len(steady) - 1, stride, *change.shape[1:]), 1, -2)
+        change = change.reshape(*change.shape[:-2], stride * inputs.shape[-1])
+        increments = change @ np.concatenate(at_end[::-1])
         start = np.broadcast_to(psi - steady[0], np.broadcast_shapes(psi.shape, steady.shape[1:]))
         increments = np.broadcast_to(increments, (len(increments), *start.shape))
-        return linear_recurrence(self.k, start, increments) + steady
+        return linear_recurrence(power, start, increments) + steady
 
     def along(
         self,
@@ -246,3 +264,71 @@ def linear_recurrence(k: Array, start: Array, increments: Array) -> Array:
         before = block[:, -1]
     x = np.moveaxis(x, 2, 1).reshape(blocks * length, *start.shape)
     return np.concatenate([start[None], x[:n_steps]])
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedRollout:
+    """(ω, P_s) at the points of a time grid, or at every `stride`-th of them, from powers at knots."""
+
+    model: Koopman
+    stride: int
+    knots: Array  # times, (n_knots,), s
+    points: Array  # times, (n_points,), s
+    gamma: Array  # Γ by output, (n_gen + 1, n_points, n_knots n_gen): ω in rad/s, P_s in pu, per pu
+    hat_weights: Array  # sum over the whole grid of each knot's hat function, (n_knots,)
+    quadrature_weights: Array  # a sum over the whole grid, taken at the points, (n_points,)
+
+    @staticmethod
+    def make(case: Case, model: Koopman, grid: Array, knots: Array, stride: int = 1) -> CondensedRollout:
+        """Condense a model of a case.
+
+        Args:
+            case: gives the generators.
+            model: the surrogate; its step is that of the grid.
+            grid: times t_k, shape (n_grid,), s.
+            knots: knot times, shape (n_knots,), s.
+            stride: outputs are taken at every so many grid points; it divides the number of steps.
+        """
+        n_gen, points = len(case.generators), grid[::stride]
+        hats = hat_functions(grid, knots)
+        gamma = np.empty((n_gen + 1, len(points), len(knots), n_gen))
+        at_rest = np.zeros((len(knots), len(model.k)))
+        for g in range(n_gen):  # one generator at a time: the states of all would fill the memory
+            response = model.rollout(at_rest, hats[:, :, None], slice(g, g + 1), stride)
+            gamma[..., g] = np.moveaxis(response[..., : n_gen + 1], 2, 0)
+        return CondensedRollout(
+            model,
+            stride,
+            knots,
+            points,
+            gamma.reshape(n_gen + 1, len(points), -1),
+            hats.sum(axis=0),
+            hat_functions(grid, points).sum(axis=0) if stride > 1 else np.ones(len(grid)),
+        )
+
+    @property
+    def n_gen(self) -> int:
+        """Number of generators."""
+        return len(self.gamma) - 1
+
+
+def free_response(model: Koopman, psi: Array, p_load: Array, stride: int = 1) -> Array:
+    """(ω, P_s) without generator power, at every `stride`-th grid point.
+
+    Args:
+        model: the surrogate.
+        psi: ψ_0, (batch, n_psi).
+        p_load: load injections at all grid points, (batch, n_grid, n_load), pu.
+        stride: divides the number of steps.
+
+    Returns:
+        Shape (batch, n_gen + 1, n_points): rad/s, pu.
+    """
+    n_gen = model.b.shape[1] - p_load.shape[2]
+    response = model.rollout(psi, p_load.swapaxes(0, 1), slice(n_gen, None), stride)
+    return np.moveaxis(response[..., : n_gen + 1], 0, 2)
+
+
+def hat_functions(grid: Array, knots: Array) -> Array:
+    """Linear interpolation as a matrix, shape (n_grid, n_knots): values(grid) = hats @ values(knots)."""
+    return np.stack([np.interp(grid, knots, row) for row in np.eye(len(knots))], axis=1)

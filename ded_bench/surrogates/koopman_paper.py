@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.identification_data import Trajectories, sample_trajectories
-from ded_bench.surrogates.identify import TRAIN_MIX, n_training
+from ded_bench.surrogates.identify import TRAIN_MIX, Trajectories, n_training, sample_trajectories
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import EPSILON
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.analysis.compare import Tolerance, compare
-from ded_bench.cli.comparison import to_text
+from ded_bench.analysis.compare import compare, limits, to_text
 from ded_bench.files.errors import InputError
 from ded_bench.results.rows import Results, Row
 from tests.analysis import test_summary
@@ -93,9 +92,9 @@ def test_changes_within_it_are_none(folders, changes) -> None:
 
 def test_tolerances_are_the_callers(folders) -> None:
     pair = folders(altered(2, objective=102.0, freq_violation_hz=1e-3, ramp_violation=1e-5))
-    assert compare(*pair, Tolerance(0.02, 1e-2, 1e-4)).same
-    assert [c.column for c in compare(*pair, Tolerance(0.02, 1e-2, 0.0)).changes] == ["ramp_violation"]
-    assert compare(*pair, Tolerance(objective=0.0)).changes[0].size == pytest.approx(1 / 102)
+    assert compare(*pair, limits(0.02, 1e-2, 1e-4)).same
+    assert [c.column for c in compare(*pair, limits(0.02, 1e-2, 0.0)).changes] == ["ramp_violation"]
+    assert compare(*pair, limits(objective=0.0)).changes[0].size == pytest.approx(1 / 102)
 
 
 def test_rows_of_one_folder_only_count_unless_told_otherwise(folders) -> None:

@@ -19,8 +19,7 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.condensed import CondensedRollout, free_response
-from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import nominal_model
 from tests.methods.on_surrogates import HORIZON, check_limits, replay, short
 

@@ -19,7 +19,7 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
-from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.koopman import CondensedRollout
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.policies import random_policy, tightest
 

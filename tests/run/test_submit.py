@@ -14,7 +14,7 @@ from ded_bench.problem.benchmark import Selection
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Results
-from ded_bench.run.submit import submit
+from ded_bench.run.runner import submit
 
 pytestmark = pytest.mark.usefixtures("inline")
 

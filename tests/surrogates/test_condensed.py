@@ -8,7 +8,7 @@ import pytest
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
-from ded_bench.surrogates.condensed import CondensedRollout, free_response, hat_functions
+from ded_bench.surrogates.koopman import CondensedRollout, free_response, hat_functions
 from ded_bench.surrogates.linear import linear_model
 
 KNOTS = 7

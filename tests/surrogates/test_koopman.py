@@ -17,13 +17,14 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import find_model, model_file
-from ded_bench.surrogates.identification_data import load_ramps, sample_trajectories
 from ded_bench.surrogates.identify import (
     held_out,
     identify,
+    load_ramps,
     make_model,
     n_parameters,
     rollout_errors,
+    sample_trajectories,
     unpack,
 )
 from ded_bench.surrogates.koopman import Koopman
@@ -150,12 +151,12 @@ def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkey
 
         return run
 
-    monkeypatch.setattr("ded_bench.surrogates.identification_data.simulate", failing(3))
+    monkeypatch.setattr("ded_bench.surrogates.identify.simulate", failing(3))
     part = sample_trajectories(case, seed=1, count=6)
     assert part.kinds == tuple(complete.kinds[k] for k in (1, 2, 4, 5))
     assert (part.omega == complete.omega[:, [1, 2, 4, 5]]).all()
     assert (part.theta_initial == complete.theta_initial[[1, 2, 4, 5]]).all()
-    monkeypatch.setattr("ded_bench.surrogates.identification_data.simulate", failing(1))
+    monkeypatch.setattr("ded_bench.surrogates.identify.simulate", failing(1))
     with pytest.raises(InputError, match="cannot follow 6 of 6 drawn schedules"):
         sample_trajectories(case, seed=1, count=6)
 

@@ -17,7 +17,7 @@ from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
-from ded_bench.surrogates.condensed import CondensedRollout
+from ded_bench.surrogates.koopman import CondensedRollout
 from ded_bench.surrogates.linear import linear_model
 
 #: Points at which ω is looked at, for each interval between knots.

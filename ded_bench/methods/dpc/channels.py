@@ -20,7 +20,7 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.surrogates.condensed import hat_functions
+from ded_bench.surrogates.koopman import hat_functions
 from ded_bench.surrogates.linear import linear_model
 
 Array32 = NDArray[np.float32]

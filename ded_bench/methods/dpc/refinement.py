@@ -20,8 +20,7 @@ from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.condensed import CondensedRollout, free_response
-from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 
 Array32 = NDArray[np.float32]
 #: Spacing of the points at which P_s and ω are taken, s. Frequencies are below 0.25 Hz.
@@ -142,7 +141,7 @@ def coarse_stride(dt_s: float, steps: int, spacing_s: float) -> int:
 def coarse_free_response(
     network: Network, model: Koopman, inputs: StackedInstances, grid: Array, stride: int
 ) -> Array32:
-    """`condensed.free_response` of instances, (batch, n_gen + 1, n_coarse), float32."""
+    """`koopman.free_response` of instances, (batch, n_gen + 1, n_coarse), float32."""
     p_load = inputs.p_load(grid)
     theta = network.power_flow(inputs.p_initial, p_load[:, 0])
     if inputs.delta.any():

@@ -35,8 +35,7 @@ from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
-from ded_bench.surrogates.condensed import CondensedRollout
-from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.koopman import CondensedRollout, Koopman
 
 #: Fresh instances, epochs over them, batch size.
 FRESH, EPOCHS, BATCH = 64_000, 32, 128

@@ -28,8 +28,7 @@ from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.surrogates.condensed import CondensedRollout, free_response, hat_functions
-from ded_bench.surrogates.koopman import Koopman
+from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response, hat_functions
 
 LEARNING_RATE = 5e-4
 BATCH, EPOCHS = 8, 900

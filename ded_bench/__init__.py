@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ded_bench.problem.instance import Instance as Instance
     from ded_bench.problem.instance import instances_frame as instances_frame
     from ded_bench.problem.schedule import Schedule as Schedule
-    from ded_bench.problem.trajectory import Trajectory as Trajectory
+    from ded_bench.problem.schedule import Trajectory as Trajectory
     from ded_bench.solvers.status import Status as Status
 
 #: Where each name is from that is imported when it is first asked for.
@@ -44,7 +44,7 @@ _HOMES = {
     "SimulationError": "plants.plant",
     "Solution": "methods.solution",
     "Status": "solvers.status",
-    "Trajectory": "problem.trajectory",
+    "Trajectory": "problem.schedule",
     "instances_frame": "problem.instance",
 }
 __all__ = [*_HOMES, "load_instances", "score", "simulate", "simulate_many", "solve"]

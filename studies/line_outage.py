@@ -18,7 +18,7 @@ import pandas as pd
 
 from ded_bench import Case, Settings, score, solve
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
-from ded_bench.methods.policy_file import find_policy_file
+from ded_bench.methods.training_record import find_policy_file
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.sampling import sample_instance

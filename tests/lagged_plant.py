@@ -22,7 +22,7 @@ from ded_bench.plants.time_varying import Delivered, Hold, Indices, TimeVarying,
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import LosslessCase
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 
 #: Time constant of the turbines, s.
 LAG_S = 0.3

@@ -11,10 +11,9 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.methods.registry import Method
 from ded_bench.methods.solution import Artifact, Settings, Solution, Solver, model_artifact
-from ded_bench.methods.training_record import TrainingOptions, write_history
+from ded_bench.methods.training_record import TrainingOptions, find_policy_file, write_history
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

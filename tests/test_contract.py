@@ -16,9 +16,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.methods import solution
 from ded_bench.methods.options import described
-from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS, trainable
 from ded_bench.methods.solution import Settings, Solution
+from ded_bench.methods.training_record import policy_file
 from ded_bench.plants.plant import plant_of
 from ded_bench.plants.score import judge, score
 from ded_bench.plants.simulate import simulate

@@ -1,21 +1,124 @@
-"""The reference of a case: which method gaps are measured against, and its objectives.
+"""What results are compared with: a paper's numbers about the case, and the reference of gaps.
 
-Where a case carries a paper's numbers, it is the method that the paper measures against; elsewhere an
-accurate one, whose claims the scorer confirms; where nobody ran it, the best feasible schedule. Objectives
-come from the rows of a results folder; where it lacks some, from the reference run that ships with the case.
+A paper's numbers lie in `paper.json` in the case's folder. Where a case carries them, the reference is the
+method that the paper measures against; elsewhere an accurate one, whose claims the scorer confirms; where
+nobody ran it, the best feasible schedule. Objectives come from the rows of a results folder; where it lacks
+some, from the reference run that ships with the case.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import pandas as pd
+from pydantic import Field
 
-from ded_bench.analysis.lines import title
-from ded_bench.analysis.paper_numbers import Paper
+from ded_bench.analysis.lines import GROUP, HEAD, head, is_usual, line_table, records, title
+from ded_bench.analysis.summary import statistics, summary
+from ded_bench.files.errors import InputError
+from ded_bench.files.strict import Record, read_record
 from ded_bench.methods.options import DEFAULT
-from ded_bench.results.objectives import OBJECTIVES, Objective
+from ded_bench.problem.quantities import Name, NonNegative, Number
+from ded_bench.results.rows import OBJECTIVES, Objective
+
+
+class PaperRow(Record):
+    """What a paper reports of one method in one regime; an increase of None is its NA."""
+
+    increase_percent: Number | None
+    solve_s: NonNegative
+    freq_violation_hz: NonNegative
+    ramp_violation: NonNegative
+
+
+class Paper(Record):
+    """The numbers of a paper about one case.
+
+    Attributes:
+        case_fingerprint: of the case that the numbers are about.
+        methods: by the paper's name of a method, in the order of its tables: ours that answer to it.
+        regimes: rows by regime and the paper's name of the method.
+    """
+
+    schema_: Literal["ded-bench/paper/1"] = Field(alias="schema")
+    source: str
+    case_fingerprint: str
+    methods: dict[str, tuple[Name, ...]]
+    regimes: dict[Name, dict[str, PaperRow]]
+
+    def rows(self) -> dict[tuple[str, str], PaperRow]:
+        """The paper's rows by regime and our method, in the paper's order."""
+        return {
+            (regime, ours): rows[name]
+            for regime, rows in self.regimes.items()
+            for name, methods in self.methods.items()
+            for ours in methods
+            if name in rows
+        }
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Our methods that answer to the one whose own increase is not available: the paper's reference."""
+        rows = self.rows()
+        compared = {ours for (_, ours), row in rows.items() if row.increase_percent is not None}
+        return tuple(dict.fromkeys(ours for _, ours in rows if ours not in compared))
+
+
+def read_paper(problems: Path) -> Paper | None:
+    """The paper's numbers that lie beside a case's instances; None if there are none.
+
+    Raises:
+        InputError: the file is wrong, or lacks the method that increases are measured against.
+    """
+    path = problems / "paper.json"
+    if not path.is_file():
+        return None
+    paper = read_record(Paper, path)
+    for regime, rows in paper.regimes.items():
+        if unknown := sorted(rows.keys() - paper.methods.keys()):
+            raise InputError(path, f"regimes.{regime}.{unknown[0]}", "is not among the methods")
+    if not paper.references:
+        raise InputError(path, "regimes", "hold no method whose increase is null: that of the reference")
+    return paper
+
+
+def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, reference: str) -> pd.DataFrame:
+    """The lines of the paper's Tables V and VI: in each regime the paper's rows first, then all others.
+
+    Args:
+        rows: of the results table with their gaps (see `summary.gaps`).
+        timing: one row per line, of one host (see `timing_summary`).
+        paper: its rows are there even if nobody ran the method yet.
+        reference: method that gaps are measured against, with its default settings.
+
+    Returns:
+        What `summary` has, `is_reference`, the time alone on a machine `solve_s` and its `timing_failures`,
+        the mean gap `increase_percent` (missing for the reference), and the paper's numbers as `paper_…`.
+    """
+    ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
+    usual = {key[:2]: key for key in ours if is_usual(key[2], key[3], key[1])}
+    theirs = paper.rows()
+    beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in theirs.items()}
+    times = {tuple(line[name] for name in GROUP): line for line in records(timing)}
+    lines = []
+    for key in sorted(dict.fromkeys((*beside, *ours)), key=lambda key: str(key[0])):
+        line = ours.get(key) or head(key[0], key[1:]) | statistics(rows[:0])
+        timed = times.get(key, {})
+        line["is_reference"] = (key[1], key[2]) == (reference, DEFAULT)
+        line["solve_s"], line["timing_failures"] = timed.get("solve_s", math.nan), timed.get("failures", 0)
+        line["increase_percent"] = math.nan if line["is_reference"] else line["gap_percent_mean"]
+        for name in PaperRow.model_fields:
+            number = getattr(beside.get(key), name, None)
+            line[f"paper_{name}"] = math.nan if number is None else float(number)
+        lines.append(line)
+    own = ("is_reference", "solve_s", "timing_failures", "increase_percent")
+    papers = (f"paper_{name}" for name in PaperRow.model_fields)
+    return line_table(lines, [*HEAD, *statistics(rows[:0]), *own, *papers])
+
 
 #: References of cases without a paper's numbers, the first that has objectives.
 ACCURATE = ("ded-radau", "ded-slp")

@@ -160,7 +160,7 @@ def _report(a: argparse.Namespace) -> int:
     if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
         say(f"tables and figures of {counted(rows, 'row')} in {folder}")
     from ded_bench.report.report import write_report
-    from ded_bench.results.objectives import OBJECTIVES, objectives_of
+    from ded_bench.results.rows import OBJECTIVES, objectives_of
 
     written = write_report(case, folder, problem_folder(a.case, case), print)
     OBJECTIVES.write(ResultsFolder(folder).objectives, objectives_of(Results(folder).rows.values()))

@@ -8,22 +8,19 @@ from typing import TextIO
 
 import pandas as pd
 
-from ded_bench.analysis.findings import own_first
 from ded_bench.analysis.lines import HEAD, named, titled
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.analysis.paper_numbers import read_paper
-from ded_bench.analysis.reference import choose_reference
-from ded_bench.analysis.summary import gaps, outcome
+from ded_bench.analysis.reference import choose_reference, read_paper
+from ded_bench.analysis.summary import gaps, outcome, own_first
 from ded_bench.cli.arguments import counted, say
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import ONLINE, OUTCOME
 from ded_bench.report.page import PageTable
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import ONLINE as ONLINE_ROWS
 from ded_bench.results.online_results import OnlineRow
-from ded_bench.results.rows import ROWS, Results, Row
+from ded_bench.results.rows import ROWS, Results, Row, reference_objectives
 
 #: Of the closed loop's columns, those that a terminal has room for.
 _LOOP = (*HEAD, "latency_s", "n", "failures", "increase_percent_mean", "max_excess_mhz_mean", "failed")

@@ -47,7 +47,6 @@ def add_commands(commands: Any) -> None:
     budget.add_argument("--epochs", type=positive, metavar="N", help="train for so many")
     p.add_argument("--limit", type=positive, help="only the first so many training instances")
     p.add_argument("--start", type=Path, metavar="FILE", help="policy whose weights training starts from")
-    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train")
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
@@ -114,9 +113,8 @@ def _train_dpc(a: argparse.Namespace) -> int:
 
 def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     """Train one policy as the command's options say; returns what to tell."""
-    from ded_bench.methods.policy_file import policy_file
     from ded_bench.methods.registry import get_method
-    from ded_bench.methods.training_record import LOSSES, TrainingOptions
+    from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
     from ded_bench.run.environment import commit, version
 
     case = Case.load(a.case)
@@ -130,7 +128,6 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
         seed=a.seed,
         seconds=a.seconds,
         epochs=a.epochs,
-        device=a.device,
         resume=a.resume,
         start=a.start,
         model=a.model,

@@ -17,8 +17,7 @@ from ded_bench.plants.plant import Plant, SimulationError, plant_of
 from ded_bench.plants.simulate import in_threads, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 
 try:
     import torch

@@ -12,8 +12,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.surrogates.koopman import hat_functions
 
 #: Slopes are those of intervals of this length, s: gradients are then right to a ten-thousandth.
@@ -88,19 +87,10 @@ def condense(
     hats, n_gen = from_schedule(model, instance, schedule), len(case.generators)
     # Columns: the knot, then the generator, of which one is moved.
     moved = np.einsum("jk,gi->jgki", hats, np.eye(n_gen)).reshape(len(hats), n_gen, -1)
-    x, states = np.zeros((model.across.f.shape[1], moved.shape[2])), []
-    for j, length in enumerate(model.lengths):
-        states.append(x)
-        driven = model.across.g[j] @ moved[j] + model.across.h[j] @ (moved[j + 1] - moved[j]) / length
-        x = model.across.f[j] @ x + driven
-    states.append(x)
-    shape = len(schedule.t), n_gen
-    model_at = [*range(len(model.lengths)), len(model.lengths) - 1]  # the last point is of the last interval
-    if isinstance(model.speed, slice):
-        d_omega = np.array([x[model.speed] for x in states])
-    else:
-        d_omega = np.array([model.speed[j] @ x for j, x in zip(model_at, states, strict=True)])
-    d_slack = np.array([model.slack[j] @ x for j, x in zip(model_at, states, strict=True)])
+    states, shape = model.states(moved), (len(schedule.t), n_gen)
+    at = np.append(np.arange(len(model.lengths)), len(model.lengths) - 1)  # the last point is of the last
+    d_omega = states[:, model.speed] if isinstance(model.speed, slice) else model.speed[at] @ states
+    d_slack = np.array([model.slack[j] @ x for j, x in zip(at, states, strict=True)])
     return CondensedMap(
         t=instance.grid[model.points],
         p=schedule.p,

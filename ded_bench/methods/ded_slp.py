@@ -26,8 +26,7 @@ from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.solvers.status import Status
 
 #: Raised when answers change.

@@ -29,9 +29,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.knot_columns import KnotColumns
+from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows
 from ded_bench.methods.knots import divided, knot_weights
-from ded_bench.methods.output_rows import BasisByPlaces, OutputRows
 from ded_bench.methods.reserve import Reserve
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case

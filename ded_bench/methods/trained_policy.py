@@ -20,8 +20,8 @@ import numpy as np
 
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.methods.policy_file import find_policy_file
 from ded_bench.methods.solution import Artifact, Settings, Solution, Solver
+from ded_bench.methods.training_record import find_policy_file
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

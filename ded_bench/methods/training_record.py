@@ -15,12 +15,41 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically
-from ded_bench.methods.policy_file import DEFAULT_MODEL
+from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.koopman import Koopman
+
+#: The surrogate on which policies train unless told otherwise; the names of their files do not say it.
+DEFAULT_MODEL = "koopman"
+
+
+def policy_file(results: Path, method: str, regime: str, model: str = "") -> Path:
+    """Where a results folder keeps a policy: `<method>-<regime>`, and the model unless it is the default."""
+    suffix = "" if model in ("", DEFAULT_MODEL) else f"-{Path(model).stem}"
+    return ResultsFolder(results).policy(f"{method}-{regime}{suffix}")
+
+
+def find_policy_file(method: str, case: Case, regime: str, settings: Settings) -> Path:
+    """Return the policy file given in the settings, else the first one in the folders to search.
+
+    Raises:
+        InputError: there is none; names the command that trains one.
+    """
+    if settings.policy:
+        return settings.policy
+    for folder in settings.search:
+        path = policy_file(folder, method, regime, settings.model)
+        if path.is_file():
+            return path
+    command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.id}"
+    command += "" if settings.model in ("", DEFAULT_MODEL) else f" --model {settings.model}"
+    raise InputError("--policy", "", f"no {method} policy for {regime} yet; run `{command}`")
+
 
 #: First columns of every history.
 HISTORY = ("epoch", "seconds", "training", "held out")
@@ -35,7 +64,6 @@ class TrainingOptions:
     seed: int = 0
     seconds: float | None = None  # end after so much training time; None: train for all epochs
     epochs: int | None = None  # None: as many as the method's recipe says
-    device: str = "cpu"  # or "cuda"
     resume: bool = False  # go on from the checkpoint, if there is one
     start: Path | None = None  # policy file, perhaps of another grid, whose weights training starts from
     model: str = ""  # surrogate to train on, by name or file, for methods that train on one
@@ -53,7 +81,7 @@ class TrainingOptions:
 
     def facts(self) -> dict[str, Any]:
         """What every policy's file tells of how it was trained."""
-        kept = ("seed", "device", "version", "commit")
+        kept = ("seed", "version", "commit")
         return {name: getattr(self, name) for name in kept}
 
 

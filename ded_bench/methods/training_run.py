@@ -75,7 +75,7 @@ class TrainingRun(abc.ABC):
             InputError: the checkpoint is none, or one of another training.
         """
         if options.resume and checkpoint_file(self.out).is_file():
-            self.load(options.device)
+            self.load()
         self._go(options.epochs or epochs, options.seconds, title)
         self.network.load_state_dict(self.best_weights)
         write_history(self.out, self.history)
@@ -141,7 +141,7 @@ class TrainingRun(abc.ABC):
         torch.save(state | {"generator": self.generator.get_state()}, buffer)
         write_atomically(checkpoint_file(self.out), buffer.getvalue())
 
-    def load(self, device: str) -> None:
+    def load(self) -> None:
         """Go on from the checkpoint, which is read without trust.
 
         Raises:
@@ -149,12 +149,12 @@ class TrainingRun(abc.ABC):
         """
         path = checkpoint_file(self.out)
         try:
-            state = torch.load(path, weights_only=True, map_location=device)
+            state = torch.load(path, weights_only=True)
             for name in ("network", "average", "optimiser"):
                 getattr(self, name).load_state_dict(state[name])
             for name in self.progress:
                 setattr(self, name, state[name])
-            self.generator.set_state(state["generator"].cpu())
+            self.generator.set_state(state["generator"])
         except Exception:  # of pickle, zipfile and torch alike
             problem = "is no checkpoint of this training; remove it, or train without --resume"
             raise InputError(path, "", problem) from None
@@ -162,15 +162,10 @@ class TrainingRun(abc.ABC):
 
 @contextlib.contextmanager
 def repeatable() -> Iterator[None]:
-    """Train so that results repeat: on one thread, from which these networks lose nothing.
-
-    A GPU convolves in single precision, as the CPU does (cuDNN's default keeps ten bits), and the same
-    way every time.
-    """
+    """Train so that results repeat: on one thread, from which these networks lose nothing."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
-            yield
+        yield
     finally:
         torch.set_num_threads(threads)

@@ -19,7 +19,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, State
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 
 #: Only the plant that made it knows what is in it.
 PlantState = Any

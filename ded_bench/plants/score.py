@@ -13,8 +13,7 @@ from ded_bench.plants.plant import Plant
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 
 #: What counts as feasible: excess frequency in Hz, also on islands, and excess of power limits in pu.
 FEASIBLE_HZ, ISLAND_HZ, FEASIBLE_PU = 1e-4, 1e-5, 1e-6

@@ -13,8 +13,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import Plant, PlantState, SimulationError, plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")

@@ -117,14 +117,16 @@ class TimeVarying:
         """Deviations x at the knots under input increments.
 
         Args:
-            u: δP at the knots, shape (n_knots, n_gen), pu.
+            u: δP at the knots, shape (n_knots, n_gen), pu; or several, (n_knots, n_gen, n_columns).
 
         Returns:
-            Shape (n_knots, n_state), zero at the first knot.
+            Shape (n_knots, n_state), or (n_knots, n_state, n_columns), zero at the first knot.
         """
-        slope = np.diff(u, axis=0) / self.lengths[:, None]
-        driven = (self.across.g @ u[:-1, :, None] + self.across.h @ slope[:, :, None])[..., 0]
-        x = np.zeros((len(self.points), self.across.f.shape[1]))
+        columns = u[:, :, None] if u.ndim == 2 else u
+        slope = np.diff(columns, axis=0) / self.lengths[:, None, None]
+        driven = self.across.g @ columns[:-1] + self.across.h @ slope
+        driven = driven[..., 0] if u.ndim == 2 else driven
+        x = np.zeros((len(self.points), *driven.shape[1:]))
         for j, (f, force) in enumerate(zip(self.across.f, driven, strict=True)):
             x[j + 1] = f @ x[j] + force
         return x

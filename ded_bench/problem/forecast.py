@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import LoadPoints, ramped_for
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, ramped_for
 from ded_bench.problem.scenario import Scenario, ScenarioLoad
 
 #: `announced`: ramps as announced; `perfect`: what will be; `worse`: announcements four times as wrong;
@@ -29,9 +29,22 @@ class Forecast:
         """Forecast injections at times `t` in s of the scenario, shape (n_t, n_load), pu."""
         return np.stack([np.interp(t, times, values) for times, values in self.loads], axis=-1)
 
-    def points(self, start: float, horizon_s: float) -> tuple[LoadPoints, ...]:
-        """The loads of an instance whose t = 0 is `start`, in the order of the case."""
-        return tuple(_points(times, values, start, horizon_s) for times, values in self.loads)
+    def instance(
+        self, scenario: Scenario, case: Case, start: float, horizon_s: float, initial: Initial, name: str
+    ) -> Instance:
+        """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
+        points = (_points(times, values, start, horizon_s) for times, values in self.loads)
+        return Instance(
+            schema_="ded-bench/instance/2",
+            id=name,
+            case=case.id,
+            seed=scenario.seed,
+            horizon_s=horizon_s,
+            dt_s=scenario.dt_s,
+            cost=scenario.cost,
+            load=dict(zip(case.loads, points, strict=True)),
+            initial=initial,
+        )
 
 
 def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: float) -> Forecast:

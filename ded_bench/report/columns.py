@@ -87,7 +87,7 @@ ROWS, N, FAILURES = Column("rows", "rows"), Column("n", "n"), Column("failures",
 DATE, INSTANCES = Column("date", "date"), Column("instances", "instances")
 _HEAD = (REGIME, TITLE)
 
-#: The paper's tables, of `paper_numbers.result_lines`.
+#: The paper's tables, of `reference.result_lines`.
 TABLE_V = (
     *_HEAD,
     Column("increase_percent", "% increase in obj. over DED"),

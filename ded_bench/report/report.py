@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ded_bench.analysis.findings import findings
+from ded_bench.analysis.summary import findings
 from ded_bench.problem.case import Case
 from ded_bench.report.figures import draw_figures
 from ded_bench.report.page import write_page

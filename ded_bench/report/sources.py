@@ -12,9 +12,8 @@ import pandas as pd
 from ded_bench.analysis.certificate import Certificate, read_certificates
 from ded_bench.analysis.lines import judged_rows, named, newest, on_usual_model
 from ded_bench.analysis.online_summary import online_rows, practice_rows
-from ded_bench.analysis.paper_numbers import Paper, read_paper
 from ded_bench.analysis.referee import REFEREE
-from ded_bench.analysis.reference import Reference, choose_reference
+from ded_bench.analysis.reference import Paper, Reference, choose_reference, read_paper
 from ded_bench.analysis.summary import gaps, judged_elsewhere, outcome, summary
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
@@ -23,11 +22,10 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.objectives import reference_objectives
 from ded_bench.results.online_results import OnlineResults
-from ded_bench.results.rows import VALIDATED, Key, Results
+from ded_bench.results.rows import VALIDATED, Key, Results, reference_objectives
 from ded_bench.results.timing import TIMING, timing_summary
 
 

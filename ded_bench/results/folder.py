@@ -1,7 +1,7 @@
 """Every path inside a results folder, and where such folders of a case lie unless told otherwise.
 
 A checkout has a whole reference run of each case. An installed package has of each its models, its policies
-and the table of objectives (`results.objectives`), so that every method answers in an empty folder.
+and the table of objectives (`rows.OBJECTIVES`), so that every method answers in an empty folder.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ResultsFolder:
         self.koopman = path / "koopman"  # identified models, see `model`
         self.certificates = path / "certificate.json"  # certificates of policies
         self.tables, self.figures = path / "tables", path / "figures"  # of the report
-        self.objectives = self.tables / "objectives.csv"  # see `results.objectives`
+        self.objectives = self.tables / "objectives.csv"  # see `rows.OBJECTIVES`
 
     @property
     def contents(self) -> tuple[Path, ...]:

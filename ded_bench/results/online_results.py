@@ -15,7 +15,7 @@ from ded_bench.files.table import Count, NotNegative, PlainName, Table
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.quantities import Probability
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 from ded_bench.results.folder import PLANT, OnlineKey, ResultsFolder
 from ded_bench.results.legacy import upgraded
 from ded_bench.results.rows import Made, OfIslands

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -18,7 +18,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.archive import Archive
-from ded_bench.results.folder import ResultsFolder
+from ded_bench.results.folder import ResultsFolder, reference_run
 from ded_bench.results.legacy import upgraded
 from ded_bench.solvers.status import Status
 
@@ -240,3 +240,44 @@ class Results(KeyedTable[Key, Row]):
     def frame(self) -> pd.DataFrame:
         """The table, one row each, typed columns; empty cells are missing values."""
         return ROWS.frame(self.rows.values())
+
+
+#: Rows of drawn validation instances serve choices, not comparisons.
+_LEFT_OUT = "validation"
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The re-simulated objective of one method in its default settings; comparable within one version."""
+
+    case: str
+    instance: str
+    regime: str
+    method: str
+    objective: float
+    problems_version: str = ""
+
+
+OBJECTIVES = Table(Objective)
+
+
+def objectives_of(rows: Iterable[Row]) -> list[Objective]:
+    """The scored rows with default settings and nothing trained, by regime, method and instance."""
+    found = [
+        Objective(row.case, row.instance, row.regime, row.method, row.objective, row.problems_version)
+        for row in rows
+        if row.objective is not None
+        and row.settings == "default"
+        and not (row.model or row.policy)
+        and row.split != _LEFT_OUT
+    ]
+    return sorted(found, key=lambda o: (o.regime, o.method, o.instance))
+
+
+def reference_objectives(case: Case) -> list[Objective]:
+    """The objectives of a case's reference run; empty where it has none.
+
+    Raises:
+        InputError: the table is wrong.
+    """
+    return OBJECTIVES.existing(ResultsFolder(reference_run(case)).objectives)

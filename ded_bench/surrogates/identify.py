@@ -25,8 +25,7 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import (
     EnergyForm,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from ded_bench.analysis.paper_numbers import read_paper
-from ded_bench.analysis.reference import choose_reference
+from ded_bench.analysis.reference import choose_reference, read_paper
 from ded_bench.analysis.summary import gaps
 from ded_bench.problem.case import SHIPPED_CASES
-from ded_bench.results.objectives import Objective
+from ded_bench.results.rows import Objective
 from tests.analysis.test_summary import frame_of, row
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.findings import findings
 from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
+    findings,
     gaps,
     judged_elsewhere,
     largest_violation,

@@ -12,9 +12,9 @@ from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import artifacts, prepare
 from ded_bench.methods.dpc.refinement import Refiner, coarse_free_response, coarse_stride
-from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.methods.training_record import policy_file
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

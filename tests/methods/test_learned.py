@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from ded_bench.cli import main
-from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.training_record import policy_file
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.run.tasks import make_tasks, pack, solve_task

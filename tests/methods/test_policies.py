@@ -14,11 +14,10 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.admm import admm_training
 from ded_bench.methods.dpc import training as dpc_training
 from ded_bench.methods.dpc_paper import paper_training
-from ded_bench.methods.policy_file import policy_file
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.trained_policy import TrainedPolicy
-from ded_bench.methods.training_record import HISTORY, TrainingOptions, checkpoint_file
+from ded_bench.methods.training_record import HISTORY, TrainingOptions, checkpoint_file, policy_file
 from ded_bench.methods.training_run import TrainingRun
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case

@@ -12,8 +12,7 @@ from ded_bench.plants.score import Score, judge, score
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.sampling import sample_instances
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 
 N = 101
 

@@ -17,8 +17,7 @@ from ded_bench.plants.time_varying import Delivered, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 
 STEPS = 400
 #: Knots at unequal distances, as after rounding to the grid.

@@ -102,7 +102,7 @@ def test_points_of_an_instance_are_the_forecast(known, threebus, quality):
     """Shifted to t = 0 at its start; every forecast begins with the present load."""
     loads = forecast(known, threebus, quality, 5.0, 16.0)
     assert loads.at(np.array([5.0])) == pytest.approx(known.p_load(threebus, np.array([5.0])), abs=1e-15)
-    (points,) = loads.points(7.31, 6.0)
+    (points,) = loads.instance(known, threebus, 7.31, 6.0, known.initial, "later").load.values()
     times = np.linspace(0.0, 6.0, 601)
     np.testing.assert_allclose(points.at(times), loads.at(7.31 + times)[:, 0], atol=1e-14)
     assert points.points[-1][0] == 6.0

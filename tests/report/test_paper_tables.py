@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.paper_numbers import Paper, read_paper, result_lines
+from ded_bench.analysis.reference import Paper, read_paper, result_lines
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import SHIPPED_CASES, Case

@@ -16,10 +16,10 @@ from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.refinement import Refiner
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.policy_file import DEFAULT_MODEL
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
+from ded_bench.methods.training_record import DEFAULT_MODEL
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -169,7 +169,6 @@ class Pool(NamedTuple):
         model: Koopman,
         network: Network,
         grid: Array,
-        device: str,
     ) -> Pool:
         """Convert channels, and compute free responses on a time grid; float32."""
         stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
@@ -179,7 +178,7 @@ class Pool(NamedTuple):
         seen = channels.start, channels.free_response, channels.sequence, channels.constants
         arrays = (*seen, inputs.cost, scale, np.concatenate(free))
         whole = (np.ascontiguousarray(array) for array in arrays)
-        return Pool(*(torch.as_tensor(array, dtype=torch.float32, device=device) for array in whole))
+        return Pool(*(torch.as_tensor(array, dtype=torch.float32) for array in whole))
 
     def of_rows(self, rows: Tensor) -> Pool:
         """Some of them."""
@@ -189,11 +188,11 @@ class Pool(NamedTuple):
 class RolloutLoss:
     """Relative cost and frequency excess of schedules, by a surrogate on the coarse points."""
 
-    def __init__(self, condensed: CondensedRollout, omega_bound: float, device: str) -> None:
+    def __init__(self, condensed: CondensedRollout, omega_bound: float) -> None:
         gamma = condensed.gamma.reshape(-1, condensed.gamma.shape[2])
         arrays = gamma, condensed.hat_weights, condensed.quadrature_weights
         self.gamma, self.hat_weights, self.quadrature_weights = (
-            torch.as_tensor(array, dtype=torch.float32).to(device) for array in arrays
+            torch.as_tensor(array, dtype=torch.float32) for array in arrays
         )
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
         self.spacing_s = condensed.stride * condensed.model.dt_s
@@ -224,18 +223,14 @@ def train(
     drawn = list(sample_instances(case, POLICY_SEED + options.seed, fresh, servable=servable))
     inputs = [StackedInstances.of(case, part) for part in (drawn, instances)]
     channels = [Channels.of(case, part, response) for part in inputs]
-    data, check = (
-        Pool.of(c, i, model, network, first.grid, options.device)
-        for c, i in zip(channels, inputs, strict=True)
-    )
+    data, check = (Pool.of(c, i, model, network, first.grid) for c, i in zip(channels, inputs, strict=True))
     stride = coarse_stride(model.dt_s, first.steps, SPACING_S)
     condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
         staged = StagedNetwork(case, response)
     staged.normalise(channels[0])
-    staged.to(options.device)
-    loss = RolloutLoss(condensed, case.omega_bound(regime), options.device)
+    loss = RolloutLoss(condensed, case.omega_bound(regime))
     run = _DispatchTraining(staged, loss, data, check, options.seed, out)
     facts = run.train(options, EPOCHS, f"{DispatchPolicy.method} {regime}") | {
         "instances": len(drawn),
@@ -270,10 +265,10 @@ class _DispatchTraining(TrainingRun):
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """Cost and priced penalty of a batch."""
-        batch = self.data.of_rows(rows.to(self.data.start.device))
+        batch = self.data.of_rows(rows)
         cost, excess = self.judge(self.network(*batch[:4]), batch, MARGIN)
         penalty = _penalty(excess)
-        self.penalty[rows] = penalty.detach().cpu()
+        self.penalty[rows] = penalty.detach()
         price = PRICE[0] * (PRICE[1] / PRICE[0]) ** progress * self.judge.spacing_s
         total: Tensor = cost.mean() + price * penalty.mean()
         return total
@@ -291,11 +286,6 @@ class _DispatchTraining(TrainingRun):
             "mean excess": float(worst.mean()),
             "max excess": float(worst.max()),
         }
-
-    def load(self, device: str) -> None:
-        """See `TrainingRun.load`; rows are chosen on the CPU."""
-        super().load(device)
-        self.penalty = self.penalty.cpu()
 
 
 def _penalty(excess: Tensor) -> Tensor:

@@ -84,7 +84,7 @@ class Batch(NamedTuple):
     p_initial: Tensor  # (batch, n_gen), pu
 
     @staticmethod
-    def of(case: Case, model: Koopman, instances: Sequence[Instance], device: str) -> Batch:
+    def of(case: Case, model: Koopman, instances: Sequence[Instance]) -> Batch:
         """Features and free responses of instances with one time grid."""
         network, p_load = Network(case), np.stack([i.p_load(case) for i in instances])
         arrays = (
@@ -94,7 +94,7 @@ class Batch(NamedTuple):
             np.array([i.cost_slack(case) for i in instances]),
             np.stack([i.p_initial(case) for i in instances]),
         )
-        return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32, device=device) for a in arrays))
+        return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32) for a in arrays))
 
     def of_rows(self, rows: Tensor) -> Batch:
         """Some of them."""
@@ -109,15 +109,12 @@ class PaperLoss:
         condensed: CondensedRollout,
         omega_bound: float,
         ramp: Array,
-        device: str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
         """Bounds in rad/s and, for each generator, pu per step."""
         gamma = condensed.gamma.reshape(-1, condensed.gamma.shape[2])
         arrays = gamma, hat_functions(condensed.points, condensed.knots), ramp
-        self.gamma, self.hats, self.ramp = (
-            torch.as_tensor(array, dtype=dtype).to(device) for array in arrays
-        )
+        self.gamma, self.hats, self.ramp = (torch.as_tensor(array, dtype=dtype) for array in arrays)
         self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
 
     def __call__(self, knots: Tensor, batch: Batch) -> dict[str, Tensor]:
@@ -156,12 +153,12 @@ def train(
         instances: to train on; they share one time grid.
     """
     model, first = options.find_model(case), instances[0]
-    data = Batch.of(case, model, instances, options.device)
+    data = Batch.of(case, model, instances)
     condensed = CondensedRollout.make(case, model, first.grid, case.knot_times(first.horizon_s))
-    loss = PaperLoss(condensed, case.omega_bound(regime), case.ramp * first.dt_s, options.device)
+    loss = PaperLoss(condensed, case.omega_bound(regime), case.ramp * first.dt_s)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
-        network = PaperNetwork(n_channels(case), case.p_min, case.p_max).to(options.device)
+        network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
     run = _PaperTraining(network, loss, data, options.seed, out)
     facts = run.train(options, EPOCHS, f"{PaperPolicy.method} {regime}") | {
         "instances": len(instances),

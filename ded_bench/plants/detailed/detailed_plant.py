@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.detailed_linearisation import linearised
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
-from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem
+from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem, linearised
 from ded_bench.plants.detailed.start import corrected, initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
@@ -29,7 +28,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import AgcState, Instance, State
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import rounded
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 
 if TYPE_CHECKING:
     from ded_bench.plants.detailed.detailed_stepper import SecondaryControl

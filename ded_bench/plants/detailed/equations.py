@@ -18,23 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.plants.detailed.machine_arrays import (
-    DELTA,
-    E1D,
-    E1Q,
-    E2D,
-    E2Q,
-    EXCITER,
-    FEEDBACK,
-    FIELD,
-    GATE,
-    LEAD_A,
-    LEAD_B,
-    SPEED,
-    TURBINE,
-    WASHOUT,
-    MachineArrays,
-)
+from ded_bench.plants.detailed import machine_arrays as at
+from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 
@@ -81,9 +66,9 @@ def sources(data: MachineArrays, x: Array, source: Array) -> None:
     source[:] = 0.0
     turn = mean_angle(data, x)
     for i in range(x.shape[1]):
-        psi_d = data[i].gd1 * x[E1Q, i] + (1.0 - data[i].gd1) * x[E2D, i]
-        psi_q = data[i].gq1 * x[E1D, i] + (1.0 - data[i].gq1) * x[E2Q, i]
-        sin, cos = np.sin(x[DELTA, i] - turn), np.cos(x[DELTA, i] - turn)
+        psi_d = data[i].gd1 * x[at.E1Q, i] + (1.0 - data[i].gd1) * x[at.E2D, i]
+        psi_q = data[i].gq1 * x[at.E1D, i] + (1.0 - data[i].gq1) * x[at.E2Q, i]
+        sin, cos = np.sin(x[at.DELTA, i] - turn), np.cos(x[at.DELTA, i] - turn)
         source[2 * data[i].port] += (psi_d * sin - psi_q * cos) / data[i].x
         source[2 * data[i].port + 1] -= (psi_q * sin + psi_d * cos) / data[i].x
 
@@ -93,7 +78,7 @@ def mean_angle(data: MachineArrays, x: Array) -> float:
     """The inertia-weighted mean of the rotor angles, rad; that of the infinite machine where there is one."""
     mean = 0.0
     for i in range(x.shape[1]):
-        mean += data[i].inertia * x[DELTA, i]
+        mean += data[i].inertia * x[at.DELTA, i]
     return mean
 
 
@@ -177,40 +162,40 @@ def machine_rates(
     """
     turn = mean_angle(data, x)
     for i in range(x.shape[1]):
-        w = x[SPEED, i]
-        e1q, e1d, e2d, e2q = x[E1Q, i], x[E1D, i], x[E2D, i], x[E2Q, i]
+        w = x[at.SPEED, i]
+        e1q, e1d, e2d, e2q = x[at.E1Q, i], x[at.E1D, i], x[at.E2D, i], x[at.E2Q, i]
         re, im = v[2 * data[i].port], v[2 * data[i].port + 1]
-        sin, cos = np.sin(x[DELTA, i] - turn), np.cos(x[DELTA, i] - turn)
+        sin, cos = np.sin(x[at.DELTA, i] - turn), np.cos(x[at.DELTA, i] - turn)
         v_d, v_q = re * sin - im * cos, re * cos + im * sin
         i_d = (data[i].gd1 * e1q + (1.0 - data[i].gd1) * e2d - v_q) / data[i].x
         i_q = (v_d - data[i].gq1 * e1d - (1.0 - data[i].gq1) * e2q) / data[i].x
         p_e[i] = v_d * i_d + v_q * i_q
-        p_m = data[i].reheat * (x[GATE, i] - x[TURBINE, i]) + x[TURBINE, i]
-        rates[DELTA, i] = data[i].omega_0 * w
-        rates[SPEED, i] = data[i].inverse_m * (p_m - p_e[i] - data[i].d * w)
+        p_m = data[i].reheat * (x[at.GATE, i] - x[at.TURBINE, i]) + x[at.TURBINE, i]
+        rates[at.DELTA, i] = data[i].omega_0 * w
+        rates[at.SPEED, i] = data[i].inverse_m * (p_m - p_e[i] - data[i].d * w)
         i_fd = data[i].gd1 * i_d + data[i].gd2 * (e1q - e2d)
         i_fd = e1q + (data[i].xd - data[i].xd1) * i_fd
         i_1q = data[i].gq2 * (e1d - e2q) - data[i].gq1 * i_q
         i_1q = e1d + (data[i].xq - data[i].xq1) * i_1q
-        rates[E1Q, i] = data[i].rate_d1 * (x[FIELD, i] - i_fd)
-        rates[E1D, i] = -data[i].rate_q1 * i_1q
-        rates[E2D, i] = data[i].rate_d2 * (e1q - e2d - (data[i].xd1 - data[i].xl) * i_d)
-        rates[E2Q, i] = data[i].rate_q2 * (e1d - e2q + (data[i].xq1 - data[i].xl) * i_q)
-        after = data[i].ks * w - x[WASHOUT, i]
-        between = data[i].lead_a * (after - x[LEAD_A, i]) + x[LEAD_A, i]
-        v_s = data[i].lead_b * (between - x[LEAD_B, i]) + x[LEAD_B, i]
-        rates[WASHOUT, i] = data[i].rate_w * after
-        rates[LEAD_A, i] = data[i].rate_a * (after - x[LEAD_A, i])
-        rates[LEAD_B, i] = data[i].rate_b * (between - x[LEAD_B, i])
+        rates[at.E1Q, i] = data[i].rate_d1 * (x[at.FIELD, i] - i_fd)
+        rates[at.E1D, i] = -data[i].rate_q1 * i_1q
+        rates[at.E2D, i] = data[i].rate_d2 * (e1q - e2d - (data[i].xd1 - data[i].xl) * i_d)
+        rates[at.E2Q, i] = data[i].rate_q2 * (e1d - e2q + (data[i].xq1 - data[i].xl) * i_q)
+        after = data[i].ks * w - x[at.WASHOUT, i]
+        between = data[i].lead_a * (after - x[at.LEAD_A, i]) + x[at.LEAD_A, i]
+        v_s = data[i].lead_b * (between - x[at.LEAD_B, i]) + x[at.LEAD_B, i]
+        rates[at.WASHOUT, i] = data[i].rate_w * after
+        rates[at.LEAD_A, i] = data[i].rate_a * (after - x[at.LEAD_A, i])
+        rates[at.LEAD_B, i] = data[i].rate_b * (between - x[at.LEAD_B, i])
         u = v_ref[i] - np.sqrt(re * re + im * im) + v_s
         if data[i].dc > 0.0:
-            u -= data[i].lead * (x[FIELD, i] - x[FEEDBACK, i])
-            rates[EXCITER, i] = data[i].rate_x * (data[i].gain * u - x[EXCITER, i])
-            rates[FIELD, i] = data[i].rate_f * (x[EXCITER, i] - data[i].ke * x[FIELD, i])
+            u -= data[i].lead * (x[at.FIELD, i] - x[at.FEEDBACK, i])
+            rates[at.EXCITER, i] = data[i].rate_x * (data[i].gain * u - x[at.EXCITER, i])
+            rates[at.FIELD, i] = data[i].rate_f * (x[at.EXCITER, i] - data[i].ke * x[at.FIELD, i])
         else:
-            into = data[i].gain * (data[i].lead * (u - x[EXCITER, i]) + x[EXCITER, i])
-            rates[EXCITER, i] = data[i].rate_x * (u - x[EXCITER, i])
-            rates[FIELD, i] = data[i].rate_f * (into - x[FIELD, i])
-        rates[FEEDBACK, i] = data[i].rate_fb * (x[FIELD, i] - x[FEEDBACK, i])
-        rates[GATE, i] = data[i].rate_g * (p_ref[i] - data[i].droop * w - x[GATE, i])
-        rates[TURBINE, i] = data[i].rate_h * (x[GATE, i] - x[TURBINE, i])
+            into = data[i].gain * (data[i].lead * (u - x[at.EXCITER, i]) + x[at.EXCITER, i])
+            rates[at.EXCITER, i] = data[i].rate_x * (u - x[at.EXCITER, i])
+            rates[at.FIELD, i] = data[i].rate_f * (into - x[at.FIELD, i])
+        rates[at.FEEDBACK, i] = data[i].rate_fb * (x[at.FIELD, i] - x[at.FEEDBACK, i])
+        rates[at.GATE, i] = data[i].rate_g * (p_ref[i] - data[i].droop * w - x[at.GATE, i])
+        rates[at.TURBINE, i] = data[i].rate_h * (x[at.GATE, i] - x[at.TURBINE, i])

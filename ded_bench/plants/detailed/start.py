@@ -5,23 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.machine_arrays import (
-    DELTA,
-    E1D,
-    E1Q,
-    E2D,
-    E2Q,
-    EXCITER,
-    FEEDBACK,
-    FIELD,
-    GATE,
-    LEAD_A,
-    LEAD_B,
-    N_STATES,
-    SPEED,
-    TURBINE,
-    WASHOUT,
-)
+from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.plant import SimulationError
@@ -32,7 +16,7 @@ from ded_bench.problem.quantities import Array
 #: What powers and loads of an instance may leave to the machine that balances the power flow, pu.
 REMAINDER = 1e-4
 #: States that a measurement does not give, and that are stationary in it.
-STATIONARY = (E1Q, E1D, E2D, E2Q, EXCITER, FIELD, FEEDBACK)
+STATIONARY = (at.E1Q, at.E1D, at.E2D, at.E2Q, at.EXCITER, at.FIELD, at.FEEDBACK)
 
 
 def initial_point(system: PowerSystem, instance: Instance) -> OperatingPoint:
@@ -70,10 +54,10 @@ def start(system: PowerSystem, instance: Instance) -> DetailedState:
     x, v_ref = system.equilibrium(point)
     offset = point.power.real.copy()
     offset[machines] -= p_set
-    mean = float(data.inertia @ x[DELTA])
-    x[DELTA] -= mean
+    mean = float(data.inertia @ x[at.DELTA])
+    x[at.DELTA] -= mean
     v = interleaved(point.voltage * np.exp(-1j * mean))
-    x[SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
+    x[at.SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
     held, next_s = 0.0, 0.0 if case.agc is None else case.agc.period_s
     if instance.initial.measured is None:
         return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
@@ -82,22 +66,22 @@ def start(system: PowerSystem, instance: Instance) -> DetailedState:
         if not system.island:
             problem = "angles behind an infinite slack are those of another plant than this"
             raise InputError(f"instance {instance.id}", "initial.theta", problem)
-        x[DELTA, machines] = theta
-        x[DELTA] -= data.inertia @ x[DELTA]
+        x[at.DELTA, machines] = theta
+        x[at.DELTA] -= data.inertia @ x[at.DELTA]
         v = _stationary(system, x, v, point.p_drawn, v_ref)
     if (agc := instance.initial.agc) is not None:
         held, next_s = agc.held_pu, next_s if agc.next_s is None else agc.next_s
-        x[DELTA] += agc.integral_rad
+        x[at.DELTA] += agc.integral_rad
     reference = offset.copy()
     reference[machines] += p_set
     reference += held * system.shares
     mechanical = reference.copy()
     if (given := instance.mechanical_initial(case)) is not None:
         mechanical[machines] = given
-    x[GATE] = reference - data.droop * x[SPEED]
-    x[TURBINE] = _turbine(system, x, mechanical)
-    x[WASHOUT] = data.ks * x[SPEED]
-    x[LEAD_A] = x[LEAD_B] = 0.0
+    x[at.GATE] = reference - data.droop * x[at.SPEED]
+    x[at.TURBINE] = _turbine(system, x, mechanical)
+    x[at.WASHOUT] = data.ks * x[at.SPEED]
+    x[at.LEAD_A] = x[at.LEAD_B] = 0.0
     return DetailedState(x, v, held, next_s, v_ref, offset, p_set)
 
 
@@ -105,16 +89,16 @@ def corrected(system: PowerSystem, instance: Instance, estimate: DetailedState) 
     """An estimate of the state at t = 0 with what an instance has measured of it in its place."""
     case, data, machines = system.case, system.data, system.scheduled
     x = estimate.x.copy()
-    x[SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
+    x[at.SPEED, machines] = instance.omega_initial(case) / data.omega_0[machines]
     if (theta := instance.theta_initial(case)) is not None:
-        x[DELTA, machines] = theta
-        x[DELTA] -= data.inertia @ x[DELTA]
+        x[at.DELTA, machines] = theta
+        x[at.DELTA] -= data.inertia @ x[at.DELTA]
     held, next_s = estimate.held, estimate.next_s
     if (agc := instance.initial.agc) is not None:
         held, next_s = agc.held_pu, next_s if agc.next_s is None else agc.next_s
-        x[DELTA] += agc.integral_rad
+        x[at.DELTA] += agc.integral_rad
     if (mechanical := instance.mechanical_initial(case)) is not None:
-        x[TURBINE, machines] = _turbine(system, x, mechanical, machines)
+        x[at.TURBINE, machines] = _turbine(system, x, mechanical, machines)
     p_set = instance.p_initial(case)
     return estimate._replace(x=x, held=held, next_s=next_s, p_set=p_set, carried=None)
 
@@ -123,7 +107,7 @@ def _turbine(
     system: PowerSystem, x: Array, mechanical: Array, machines: Indices | slice = slice(None)
 ) -> Array:
     """States of turbines that deliver given powers, (n,), pu; those of gates where they do not lag."""
-    gate, reheat = x[GATE, machines], system.data.reheat[machines]
+    gate, reheat = x[at.GATE, machines], system.data.reheat[machines]
     through, lagging = 1.0 - reheat, gate.copy()
     np.divide(mechanical - reheat * gate, through, out=lagging, where=through != 0.0)
     return lagging
@@ -140,8 +124,8 @@ def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Ar
     n, n_v = x.shape[1], len(v)
     moving = system.moving
     free = moving[np.isin(moving // n, STATIONARY)]
-    rows = np.concatenate([free, N_STATES * n + np.arange(n_v)])
-    speed, x[SPEED] = x[SPEED].copy(), 0.0  # stabilisers have nothing to say in a stationary state
+    rows = np.concatenate([free, at.N_STATES * n + np.arange(n_v)])
+    speed, x[at.SPEED] = x[at.SPEED].copy(), 0.0  # stabilisers have nothing to say in a stationary state
     still = np.zeros(n)
     for _ in range(NEWTON_STEPS):
         given = x.ravel(), v, still, drawn, v_ref
@@ -149,7 +133,7 @@ def _stationary(system: PowerSystem, x: Array, v: Array, drawn: Array, v_ref: Ar
         off = np.concatenate([rates[free], balance])
         worst = np.abs(off).max()
         if worst < MISMATCH * 1e3:
-            x[SPEED] = speed
+            x[at.SPEED] = speed
             return v
         if not worst < np.inf:
             break

@@ -13,24 +13,8 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
-from ded_bench.plants.detailed.machine_arrays import (
-    DELTA,
-    E1D,
-    E1Q,
-    E2D,
-    E2Q,
-    EXCITER,
-    FEEDBACK,
-    FIELD,
-    GATE,
-    LEAD_A,
-    LEAD_B,
-    N_STATES,
-    SPEED,
-    TURBINE,
-    WASHOUT,
-    MachineArrays,
-)
+from ded_bench.plants.detailed import machine_arrays as at
+from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.plants.detailed.power_flow import PortNetwork
 
 
@@ -66,10 +50,10 @@ class SymbolicPlant(NamedTuple):
 def symbolic_plant(data: MachineArrays, network: PortNetwork) -> SymbolicPlant:
     """Write the equations of all machines and the network for CasADi."""
     n, n_port = len(data.port), len(network.ports)
-    x, v = casadi.SX.sym("x", N_STATES * n), casadi.SX.sym("v", 2 * n_port)
+    x, v = casadi.SX.sym("x", at.N_STATES * n), casadi.SX.sym("v", 2 * n_port)
     p_ref, drawn, v_ref = (casadi.SX.sym(name, size) for name, size in (("p", n), ("l", n_port), ("r", n)))
-    states = casadi.reshape(x, n, N_STATES)
-    s = [states[:, i] for i in range(N_STATES)]
+    states = casadi.reshape(x, n, at.N_STATES)
+    s = [states[:, i] for i in range(at.N_STATES)]
     functions = Functions(casadi.sin, casadi.cos, casadi.sqrt)
     found = plant_equations(data, network, s, (v[0::2], v[1::2]), (p_ref, drawn, v_ref), functions)
     balance = casadi.reshape(casadi.horzcat(*found.balance).T, 2 * n_port, 1)
@@ -103,15 +87,15 @@ def plant_equations(
     (v_re, v_im), (p_ref, drawn, v_ref) = voltage, inputs
     ports = data.port.tolist()
     at_re, at_im = v_re[ports], v_im[ports]
-    sin, cos = functions.sin(s[DELTA]), functions.cos(s[DELTA])
+    sin, cos = functions.sin(s[at.DELTA]), functions.cos(s[at.DELTA])
     v_d, v_q = at_re * sin - at_im * cos, at_re * cos + at_im * sin
-    psi_d = data.gd1 * s[E1Q] + (1 - data.gd1) * s[E2D]
-    psi_q = data.gq1 * s[E1D] + (1 - data.gq1) * s[E2Q]
+    psi_d = data.gd1 * s[at.E1Q] + (1 - data.gd1) * s[at.E2D]
+    psi_q = data.gq1 * s[at.E1D] + (1 - data.gq1) * s[at.E2Q]
     i_d, i_q = (psi_d - v_q) / data.x, (v_d - psi_q) / data.x
     size = functions.sqrt(v_d**2 + v_q**2)
     rates, p_m = _rates(data, s, (i_d, i_q), size, (p_ref, v_ref))
     p_e = v_d * i_d + v_q * i_q
-    rates[SPEED] = data.inverse_m * (p_m - p_e - data.d * s[SPEED])
+    rates[at.SPEED] = data.inverse_m * (p_m - p_e - data.d * s[at.SPEED])
     # Out of dq: the current's frame is turned by delta - pi/2.
     i_re, i_im = i_d * sin + i_q * cos, i_q * sin - i_d * cos
     y, q, square = network.admittance, network.q_drawn, v_re**2 + v_im**2
@@ -131,29 +115,29 @@ def _rates(
 ) -> tuple[list[Any], Any]:
     """Rates of all states but the speeds, turbines' powers."""
     (i_d, i_q), (p_ref, v_ref) = current, references
-    w = s[SPEED]
-    after = data.ks * w - s[WASHOUT]
-    lead = data.lead_a * (after - s[LEAD_A]) + s[LEAD_A]
-    v_s = data.lead_b * (lead - s[LEAD_B]) + s[LEAD_B]
-    feedback = data.dc * data.lead * (s[FIELD] - s[FEEDBACK])
+    w = s[at.SPEED]
+    after = data.ks * w - s[at.WASHOUT]
+    lead = data.lead_a * (after - s[at.LEAD_A]) + s[at.LEAD_A]
+    v_s = data.lead_b * (lead - s[at.LEAD_B]) + s[at.LEAD_B]
+    feedback = data.dc * data.lead * (s[at.FIELD] - s[at.FEEDBACK])
     u = v_ref - v - feedback + v_s
-    static = data.gain * (data.lead * (u - s[EXCITER]) + s[EXCITER])
-    drive = data.dc * s[EXCITER] + (1 - data.dc) * static
-    i_fd = s[E1Q] + (data.xd - data.xd1) * (data.gd1 * i_d - data.gd2 * (s[E2D] - s[E1Q]))
-    i_1q = s[E1D] + (data.xq - data.xq1) * (-data.gq1 * i_q + data.gq2 * (s[E1D] - s[E2Q]))
-    p_m = data.reheat * (s[GATE] - s[TURBINE]) + s[TURBINE]
-    rates: list[Any] = [None] * N_STATES
-    rates[DELTA] = data.omega_0 * w
-    rates[E1Q] = data.rate_d1 * (s[FIELD] - i_fd)
-    rates[E1D] = -data.rate_q1 * i_1q
-    rates[E2D] = data.rate_d2 * (s[E1Q] - s[E2D] - (data.xd1 - data.xl) * i_d)
-    rates[E2Q] = data.rate_q2 * (s[E1D] - s[E2Q] + (data.xq1 - data.xl) * i_q)
-    rates[EXCITER] = data.rate_x * ((data.dc * data.gain + 1 - data.dc) * u - s[EXCITER])
-    rates[FIELD] = data.rate_f * (drive - data.ke * s[FIELD])
-    rates[FEEDBACK] = data.rate_fb * (s[FIELD] - s[FEEDBACK])
-    rates[WASHOUT] = data.rate_w * after
-    rates[LEAD_A] = data.rate_a * (after - s[LEAD_A])
-    rates[LEAD_B] = data.rate_b * (lead - s[LEAD_B])
-    rates[GATE] = data.rate_g * (p_ref - data.droop * w - s[GATE])
-    rates[TURBINE] = data.rate_h * (s[GATE] - s[TURBINE])
+    static = data.gain * (data.lead * (u - s[at.EXCITER]) + s[at.EXCITER])
+    drive = data.dc * s[at.EXCITER] + (1 - data.dc) * static
+    i_fd = s[at.E1Q] + (data.xd - data.xd1) * (data.gd1 * i_d - data.gd2 * (s[at.E2D] - s[at.E1Q]))
+    i_1q = s[at.E1D] + (data.xq - data.xq1) * (-data.gq1 * i_q + data.gq2 * (s[at.E1D] - s[at.E2Q]))
+    p_m = data.reheat * (s[at.GATE] - s[at.TURBINE]) + s[at.TURBINE]
+    rates: list[Any] = [None] * at.N_STATES
+    rates[at.DELTA] = data.omega_0 * w
+    rates[at.E1Q] = data.rate_d1 * (s[at.FIELD] - i_fd)
+    rates[at.E1D] = -data.rate_q1 * i_1q
+    rates[at.E2D] = data.rate_d2 * (s[at.E1Q] - s[at.E2D] - (data.xd1 - data.xl) * i_d)
+    rates[at.E2Q] = data.rate_q2 * (s[at.E1D] - s[at.E2Q] + (data.xq1 - data.xl) * i_q)
+    rates[at.EXCITER] = data.rate_x * ((data.dc * data.gain + 1 - data.dc) * u - s[at.EXCITER])
+    rates[at.FIELD] = data.rate_f * (drive - data.ke * s[at.FIELD])
+    rates[at.FEEDBACK] = data.rate_fb * (s[at.FIELD] - s[at.FEEDBACK])
+    rates[at.WASHOUT] = data.rate_w * after
+    rates[at.LEAD_A] = data.rate_a * (after - s[at.LEAD_A])
+    rates[at.LEAD_B] = data.rate_b * (lead - s[at.LEAD_B])
+    rates[at.GATE] = data.rate_g * (p_ref - data.droop * w - s[at.GATE])
+    rates[at.TURBINE] = data.rate_h * (s[at.GATE] - s[at.TURBINE])
     return rates, p_m

@@ -22,7 +22,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import lossless
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Trajectory
 
 if TYPE_CHECKING:
     from ded_bench.plants.lossless.stepper import Carried

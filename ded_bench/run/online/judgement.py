@@ -19,8 +19,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.results.online_results import Judgement
 from ded_bench.run.online.loop import LoopOptions, run_loop
 from ded_bench.run.online.planner import Planned
@@ -132,18 +131,8 @@ def _in_windows(case: Case, scenario: Scenario, regime: str) -> Hindsight:
 
 def whole_instance(case: Case, scenario: Scenario) -> Instance:
     """A scenario as one instance, with its true loads."""
-    points = forecast(scenario, case, "perfect", 0.0, scenario.duration_s).points(0.0, scenario.duration_s)
-    return Instance(
-        schema_="ded-bench/instance/2",
-        id=scenario.id,
-        case=case.id,
-        seed=scenario.seed,
-        horizon_s=scenario.duration_s,
-        dt_s=scenario.dt_s,
-        cost=scenario.cost,
-        load=dict(zip(case.loads, points, strict=True)),
-        initial=scenario.initial,
-    )
+    last, loads = scenario.duration_s, forecast(scenario, case, "perfect", 0.0, scenario.duration_s)
+    return loads.instance(scenario, case, 0.0, last, scenario.initial, scenario.id)
 
 
 def unforeseen_hz(case: Case, scenario: Scenario, options: LoopOptions, plant: Plant) -> float:

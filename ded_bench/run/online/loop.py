@@ -20,8 +20,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
-from ded_bench.problem.schedule import Schedule
-from ded_bench.problem.trajectory import Trajectory
+from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.run.online.planner import Ask, Planned
 
 #: Between plans unless told otherwise, s.
@@ -197,18 +196,8 @@ class _Loop:
     def _instance(self, state: PlantState, loads: Forecast, start: int) -> Instance:
         left = (self.scenario.steps - start) * self.dt
         horizon = min(self.horizon, left) if self.options.to_end else self.horizon
-        points = loads.points(start * self.dt, horizon)
-        return Instance(
-            schema_="ded-bench/instance/2",
-            id=f"{self.scenario.id[:50]}-{start}",
-            case=self.case.id,
-            seed=self.scenario.seed,
-            horizon_s=horizon,
-            dt_s=self.dt,
-            cost=self.scenario.cost,
-            load=dict(zip(self.case.loads, points, strict=True)),
-            initial=self.plant.observed(state).initial(self.case),
-        )
+        name, initial = f"{self.scenario.id[:50]}-{start}", self.plant.observed(state).initial(self.case)
+        return loads.instance(self.scenario, self.case, start * self.dt, horizon, initial, name)
 
     def _go_on(self, until: int) -> None:
         if until > self.history.now:

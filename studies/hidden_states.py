@@ -21,8 +21,7 @@ from ded_bench.plants.plant import servable
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
 from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Ask, Planned
+from ded_bench.run.online.loop import Ask, LoopOptions, Planned, run_loop
 
 SEED = 2_500_000
 COLUMNS = "| forecast | plans | mean, mHz | swings, mHz | AGC travel, pu | cost over `ed`, % | s a plan |"

@@ -80,7 +80,7 @@ def test_model_predictive_control(tmp_path: Path) -> None:
 import ded_bench, do_mpc_dispatch
 from ded_bench.problem.sampling import sample_instance, sample_scenario
 from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned
+from ded_bench.run.online.loop import Planned
 case = ded_bench.Case.load("9bus")
 instance = sample_instance(case, 1_500_000, 0)
 mine = do_mpc_dispatch.solve(instance, "TO", case)

@@ -20,8 +20,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioLoad, ScenarioRamp
 from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned
+from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from tests.conftest import CASE_FILES
 from tests.detailed_cases import MIXED
 

@@ -8,7 +8,7 @@ import pandas as pd
 
 from ded_bench.analysis import summary
 from ded_bench.analysis.lines import GROUP, line_table, named
-from ded_bench.problem.forecast import QUALITIES
+from ded_bench.problem.scenario import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
 #: What rows of one line of a table share, besides the scenario.

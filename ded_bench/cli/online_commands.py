@@ -24,8 +24,7 @@ from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import PLANTS
 from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
 from ded_bench.problem.case import Case
-from ded_bench.problem.forecast import QUALITIES
-from ded_bench.problem.scenario import Scenario, load_scenarios
+from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders
 
 if TYPE_CHECKING:
@@ -91,9 +90,8 @@ def _operations(
     a: argparse.Namespace, case: Case, folder: Path, scenarios: Sequence[Scenario]
 ) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
-    from ded_bench.run.online.loop import PERIOD_S, LoopOptions
+    from ded_bench.run.online.loop import LIMIT_S, PERIOD_S, LoopOptions
     from ded_bench.run.online.operation import make_operations
-    from ded_bench.run.online.planner import LIMIT_S
 
     search = search_folders(case, folder)
     methods = chosen_methods(a, search)

@@ -18,8 +18,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import search_folders
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned, answered
+from ded_bench.run.online.loop import LoopOptions, Planned, answered, run_loop
 from ded_bench.solvers.linear_program import LISTENERS, FormAnswer, FreeForm
 from ded_bench.solvers.status import Status
 

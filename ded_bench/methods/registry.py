@@ -33,6 +33,7 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
+    takes_start: bool = False  # its training can start from the weights of another policy
     model: str = ""  # the surrogate that it plans with unless told otherwise, if it takes any
 
     @property
@@ -100,11 +101,6 @@ class Method:
         trainer: Trainer = importlib.import_module(self.trainer).train
         return trainer
 
-    @property
-    def takes_start(self) -> bool:
-        """Whether its training can start from the weights of another policy."""
-        return bool(getattr(importlib.import_module(self.trainer), "TAKES_START", False))
-
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -134,6 +130,7 @@ METHODS: dict[str, Method] = {
             "ded_bench.methods.admm.admm_policy",
             "DED-ADMM",
             trainer="ded_bench.methods.admm.admm_training",
+            takes_start=True,
         ),
     )
 }

@@ -85,11 +85,11 @@ class TrainingOptions:
         return {name: getattr(self, name) for name in kept}
 
 
-#: `train(case, regime, instances, out, options)` of a method's training module, which says
-#: `TAKES_START = True` if it knows `options.start`. The instances are all on one time grid. It writes the
-#: policy to `out`, its history beside it, and returns something whose `training` has facts: `epochs` (done),
-#: `seconds` (spent), one of `LOSSES`, and any others. It raises InputError if the surrogate is missing, the
-#: checkpoint to go on from belongs to another training, or the weights to start from do not fit.
+#: `train(case, regime, instances, out, options)` of a method's training module. The instances are all on one
+#: time grid. It writes the policy to `out`, its history beside it, and returns something whose `training` has
+#: facts: `epochs` (done), `seconds` (spent), one of `LOSSES`, and any others. It raises InputError if the
+#: surrogate is missing, the checkpoint to go on from belongs to another training, or the weights to start
+#: from do not fit.
 Trainer = Callable[[Case, str, Sequence[Instance], Path, TrainingOptions], Any]
 
 

@@ -13,8 +13,8 @@ from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Count, NotNegative, PlainName, Table
 from ded_bench.plants.score import AGC_COLUMN
-from ded_bench.problem.forecast import QUALITIES
 from ded_bench.problem.quantities import Probability
+from ded_bench.problem.scenario import QUALITIES
 from ded_bench.problem.schedule import Trajectory
 from ded_bench.results.folder import PLANT, OnlineKey, ResultsFolder
 from ded_bench.results.legacy import upgraded

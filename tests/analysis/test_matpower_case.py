@@ -9,10 +9,9 @@ import pandas as pd
 import pytest
 
 import ded_bench
-from ded_bench.analysis.matpower_case import imported
+from ded_bench.analysis.matpower_case import imported, read_matpower
 from ded_bench.cli import main
 from ded_bench.files.errors import InputError
-from ded_bench.files.matpower import read_matpower
 from ded_bench.problem.case import REPOSITORY, Case
 from tests.cli.command_line import refused
 

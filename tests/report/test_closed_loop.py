@@ -16,8 +16,7 @@ from ded_bench.report.report import write_report
 from ded_bench.results.online_results import OnlineResults, OnlineRow, keep_trajectory
 from ded_bench.results.rows import Results, Row
 from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned
+from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from tests.detailed_cases import MIXED
 
 STATIC = {"scenario": "s", "regime": "TO", "method": "ed", "settings": "every=1", "period_s": 1.0}

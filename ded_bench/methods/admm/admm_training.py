@@ -36,8 +36,6 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
-#: Weights fit every grid: training may start from another's.
-TAKES_START = True
 #: Iterations of an answer: the fewest, and times generators on small grids, where they take less time. Where
 #: the bound on |ω| is loose, schedules are shaped by ramps, and a few iterations go almost as far.
 TIGHT, LOOSE = (14, 60), (3, 30)

@@ -8,7 +8,7 @@ import pandas as pd
 
 from ded_bench.analysis.lines import titled, where
 from ded_bench.analysis.online_summary import PRACTICE, STATIC
-from ded_bench.problem.forecast import QUALITIES
+from ded_bench.problem.scenario import QUALITIES
 from ded_bench.report.figures.panels import (
     Shown,
     agc_panel,

@@ -16,13 +16,11 @@ from ded_bench.plants.plant import Plant
 from ded_bench.plants.score import STRICT_HZ, Score, judge, mean_hz
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.scenario import Scenario
+from ded_bench.problem.scenario import Scenario, forecast
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.results.online_results import Judgement
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned
+from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 
 #: Knots of hindsight lie so many times as close as the case's: renewed plans may bend anywhere.
 FINER = 4

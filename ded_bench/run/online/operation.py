@@ -31,8 +31,7 @@ from ded_bench.results.online_results import (
 from ded_bench.results.timing import TIMING, model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import LIMIT_S, Planner
+from ded_bench.run.online.loop import LIMIT_S, LoopOptions, Planner, run_loop
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import reason_of
 

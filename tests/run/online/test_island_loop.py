@@ -25,9 +25,8 @@ from ded_bench.problem.scenario import Scenario, load_scenarios
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.online_results import OnlineResults, read_trajectory
 from ded_bench.run.online.judgement import EPSILON_HZ, cps1, hindsight, judge_operation, whole_instance
-from ded_bench.run.online.loop import LoopOptions, run_loop
+from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from ded_bench.run.online.operation import make_operations, operate
-from ded_bench.run.online.planner import Planned
 from ded_bench.solvers.status import Status
 from tests.detailed_cases import MIXED
 

@@ -15,8 +15,7 @@ from ded_bench.problem.sampling import sample_scenario
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioRamp
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz, whole_instance
-from ded_bench.run.online.loop import LoopOptions, run_loop
-from ded_bench.run.online.planner import Planned, Planner
+from ded_bench.run.online.loop import LoopOptions, Planned, Planner, run_loop
 from ded_bench.solvers.status import Status
 from tests.conftest import CASE_FILES
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.lines import GROUP, line_table, records
-from ded_bench.analysis.summary import summary
+from ded_bench.analysis.summary import GROUP, line_table, records, summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.overview import read_grid
 from ded_bench.report.sources import trainings

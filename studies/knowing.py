@@ -20,7 +20,7 @@ import numpy as np
 
 from ded_bench import Case, load_instances
 from ded_bench.files.errors import InputError
-from ded_bench.methods.first_schedules import static_dispatch
+from ded_bench.methods.ed import static_dispatch
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import SimulationError, plant_of

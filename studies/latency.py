@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.analysis.lines import GROUP, named
+from ded_bench.analysis.summary import GROUP, named
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
 #: A method with so many latencies at announced forecasts was swept.

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.analysis.lines import titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.reference import result_lines
+from ded_bench.analysis.summary import titled
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.sources import Sources, read_sources
 

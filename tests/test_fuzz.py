@@ -23,8 +23,7 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.analysis.lines import named
-from ded_bench.analysis.summary import summary
+from ded_bench.analysis.summary import named, summary
 from ded_bench.cli import commands
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_record

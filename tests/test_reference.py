@@ -7,9 +7,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import on_usual_model
+from ded_bench.analysis.compare import reproduce
 from ded_bench.analysis.reference import result_lines
-from ded_bench.analysis.reproduce import reproduce
+from ded_bench.analysis.summary import on_usual_model
 from ded_bench.plants.score import Score, score
 from ded_bench.problem.case import REPOSITORY, SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance

@@ -7,7 +7,7 @@ from typing import Any
 import pandas as pd
 
 from ded_bench.analysis import summary
-from ded_bench.analysis.lines import GROUP, line_table, named
+from ded_bench.analysis.summary import GROUP, line_table, named
 from ded_bench.problem.scenario import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 

@@ -17,8 +17,17 @@ from typing import Literal
 import pandas as pd
 from pydantic import Field
 
-from ded_bench.analysis.lines import GROUP, HEAD, head, is_usual, line_table, records, title
-from ded_bench.analysis.summary import statistics, summary
+from ded_bench.analysis.summary import (
+    GROUP,
+    HEAD,
+    head,
+    is_usual,
+    line_table,
+    records,
+    statistics,
+    summary,
+    title,
+)
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
 from ded_bench.methods.options import DEFAULT

@@ -8,10 +8,9 @@ from typing import TextIO
 
 import pandas as pd
 
-from ded_bench.analysis.lines import HEAD, named, titled
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.reference import choose_reference, read_paper
-from ded_bench.analysis.summary import gaps, outcome, own_first
+from ded_bench.analysis.summary import HEAD, gaps, named, outcome, own_first, titled
 from ded_bench.cli.arguments import counted, say
 from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case

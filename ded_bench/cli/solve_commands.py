@@ -224,7 +224,7 @@ def _reproduce(a: argparse.Namespace) -> int:
     """Rows of a results folder, solved again."""
     results, case, instances = _rows_of(a)
     say(f"solving up to {a.sample} rows of each method, settings, model and regime in {a.results} again")
-    from ded_bench.analysis.reproduce import reproduce, table_of
+    from ded_bench.analysis.compare import reproduce, table_of
 
     lines = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
     print(table_of(lines))

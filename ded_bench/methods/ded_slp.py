@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ded_bench.methods.first_schedules import first_schedules, static_dispatch
+from ded_bench.methods.ed import first_schedules, static_dispatch
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
 from ded_bench.methods.knots import case_knots, control_times, is_reachable, knot_points
 from ded_bench.methods.options import option, read_options

@@ -15,7 +15,7 @@ import pyomo.dae as dae
 import pyomo.environ as pyo
 
 from ded_bench.methods.ded import eliminated
-from ded_bench.methods.first_schedules import first_schedules, static_dispatch
+from ded_bench.methods.ed import first_schedules, static_dispatch
 from ded_bench.methods.knots import case_knots, divided, power_limits, transfer_room
 from ded_bench.methods.radau_program import POINTS, WEIGHTS, lagrange
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant

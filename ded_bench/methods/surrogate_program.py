@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.first_schedules import first_schedules, slow_dispatch, within_ramps
+from ded_bench.methods.ed import first_schedules, slow_dispatch, within_ramps
 from ded_bench.methods.knot_program import KnotProgram, Prediction
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.reserve import Reserve

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from ded_bench.analysis.lines import HEAD, records
+from ded_bench.analysis.summary import HEAD, records
 
 Cells = Mapping[str, Any]
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.lines import GROUP, groups, main_lines, records, titled
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.analysis.summary import findings, summary
+from ded_bench.analysis.summary import GROUP, findings, groups, main_lines, records, summary, titled
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of

@@ -10,11 +10,19 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench.analysis.certificate import Certificate, read_certificates
-from ded_bench.analysis.lines import judged_rows, named, newest, on_usual_model
 from ded_bench.analysis.online_summary import online_rows, practice_rows
 from ded_bench.analysis.referee import REFEREE
 from ded_bench.analysis.reference import Paper, Reference, choose_reference, read_paper
-from ded_bench.analysis.summary import gaps, judged_elsewhere, outcome, summary
+from ded_bench.analysis.summary import (
+    gaps,
+    judged_elsewhere,
+    judged_rows,
+    named,
+    newest,
+    on_usual_model,
+    outcome,
+    summary,
+)
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import SimulationError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import (
+from ded_bench.analysis.summary import (
     groups,
     judged_rows,
     main_lines,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.analysis.reproduce import reproduce, table_of
+from ded_bench.analysis.compare import reproduce, table_of
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case

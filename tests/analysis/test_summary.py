@@ -8,12 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import GROUP, named
 from ded_bench.analysis.summary import (
+    GROUP,
     findings,
     gaps,
     judged_elsewhere,
     largest_violation,
+    named,
     outcome,
     summary,
 )

@@ -10,7 +10,7 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_ko
 from ded_bench.methods.ded_ko import build_ded_ko, set_instance
-from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.ed import slow_dispatch
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Artifact, Settings
 from ded_bench.plants.score import score

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ded_bench.methods.dpc.bound_keeper import PARTS, BoundKeeper, predict
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
+from ded_bench.methods.dpc.refinement import PARTS, BoundKeeper, predict
 from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances

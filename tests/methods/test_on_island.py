@@ -11,7 +11,7 @@ from ded_bench import load_instances
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
 from ded_bench.methods.ded_slp import OPEN
-from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.ed import slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import case_knots
 from ded_bench.methods.radau_detailed import DetailedProgram, mesh

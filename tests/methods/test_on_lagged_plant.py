@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ded_bench.methods.first_schedules import slow_dispatch
+from ded_bench.methods.ed import slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.slp import Rows, solve_with_rows_added

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.lines import GROUP, title
+from ded_bench.analysis.summary import GROUP, title
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.figures.panels import (
     FEW,

@@ -22,7 +22,7 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.report.columns import TABLE_V, TABLE_VI
-from ded_bench.report.figures.schedules import representative
+from ded_bench.report.figures.panels import representative
 from ded_bench.report.report import write_report
 from ded_bench.report.sources import read_sources
 from ded_bench.results.rows import Results, Row

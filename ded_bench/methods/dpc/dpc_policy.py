@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ded_bench.methods.dpc.bound_keeper import BoundKeeper
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
-from ded_bench.methods.dpc.refinement import Refiner
+from ded_bench.methods.dpc.refinement import BoundKeeper, Refiner
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.stacked_instances import StackedInstances

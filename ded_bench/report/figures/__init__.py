@@ -1,10 +1,10 @@
-"""The figures of a report: one module each, and one line in FIGURES."""
+"""The figures of a report: one line each in FIGURES."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from ded_bench.report.figures import closed_loop, schedules, tradeoff
+from ded_bench.report.figures import panels, tradeoff
 from ded_bench.report.figures.style import Drawn, save_figure
 from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
@@ -12,8 +12,8 @@ from ded_bench.report.sources import Sources
 #: The topic under which a section shows a figure, and what draws it, in the order in which they stand.
 FIGURES: Sequence[tuple[str, Callable[[Sources], Iterator[Drawn]]]] = (
     ("tradeoff", tradeoff.draw),
-    ("schedules", schedules.draw),
-    ("online", closed_loop.draw),
+    ("schedules", panels.draw_schedules),
+    ("online", panels.draw_scenario),
 )
 
 

@@ -1,16 +1,27 @@
-"""Curves over time in panels: powers, loads, frequencies of trajectories."""
+"""Curves over time in panels: powers, loads, frequencies of trajectories.
+
+Of one representative instance per regime, with frequencies in the tightest; of one scenario of the closed loop
+under several methods, static dispatch and on islands practice among them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
+from ded_bench.analysis.online_summary import PRACTICE, STATIC
+from ded_bench.analysis.summary import main_lines, records, titled, where
+from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array, Case
-from ded_bench.report.figures.style import DASHES, GREY, PALETTE, legend_below, look, new_figure, plain
+from ded_bench.problem.scenario import QUALITIES
+from ded_bench.report.figures.style import DASHES, GREY, PALETTE, Drawn, legend_below, look, new_figure, plain
+from ded_bench.report.sources import Sources
+from ded_bench.results.online_results import read_trajectory
 
 RAD_TO_HZ = 1 / (2 * np.pi)
 #: How many generators or loads a figure shows one by one.
@@ -148,3 +159,104 @@ def busiest(curves: Sequence[Array], count: int) -> list[int]:
     """
     ranges = np.max([np.ptp(values, axis=0) for values in curves], axis=0)
     return sorted(np.argsort(-ranges, kind="stable")[:count].tolist())
+
+
+def draw_schedules(sources: Sources) -> Iterator[Drawn]:
+    """Of every regime that has a schedule (paper, Figs. NO_cmp, TO_cmp, freq_cmp)."""
+    case = sources.case
+    for regime in case.regimes:
+        chosen = representative(sources, regime)
+        rows = enumerate(records(chosen))
+        shown = [one for place, row in rows if (one := shown_run(sources, row, place))]
+        if not shown:
+            continue
+        heading = f"{chosen['instance'].iloc[0]}, {regime}"
+        last = "mean frequency" if case.slack is None else "slack power"
+        names = " and ".join(one.label for one in reversed(shown))
+        caption = f"{names} on {heading}: set-points with bounds, loads, {last}; the gap is near the median"
+        panels = [*power_panels(case, shown), load_panel(case, shown[0]), balance_panel(case, regime, shown)]
+        yield Drawn(f"schedule_{regime}", caption, time_figure(heading, panels, 2))
+        if regime == sources.tightest:
+            caption = f"Frequencies under {names} on {heading}; dotted: the regime's bounds."
+            panels = frequency_panels(case, regime, shown, 4)
+            yield Drawn(f"frequencies_{regime}", caption, time_figure(heading, panels, 1))
+
+
+def shown_run(sources: Sources, row: dict[Any, Any], place: int = 0) -> Shown | None:
+    """What figures show of a row; None if it cannot be simulated."""
+    run = sources.trajectory(row["key"])
+    arrays = (run.t, run.p_set, run.omega, run.p_load, run.p_slack) if run else ()
+    return Shown(row["method"], row["title"], place, *arrays) if run else None
+
+
+def representative(sources: Sources, regime: str) -> pd.DataFrame:
+    """Rows of the reference, if it was run, and a challenger on one instance; none without a kept schedule.
+
+    Trained methods come before others, and the smaller the mean gap, the earlier. Of the instances whose
+    schedules are kept, the one whose gap is nearest to the challenger's median is chosen.
+    """
+    rows = main_lines(sources.judged[sources.judged["regime"] == regime].dropna(subset=["objective"]))
+    rows = rows.assign(gap_percent=rows["gap_percent"].fillna(0.0))
+    kept = titled(where(rows, map(sources.has_schedule, rows["key"])))
+    reference = kept[kept["method"] == sources.reference.method]
+    gaps = rows["gap_percent"].groupby(rows["method"])
+    trained = {name for name, method in METHODS.items() if method.trainer}
+    distance = gaps.agg(lambda gap: gap.abs().mean())
+    for method in sorted(distance.index, key=lambda name: (name not in trained, distance[name], name)):
+        pairs = kept[kept["method"] == method]
+        if method != sources.reference.method and len(reference):
+            pairs = pairs[pairs["instance"].isin(reference["instance"])]
+        if (method != sources.reference.method or len(distance) == 1) and len(pairs):
+            off = (pairs["gap_percent"] - gaps.get_group(method).median()).abs()
+            both = pd.concat([reference, pairs]).drop_duplicates(["method", "instance"])
+            return where(both, both["instance"] == pairs.loc[off.idxmin(), "instance"])
+    return kept.iloc[:0]
+
+
+#: Static dispatch that is drawn, method and settings; what moves most comes first, below the others.
+STATICS = ((PRACTICE[0], "every=300"), PRACTICE, STATIC)
+#: At most so many methods beside it, and generators, are drawn of a scenario.
+METHODS_SHOWN, GENERATORS_SHOWN = 2, 3
+
+
+def draw_scenario(sources: Sources) -> Iterator[Drawn]:
+    """Of the scenario that is chosen, if any is kept."""
+    scenario, shown = shown_scenario(sources)
+    if shown:
+        case, heading = sources.case, f"{scenario}, {sources.tightest}"
+        names = ", ".join(one.label for one in shown)
+        last = "slack power" if case.slack else "secondary control (AGC)"
+        caption = f"Scenario {heading}: loads, powers, frequencies and {last} under {names}."
+        panels = [load_panel(case, shown[0]), *power_panels(case, shown, GENERATORS_SHOWN)]
+        panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
+        panels.append(balance_panel(case, sources.tightest, shown) if case.slack else agc_panel(shown))
+        yield Drawn("online_scenario", caption, time_figure(heading, panels, 1))
+
+
+def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
+    """A scenario of the tightest regime and trajectories to show; none if none is kept.
+
+    Of the scenarios with most lines, the one whose worst excess is the median; static dispatch, and of the
+    other methods those of least excess, each with its best line.
+    """
+    files, rows = sources.results.paths, sources.online if sources.case.slack else sources.practice
+    rows = rows[(rows["regime"] == sources.tightest) & (rows["forecast"] == QUALITIES[0])]
+    rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
+    if not len(rows):
+        return "", []
+    lines = rows.groupby("scenario")["key"].transform("size")
+    excess = rows[lines == lines.max()].groupby("scenario")["max_excess_hz"].max()
+    scenario = str(excess.sort_values(kind="stable").index[len(excess) // 2])
+    one = titled(rows[rows["scenario"] == scenario]).sort_values("max_excess_hz", kind="stable")
+    is_static = one["method"] == STATIC[0]
+    statics = [one[is_static & (one["settings"] == settings)][:1] for _, settings in STATICS]
+    chosen = pd.concat([*statics, one[~is_static].drop_duplicates("method")[:METHODS_SHOWN]])
+    paths = {
+        (row["method"], f"{row['title']}, {row['latency_s']:.2g} s"): files.trajectory(row["key"])
+        for row in chosen.to_dict("records")
+    }
+    hindsight = files.hindsight_trajectory(scenario, sources.tightest, sources.case.plant_name)
+    if hindsight.is_file():  # first, below the others
+        paths = {("", "hindsight"): hindsight} | paths
+    read = [(*key, read_trajectory(path)) for key, path in paths.items()]
+    return scenario, [Shown(m, label, i, **arrays) for i, (m, label, arrays) in enumerate(read)]

@@ -13,8 +13,8 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import Bbox
 
-from ded_bench.analysis.lines import title
 from ded_bench.analysis.reference import Paper
+from ded_bench.analysis.summary import title
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.figures.style import GREY, Drawn, colour, legend_below, marker, new_figure, plain
 from ded_bench.report.sources import Sources

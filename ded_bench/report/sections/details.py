@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from ded_bench.analysis.lines import groups, titled
 from ded_bench.analysis.online_summary import own_latency
+from ded_bench.analysis.summary import groups, titled
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.columns import (
     CERTIFICATE,

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import pandas as pd
 
-from ded_bench.analysis.lines import records, title, titled
 from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.reference import Paper, result_lines
-from ded_bench.analysis.summary import findings, own_first
+from ded_bench.analysis.summary import findings, own_first, records, title, titled
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU

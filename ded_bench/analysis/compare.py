@@ -4,8 +4,8 @@ Rows of two folders are compared that answer the same question: by instance, reg
 name of the surrogate, the newest of each. Status, feasibility, objective and violations decide.
 
 Rows are solved again with today's code and the folder's models and policies: are they those of the code that
-stands beside them? Objectives and violations are re-simulated. Rows that failed or ended by a time limit depend
-on the machine: they are named, not compared.
+stands beside them? Objectives and violations are re-simulated. Rows that failed or ended by a time limit
+depend on the machine: they are named, not compared.
 """
 
 from __future__ import annotations

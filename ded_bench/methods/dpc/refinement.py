@@ -1,7 +1,7 @@
 """What may follow the network of `ded-dpc`: steps that refine its answer, and the least change that mends it.
 
-**Refined** is for many instances at once, by a fixed number of first-order steps on the condensed problem, the
-linear program over the knots
+**Refined** is for many instances at once, by a fixed number of first-order steps on the condensed problem,
+the linear program over the knots
 
     min Σ c_i P_i + c_s |P_s|   with   y = A p + a = (P_s, ω / bound, ramps, powers)
 
@@ -9,10 +9,10 @@ where A is the same for all instances. ADMM splits it into a least-squares step,
 factorised once, and a step that treats each component of y alone (Boyd et al. 2011). The last
 answer passes through the follower, so that bounds, ramps and P_0 hold after any number of steps.
 
-**Mended** is where |ω| would exceed its bound. The linearised grid tells what a schedule does to ω between the
-knots too, within a hundredth of the bound of what the true system does (docs/model.md). Only where |ω| comes
-nearer than that to the bound is anything changed: damped Gauss-Newton steps lead the powers to where ω stays
-below. Each passes through the follower.
+**Mended** is where |ω| would exceed its bound. The linearised grid tells what a schedule does to ω between
+the knots too, within a hundredth of the bound of what the true system does (docs/model.md). Only where |ω|
+comes nearer than that to the bound is anything changed: damped Gauss-Newton steps lead the powers to where ω
+stays below. Each passes through the follower.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ SPACING_S = 0.2
 WEIGHTS = {"p_slack": 0.1, "omega": 0.003, "ramp": 1.0, "power": 1.0}
 #: Length of the dual step; ADMM converges below (1 + √5) / 2 (Fortin and Glowinski 1983).
 DUAL_STEP = 1.6
-#: The bound is tightened by this fraction: about the error of the model, and of the linearised grid. Where it is
-#: mended, from t = 0, where the state is given and nothing can be changed, it grows to that over one interval.
+#: The bound is tightened by this fraction: about the error of the model, and of the linearised grid. Where it
+#: is mended, from t = 0, where the state is given and nothing can be changed, it grows to that over one
+#: interval.
 MARGIN = 0.01
 #: How much worse an answer counts per relative unit of its largest excess of |ω|, relative to its cost.
 EXCESS_PRICE = 1.0

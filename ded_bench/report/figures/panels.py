@@ -1,7 +1,7 @@
 """Curves over time in panels: powers, loads, frequencies of trajectories.
 
-Of one representative instance per regime, with frequencies in the tightest; of one scenario of the closed loop
-under several methods, static dispatch and on islands practice among them.
+Of one representative instance per regime, with frequencies in the tightest; of one scenario of the closed
+loop under several methods, static dispatch and on islands practice among them.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import functools
 import importlib.metadata
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ class CasadiIpopt:
         return outcome
 
 
-def assign(columns: Sequence[Any], values: Array) -> None:
+def assign(columns: Iterable[Any], values: Array) -> None:
     """Set the values of Pyomo variables."""
     for variable, value in zip(columns, values.tolist(), strict=True):
         variable.set_value(value, skip_validation=True)

@@ -9,13 +9,15 @@ import functools
 import hashlib
 import json
 import os
+import secrets
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, WrapValidator
 
 from ded_bench.files.errors import InputError
 
@@ -86,8 +88,13 @@ def check_readable(path: str | Path, largest: int = MAX_BYTES) -> None:
 
 def parse_record(kind: type[R], text: str, source: str | Path) -> R:
     """Parse JSON text as a `kind`; `source` is the name that errors give."""
+
+    def once(pairs: list[tuple[str, Any]]) -> None:
+        if twice := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
+            raise InputError(source, twice[0], "appears twice")
+
     try:
-        json.loads(text, object_pairs_hook=_no_duplicates)
+        json.loads(text, object_pairs_hook=once)
         return kind.model_validate_json(text)
     except ValidationError as error:
         found = error.errors(include_url=False)
@@ -96,8 +103,8 @@ def parse_record(kind: type[R], text: str, source: str | Path) -> R:
         unknown = first["type"] == "extra_forbidden"
         said = _unknown(kind, str(first["loc"][-1])) if unknown else _plain(first["msg"])
         raise InputError(source, field, said) from None
-    except _DuplicateKeyError as error:
-        raise InputError(source, str(error), "appears twice") from None
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(source, "", f"is not JSON ({str(error)[:120]})") from None
 
@@ -110,16 +117,15 @@ def write_record(record: Record, path: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Replace `path` by `content` in one step: a reader or a crash never sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with naming(path), os.fdopen(handle, "wb") as file:
+        with naming(path), open(temporary, "xb") as file:
             file.write(content if isinstance(content, bytes) else content.encode())
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -145,23 +151,15 @@ def check_writable(out: Path) -> None:
         raise InputError(out, "", f"cannot be written ({error.strerror})") from None
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def of_kind(choose: Callable[[dict[str, Any]], type[Record]], *kinds: type[Record]) -> WrapValidator:
+    """Read a record as what its fields say it is: a union's errors would name fields of all kinds."""
 
+    def read(value: Any, _: Any) -> Any:
+        if isinstance(value, kinds):
+            return value
+        return choose(value if isinstance(value, dict) else {}).model_validate(value)
 
-class _DuplicateKeyError(Exception):
-    pass
-
-
-def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    seen: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in seen:
-            raise _DuplicateKeyError(key)
-        seen[key] = value
-    return seen
+    return WrapValidator(read)
 
 
 def _unknown(kind: type[Record], key: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -152,14 +153,12 @@ def paper_program(
         return sp.kron(sp.csr_matrix(at_end), now, "csr") + sp.kron(sp.csr_matrix(at_start), last, "csr")
 
     own = np.eye(n_gen, n_input) / koopman.dt_s
-    rows = sp.bmat(
-        [
-            [blocks(np.eye(n_psi), -koopman.k), blocks(-koopman.g, -before), None, None],
-            [sp.kron(-np.eye(n_psi)[[n_gen]], points, "csr"), None, points, -points],
-            [None, blocks(own, -own), None, None],
-        ],
-        "csr",
-    )
+    parts: list[list[Any]] = [
+        [blocks(np.eye(n_psi), -koopman.k), blocks(-koopman.g, -before), None, None],
+        [sp.kron(-np.eye(n_psi)[[n_gen]], points, "csr"), None, points, -points],
+        [None, blocks(own, -own), None, None],
+    ]
+    rows = sp.csr_matrix(sp.bmat(parts))
     lower, upper = np.full((2, n_psi + n_input + 2, steps + 1), [[[-np.inf]], [[np.inf]]])
     lower[:n_gen], upper[:n_gen] = -case.omega_bound(regime), case.omega_bound(regime)
     lower[:n_psi, 0] = upper[:n_psi, 0] = psi

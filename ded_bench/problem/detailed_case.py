@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, WrapValidator, model_validator
+from pydantic import Field, model_validator
 
-from ded_bench.files.strict import Record
+from ded_bench.files.strict import Record, of_kind
 from ded_bench.problem.case import Case, Sampling
 from ded_bench.problem.limits import Agc, IslandRegime, Regime, ScheduledMachine, Transfer
 from ded_bench.problem.quantities import LARGEST, Array, Magnitude, Name, check_whole_steps
@@ -29,12 +29,10 @@ class PlantChoice(Record):
         return self
 
 
-def _regime(value: Any, _: Any) -> Regime | IslandRegime:
-    """Read a regime as what its fields say it is: a union's errors would name fields of both kinds."""
-    if isinstance(value, Regime | IslandRegime):
-        return value
-    kind = Regime if isinstance(value, dict) and "omega_hz" in value else IslandRegime
-    return kind.model_validate(value)
+AnyRegime = Annotated[
+    Regime | IslandRegime,
+    of_kind(lambda value: Regime if "omega_hz" in value else IslandRegime, Regime, IslandRegime),
+]
 
 
 class DetailedCase(Case):
@@ -53,7 +51,7 @@ class DetailedCase(Case):
     ]
     transfers_: Annotated[tuple[Transfer, ...] | None, Field(alias="transfers", strict=False)] = None
     ramp_pu_per_s: Magnitude
-    regimes: dict[Name, Annotated[Regime | IslandRegime, WrapValidator(_regime)]]
+    regimes: dict[Name, AnyRegime]
     sampling: Sampling
     knots: Annotated[int, Field(ge=2, le=100_000)] | None = None
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, WrapValidator, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Fingerprinted, Record, parse_record, read_text
+from ded_bench.files.strict import Fingerprinted, Record, of_kind, parse_record, read_text
 from ded_bench.problem.quantities import SMALLEST, Magnitude, Name, NonNegative, Number, Positive
 
 BASE_MVA = 100.0
@@ -109,18 +109,15 @@ def unconnected(names: set[str], lines: Any, start: str) -> set[str]:
 
 
 def _of_its_model(*kinds: type[Record]) -> WrapValidator:
-    """Read a record as the model that it names: a union's errors would name fields of all of them."""
+    """Read a record as the model that it names."""
     by_model = {kind.__name__.upper(): kind for kind in kinds}
 
-    def read(value: Any, _: Any) -> Any:
-        if value is None or isinstance(value, kinds):
-            return value
-        model = value.get("model") if isinstance(value, dict) else None
-        if model not in by_model:
+    def choose(value: dict[str, Any]) -> type[Record]:
+        if value.get("model") not in by_model:
             raise ValueError(f"model: must be one of {', '.join(by_model)}")
-        return by_model[model].model_validate(value)
+        return by_model[value["model"]]
 
-    return WrapValidator(read)
+    return of_kind(choose, *kinds)
 
 
 class Sexs(Record):
@@ -196,8 +193,8 @@ class Genrou(_ModelledMachine):
     Tq10: Positive
     Td20: Positive
     Tq20: Positive
-    exciter: Annotated[Sexs | Ieeex1 | None, _of_its_model(Sexs, Ieeex1)]
-    pss: Annotated[St2cut | None, _of_its_model(St2cut)]
+    exciter: Annotated[Sexs | Ieeex1, _of_its_model(Sexs, Ieeex1)] | None
+    pss: Annotated[St2cut, _of_its_model(St2cut)] | None
 
     @model_validator(mode="after")
     def _possible(self) -> Genrou:

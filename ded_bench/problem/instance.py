@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, WrapValidator, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import Fingerprinted, Record, read_record
+from ded_bench.files.strict import Fingerprinted, Record, of_kind, read_record
 from ded_bench.problem.case import Case
 from ded_bench.problem.quantities import (
     MAX_POINTS,
@@ -84,15 +84,10 @@ class LoadPoints(Record):
         return tuple(t for t, _ in self.points[1:-1])
 
 
-def _load_of_its_kind(value: Any, _: Any) -> LoadRamp | LoadPoints:
-    """Read a load as what its fields say it is: a union's errors would name fields of both kinds."""
-    if isinstance(value, LoadRamp | LoadPoints):
-        return value
-    kind = LoadPoints if isinstance(value, dict) and "points" in value else LoadRamp
-    return kind.model_validate(value)
-
-
-Load = Annotated[LoadRamp | LoadPoints, WrapValidator(_load_of_its_kind)]
+Load = Annotated[
+    LoadRamp | LoadPoints,
+    of_kind(lambda value: LoadPoints if "points" in value else LoadRamp, LoadRamp, LoadPoints),
+]
 
 
 class AgcState(Extended):

@@ -25,7 +25,9 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.ipopt import CasadiIpopt, assign, fix
+from ded_bench.solvers.compile import fix
+from ded_bench.solvers.ipopt import CasadiIpopt
+from ded_bench.solvers.linear_program import assign
 from ded_bench.solvers.status import Status
 
 #: Raised when answers change.

@@ -1,48 +1,42 @@
 """DED-KO: the paper's linear program over all points of the horizon, on a surrogate.
 
-On a lifted model it is the paper's formulation. By default PIQP solves it. Where the surrogate varies in
-time, and on grids where it would take minutes, the default is another program with the same optimum (see
-`knot_program`: every grid point is a knot).
+On a lifted model it is the paper's formulation, written in Pyomo. By default PIQP solves it. Where the
+surrogate varies in time, and on grids whose Pyomo model would take minutes and gigabytes, the default makes
+the arrays of the same program directly (see `knot_program`: every grid point is a knot).
 """
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
+import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.solution import Settings, Solution, Solver, too_large
+from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers import highs, ipopt, piqp
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm, Indices
+from ded_bench.solvers.compile import SOLVERS, OnArrays, fix, reset
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 
 #: Raised when answers change.
 VERSION = 1
-#: Linear solvers by name.
-SOLVERS: dict[str, Callable[[FreeForm, float], FormAnswer]] = {
-    "piqp": piqp.solve_form,
-    "ipopt": ipopt.solve_form,
-    "highs": highs.solve_form,
-}
-#: Entries of the equations up to which the default is the paper's program (two-area has half of it).
-PAPER_ENTRIES = 1_000_000
-#: Limit of the other programs where none is given: HiGHS, the last resort, knows no end on large grids.
+#: Entries of the equations up to which the default is a Pyomo model; half of it takes 10 s and 0.5 GB
+#: (two-area), once.
+PYOMO_ENTRIES = 1_000_000
+#: Limit of the arrays' programs where none is given: HiGHS, the last resort, knows no end on large grids.
 TIME_LIMIT_S = 1800.0
-#: Bytes that a program takes for each entry of its equations (39bus).
-BYTES_PER_ENTRY = 150
+#: Bytes that a program takes for each entry of its equations: as arrays (39bus), as a Pyomo model (two-area).
+ARRAYS_BYTES, PYOMO_BYTES = 150, 1000
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class Options:
     """How the program is solved."""
 
     solver: str = option(
-        "piqp", "piqp solves another program where the paper's would be too large", choices=tuple(SOLVERS)
+        "piqp", "piqp makes arrays where the Pyomo model would be too large", choices=tuple(SOLVERS)
     )
 
 
@@ -69,17 +63,30 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
     """
     case.check_regimes([regime])
     solver = read_options(Options, settings.options).solver
-    if solver != "piqp" and not isinstance(surrogate, Koopman):
-        raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")
+    if solver != "piqp":
+        if not isinstance(surrogate, Koopman):
+            raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")
+        return _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
+    by_arrays = _array_solver(case, surrogate, regime, settings)
+    if not isinstance(surrogate, Koopman):
+        return by_arrays
+    by_pyomo = _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
 
     def solve(instance: Instance) -> Solution:
-        points, entries = np.arange(instance.steps + 1), _entries(case, surrogate, instance.steps)
-        if refusal := too_large(
-            BYTES_PER_ENTRY * entries, f"the program of {len(points)} points", "`ded-ko-knots` takes fewer"
-        ):
+        small = _entries(case, surrogate, instance.steps) <= PYOMO_ENTRIES
+        return by_pyomo(instance) if small else by_arrays(instance)
+
+    return solve
+
+
+def _array_solver(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
+    """A solver that makes the arrays of each instance's program."""
+
+    def solve(instance: Instance) -> Solution:
+        points = np.arange(instance.steps + 1)
+        needed = ARRAYS_BYTES * _entries(case, surrogate, instance.steps)
+        if refusal := too_large(needed, f"the program of {len(points)} points", "`ded-ko-knots` takes fewer"):
             return refusal
-        if isinstance(surrogate, Koopman) and (solver != "piqp" or entries <= PAPER_ENTRIES):
-            return _solve(case, surrogate, regime, solver, settings.time_limit_s, instance)
         limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
         # Softly, since one widening for all of thousands of intervals would be a dense column.
         solution = solve_on_surrogate(
@@ -97,94 +104,133 @@ def _entries(case: Case, surrogate: Surrogate, steps: int) -> int:
     return steps * n_state * (n_state + 2 * n_gen + 1)
 
 
-def _solve(
-    case: Case, koopman: Koopman, regime: str, solver: str, time_limit_s: float | None, instance: Instance
-) -> Solution:
-    """Solve the paper's program; what PIQP does not solve, IPOPT decides."""
-    koopman.check_step(instance)
-    started = time.perf_counter()
-    form, columns, values = paper_program(case, koopman, instance, regime)
-    built = time.perf_counter()
-    left = np.inf if time_limit_s is None else time_limit_s
-    answer = SOLVERS[solver](form, left)
-    if answer.status == Status.FAILED and solver == "piqp":
-        spent = time.perf_counter() - built
-        other = ipopt.solve_form(form, max(left - spent, 1e-3))  # IPOPT wants some
-        version, message = f"{answer.version}, {other.version}", f"{answer.message}, {other.message}"
-        answer = replace(other, version=version, message=message)
-    found = Solution(
-        status=answer.status,
-        iterations=answer.iterations,
-        build_s=built - started,
-        setup_s=0.0,
-        solve_s=time.perf_counter() - built,
-        solver_version=answer.version,
-    )
-    if answer.status not in (Status.OPTIMAL, Status.FEASIBLE):
-        return replace(found, error=answer.message)
-    constant = float(instance.cost_gen(case) @ instance.p_initial(case))
-    values[columns] = answer.x
-    points = instance.steps + 1
-    p_gen = values[len(koopman.k) * points :].reshape(-1, points)[: len(case.generators)]
-    schedule = Schedule(instance.grid, p_gen.T)
-    return replace(found, schedule=schedule, solver_objective=float(form.cost @ answer.x) + constant)
+def _pyomo_solver(
+    case: Case, koopman: Koopman, regime: str, solver: str, time_limit_s: float | None
+) -> Solver:
+    """A solver through the Pyomo model; one compiled program per process serves all instances."""
+
+    def solve(instance: Instance) -> Solution:
+        koopman.check_step(instance)
+        needed = PYOMO_BYTES * _entries(case, koopman, instance.steps)
+        if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
+            return refusal
+        started = time.perf_counter()
+        program = _Program(case, koopman.fingerprint, instance.steps, koopman)
+        model = _built(program)
+        set_instance(model, case, koopman, instance, regime)
+        build_s = time.perf_counter() - started
+        outcome = _compiled(program, solver).solve(time_limit_s)
+        return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
+
+    return solve
 
 
-def paper_program(
-    case: Case, koopman: Koopman, instance: Instance, regime: str
-) -> tuple[FreeForm, Indices, Array]:
-    """The paper's eq. (DED_KO) of one instance.
+@dataclass(frozen=True)
+class _Program:
+    """What a built model depends on; Koopman models are equal if their fingerprints are."""
 
-    With P = (generators, loads) and the G of `Koopman`, eq. (KO_dyn) is
-    ψ_{k+1} = K ψ_k + ((I - K) B - G) P_k + G P_{k+1}. Its columns are ψ, generators, loads and P_s up and
-    down, each at all points; loads and what is given at t = 0 are no columns of the form.
+    case: Case
+    fingerprint: str
+    steps: int
+    koopman: Koopman = field(compare=False)
 
-    Returns:
-        The form, in which columns stand as rows first name them, which of all columns are its own, and all
-        columns' values, where they are given.
+
+@functools.lru_cache(maxsize=1)
+def _built(program: _Program) -> pyo.ConcreteModel:
+    return build_ded_ko(program.case, program.koopman, program.steps)
+
+
+@functools.lru_cache(maxsize=1)
+def _compiled(program: _Program, solver: str) -> OnArrays:
+    return OnArrays(_built(program), solver)
+
+
+def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
+    """Return the unsolved LP of the paper's eq. (DED_KO) for any instance of a case.
+
+    What instances differ in - costs, loads, ψ_0, initial power, the regime's bound - are bounds and
+    variables that `set_instance` fixes by their bounds. With P = (generators, loads) and the G of
+    `Koopman`, eq. (KO_dyn) is ψ_{k+1} = K ψ_k + ((I - K) B - G) P_k + G P_{k+1}.
     """
-    steps, (n_psi, n_input), n_gen = instance.steps, koopman.b.shape, len(case.generators)
-    psi, p_initial = koopman.initial(Network(case), [instance])[0], instance.p_initial(case)
-    now, last, points = sp.eye(steps, steps + 1, 1), sp.eye(steps, steps + 1), sp.eye(steps + 1)
+    n_gen, n_psi = len(case.generators), len(koopman.k)
+    m = pyo.ConcreteModel()
+    m.point = pyo.RangeSet(0, steps)
+    m.step = pyo.RangeSet(1, steps)
+    m.gen = pyo.Set(initialize=case.generators, ordered=True)
+    m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
+    m.observable = pyo.RangeSet(0, n_psi - 1)
+
+    # Data, fixed by bounds.
+    m.cost = pyo.Var(m.gen)
+    m.cost_slack = pyo.Var()
+    m.p_load = pyo.Var(m.load_bus, m.point)
+
+    # Variables; frequencies in rad/s, powers in pu. ψ = (ω, P_s, N).
+    m.psi = pyo.Var(m.observable, m.point)
+    m.p_gen = pyo.Var(m.gen, m.point)
+    m.p_slack_up = pyo.Var(m.point, bounds=(0, None))
+    m.p_slack_down = pyo.Var(m.point, bounds=(0, None))
+
+    # Constraints.
+    inputs = [(m.p_gen, g) for g in case.generators] + [(m.p_load, bus) for bus in case.loads]
     before = (np.eye(n_psi) - koopman.k) @ koopman.b - koopman.g
 
-    def blocks(at_end: Array, at_start: Array) -> sp.csr_matrix:
-        """A matrix times what is at the end of every step, another times what is at its start."""
-        return sp.kron(sp.csr_matrix(at_end), now, "csr") + sp.kron(sp.csr_matrix(at_start), last, "csr")
+    @m.Constraint(m.observable, m.step)
+    def eq_dynamics(m: Any, i: int, k: int) -> Any:
+        terms = [koopman.k[i, j] * m.psi[j, k - 1] for j in m.observable if koopman.k[i, j]]
+        for j, (p, bus) in enumerate(inputs):
+            terms += [before[i, j] * p[bus, k - 1]] if before[i, j] else []
+            terms += [koopman.g[i, j] * p[bus, k]] if koopman.g[i, j] else []
+        return m.psi[i, k] == pyo.quicksum(terms)
 
-    own = np.eye(n_gen, n_input) / koopman.dt_s
-    parts: list[list[Any]] = [
-        [blocks(np.eye(n_psi), -koopman.k), blocks(-koopman.g, -before), None, None],
-        [sp.kron(-np.eye(n_psi)[[n_gen]], points, "csr"), None, points, -points],
-        [None, blocks(own, -own), None, None],
-    ]
-    rows = sp.csr_matrix(sp.bmat(parts))
-    lower, upper = np.full((2, n_psi + n_input + 2, steps + 1), [[[-np.inf]], [[np.inf]]])
-    lower[:n_gen], upper[:n_gen] = -case.omega_bound(regime), case.omega_bound(regime)
-    lower[:n_psi, 0] = upper[:n_psi, 0] = psi
-    p_gen, p_load = slice(n_psi, n_psi + n_gen), slice(n_psi + n_gen, n_psi + n_input)
-    lower[p_gen], upper[p_gen] = case.p_min[:, None], case.p_max[:, None]
-    lower[p_gen, 0] = upper[p_gen, 0] = p_initial
-    lower[p_load] = upper[p_load] = instance.p_load(case).T
-    lower[-2:] = 0.0
-    cost = np.zeros_like(lower)
-    cost[p_gen], cost[-2:] = instance.cost_gen(case)[:, None], instance.cost_slack(case)
-    columns, first = np.unique(rows.indices, return_index=True)
-    columns = columns[np.argsort(first)]
-    is_free = (lower != upper).ravel()
-    values = np.where(is_free, 0.0, lower.ravel())
-    right = -(rows.tocsc()[:, columns] @ values[columns])
-    columns = columns[is_free[columns]]
-    rows, equal = rows[:, columns], steps * n_psi + steps + 1
-    ramp = np.repeat(case.ramp, steps)
-    form = FreeForm(
-        cost=cost.ravel()[columns],
-        equal=sp.csc_matrix(rows[:equal]),
-        right=right[:equal],
-        between=sp.csc_matrix(rows[equal:]),
-        low=right[equal:] - ramp,
-        high=right[equal:] + ramp,
-        lower=lower.ravel()[columns],
-        upper=upper.ravel()[columns],
-    )
-    return form, columns, values
+    @m.Constraint(m.point)
+    def eq_slack(m: Any, k: int) -> Any:
+        return m.p_slack_up[k] - m.p_slack_down[k] == m.psi[n_gen, k]
+
+    ramp = dict(zip(case.generators, case.ramp.tolist(), strict=True))
+
+    @m.Constraint(m.gen, m.step)
+    def ineq_ramp(m: Any, g: str, k: int) -> Any:
+        rate = (m.p_gen[g, k] - m.p_gen[g, k - 1]) / koopman.dt_s
+        return pyo.inequality(-ramp[g], rate, ramp[g])
+
+    @m.Objective()
+    def cost_total(m: Any) -> Any:
+        generation = pyo.quicksum(m.cost[g] * m.p_gen[g, k] for g in m.gen for k in m.point)
+        slack = pyo.quicksum(m.cost_slack * (m.p_slack_up[k] + m.p_slack_down[k]) for k in m.point)
+        return generation + slack
+
+    return m
+
+
+def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
+    """Give a built model the data of one instance and reset its initial point (cold start).
+
+    The initial point is ψ_0 and P_0 over the whole horizon.
+    """
+    psi = koopman.initial(Network(case), [instance])[0].tolist()
+    bound = case.omega_bound(regime)
+    n_gen = len(case.generators)
+    fix(m.cost_slack, instance.cost_slack(case))
+    for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
+        for k, value in enumerate(column):
+            fix(m.p_load[bus, k], value)
+    for i, value in enumerate(psi):
+        limit = bound if i < n_gen else None
+        for k in m.point:
+            reset(m.psi[i, k], value, None if limit is None else -limit, limit)
+        fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies
+    for g, value in zip(case.generators, instance.p_initial(case).tolist(), strict=True):
+        fix(m.cost[g], instance.cost[g])
+        for k in m.point:
+            reset(m.p_gen[g, k], value, case.machines[g].p_min, case.machines[g].p_max)
+        fix(m.p_gen[g, 0], value)
+    for k in m.point:
+        m.p_slack_up[k].set_value(max(psi[n_gen], 0.0), skip_validation=True)
+        m.p_slack_down[k].set_value(max(-psi[n_gen], 0.0), skip_validation=True)
+
+
+def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:
+    """Read the generator powers of a solved model, shape (n_points, n_gen), pu."""
+    values: Array = np.array([[m.p_gen[g, k].value for g in case.generators] for k in m.point])
+    return Schedule(t=instance.grid, p=values)

@@ -28,7 +28,6 @@ from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.ipopt import assign
 
 #: An array of Pyomo's variables or expressions.
 Expressions: TypeAlias = "np.ndarray[Any, Any]"
@@ -226,9 +225,9 @@ class DetailedProgram:
         x = x.reshape(len(x), -1)[:, self._moving] * self._scale
         for variables, values in ((self._x[1:], x), (self._v[1:], v)):
             for column, course in zip(variables.T, values.T, strict=True):
-                assign(column, np.interp(mesh.places[1:], np.arange(len(course)), course))
-        assign(self._p_set[1:].ravel(), p_set[1:].ravel())
-        assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
+                _assign(column, np.interp(mesh.places[1:], np.arange(len(course)), course))
+        _assign(self._p_set[1:].ravel(), p_set[1:].ravel())
+        _assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
 
     def schedule(self) -> Schedule:
         """The set-points of the solved model; IPOPT keeps bounds to 1e-8 only, so they are put back."""
@@ -240,3 +239,8 @@ class DetailedProgram:
 def _by_time(variable: pyo.Var, times: Any) -> Expressions:
     """The variables of an indexed one, (n_times, n_index)."""
     return np.array(list(variable.values()), dtype=object).reshape(-1, len(times)).T
+
+
+def _assign(variables: Expressions, values: Array) -> None:
+    for variable, value in zip(variables, values.tolist(), strict=True):
+        variable.set_value(value, skip_validation=True)

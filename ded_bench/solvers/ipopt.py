@@ -6,7 +6,6 @@ import functools
 import importlib.metadata
 import tempfile
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import scipy.sparse as sp
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.problem.case import Array
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, bounds
 from ded_bench.solvers.status import Options, Outcome, Status
 
 #: IPOPT's return values as CasADi spells them; everything else is a failure.
@@ -76,8 +75,7 @@ class CasadiIpopt:
         """
         started = time.perf_counter()
         solver = self._made(time_limit_s)
-        limits = np.array([[v.lb for v in self._columns], [v.ub for v in self._columns]], dtype=float)
-        lower, upper = np.where(np.isnan(limits), [[-np.inf], [np.inf]], limits)  # None becomes NaN
+        lower, upper = bounds(self._columns)
         start = np.array([0.0 if v.value is None else v.value for v in self._columns])
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
@@ -86,19 +84,6 @@ class CasadiIpopt:
         if x is not None:
             assign(self._columns, x)
         return outcome
-
-
-def assign(columns: Iterable[Any], values: Array) -> None:
-    """Set the values of Pyomo variables."""
-    for variable, value in zip(columns, values.tolist(), strict=True):
-        variable.set_value(value, skip_validation=True)
-
-
-def fix(variable: pyo.Var, value: float) -> None:
-    """Make a variable data: fixed by equal bounds."""
-    variable.setlb(value)
-    variable.setub(value)
-    variable.set_value(value, skip_validation=True)
 
 
 def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:

@@ -1,14 +1,20 @@
-"""Linear programs as arrays: what is solved, what solvers say, and who is told of it."""
+"""A Pyomo model as the arrays of a linear program, read once and given new numbers for each solve.
+
+What instances differ in are variable bounds, and variables fixed by equal bounds: such a variable
+may multiply others in the objective, so that costs, too, can change from one solve to the next.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyomo.environ as pyo
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from pyomo.repn import generate_standard_repn
 
 from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
@@ -18,7 +24,7 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class FreeForm:
-    """Least cost x with equal x = right, low <= between x <= high, lower <= x <= upper."""
+    """One instance without its data: equal x = right, low <= between x <= high, lower <= x <= upper."""
 
     cost: Array
     equal: sp.csc_matrix
@@ -103,3 +109,120 @@ def told(form: FreeForm, answer: FormAnswer) -> FormAnswer:
     for listener in LISTENERS:
         listener(form, answer)
     return answer
+
+
+class Instantiated(NamedTuple):
+    """One instance of a Pyomo model."""
+
+    form: FreeForm
+    values: Array  # of all columns, zero where they are free
+    free: NDArray[np.bool_]
+    constant: float  # what the form's objective leaves out
+
+
+@dataclass(frozen=True, eq=False)
+class LinearProgram:
+    """row_lower <= a x <= row_upper, and an objective linear in x once the data are known."""
+
+    columns: tuple[Any, ...]  # Pyomo variables
+    a: sp.csc_matrix  # (n_rows, n_columns)
+    row_lower: Array
+    row_upper: Array
+    linear: Array  # (n_columns,)
+    bilinear: sp.csr_matrix  # (n_columns, n_columns), symmetric: objective ½ xᵀ Q x + linear·x
+    constant: float
+
+    def now(self) -> Instantiated:
+        """The program under the current bounds of the Pyomo variables.
+
+        Raises:
+            ValueError: two variables that are free multiply each other.
+        """
+        lower, upper = bounds(self.columns)
+        free = lower != upper
+        data = np.where(free, 0.0, lower)
+        if (self.bilinear @ free.astype(float))[free].any():
+            raise ValueError("the objective is not linear in the free variables")
+        slope, rows, shift = self.bilinear @ data, self.a.tocsr(), self.a @ data
+        equal = self.row_lower == self.row_upper
+        form = FreeForm(
+            cost=(self.linear + slope)[free],
+            equal=sp.csc_matrix(rows[equal][:, free]),
+            right=(self.row_lower - shift)[equal],
+            between=sp.csc_matrix(rows[~equal][:, free]),
+            low=(self.row_lower - shift)[~equal],
+            high=(self.row_upper - shift)[~equal],
+            lower=lower[free],
+            upper=upper[free],
+        )
+        return Instantiated(form, data, free, self.constant + float(data @ (self.linear + 0.5 * slope)))
+
+
+def bounds(columns: Sequence[Any]) -> Array:
+    """Lower and upper bounds of Pyomo variables, shape (2, n); infinite where there are none."""
+    both = np.array([[v.lb for v in columns], [v.ub for v in columns]], dtype=float)  # None becomes NaN
+    return np.where(np.isnan(both), [[-np.inf], [np.inf]], both)
+
+
+def assign(columns: Sequence[Any], values: Array) -> None:
+    """Set the values of Pyomo variables."""
+    for variable, value in zip(columns, values.tolist(), strict=True):
+        variable.set_value(value, skip_validation=True)
+
+
+def read_linear(model: pyo.ConcreteModel) -> LinearProgram:
+    """Read a Pyomo model with linear constraints and one active objective, which is minimised.
+
+    Raises:
+        ValueError: a constraint is not linear, or the objective is of higher degree than two.
+    """
+    index: dict[int, int] = {}
+    columns: list[Any] = []
+
+    def column(variable: Any) -> int:
+        known = index.setdefault(id(variable), len(columns))
+        if known == len(columns):
+            columns.append(variable)
+        return known
+
+    rows: list[int] = []
+    cols: list[int] = []
+    values: list[float] = []
+    lower: list[float] = []
+    upper: list[float] = []
+    for constraint in model.component_data_objects(pyo.Constraint, active=True):
+        low, body, high = constraint.to_bounded_expression(evaluate_bounds=True)
+        repn = generate_standard_repn(body, quadratic=False)
+        if repn.nonlinear_expr is not None:
+            raise ValueError(f"constraint {constraint.name} is not linear")
+        rows += [len(lower)] * len(repn.linear_vars)
+        cols += [column(variable) for variable in repn.linear_vars]
+        values += repn.linear_coefs
+        lower.append(-np.inf if low is None else low - repn.constant)
+        upper.append(np.inf if high is None else high - repn.constant)
+
+    objective = next(model.component_data_objects(pyo.Objective, active=True))
+    repn = generate_standard_repn(objective.expr, quadratic=True)
+    if repn.nonlinear_expr is not None:
+        raise ValueError("the objective is not linear in the free variables")
+    pairs = [(column(one), column(other)) for one, other in repn.quadratic_vars]
+    places = [column(variable) for variable in repn.linear_vars]
+    n = len(columns)
+    linear = np.zeros(n)
+    np.add.at(linear, places, repn.linear_coefs)
+    return LinearProgram(
+        columns=tuple(columns),
+        a=sp.csc_matrix((values, (rows, cols)), shape=(len(lower), n)),
+        row_lower=np.array(lower),
+        row_upper=np.array(upper),
+        linear=linear,
+        bilinear=_symmetric(pairs, repn.quadratic_coefs, n),
+        constant=float(repn.constant),
+    )
+
+
+def _symmetric(pairs: Sequence[tuple[int, int]], coefficients: Sequence[float], n: int) -> sp.csr_matrix:
+    """Σ q_ij x_i x_j as the symmetric Q of ½ xᵀ Q x (a square x_i² counts twice, as it should)."""
+    i = [one for one, _ in pairs] + [other for _, other in pairs]
+    j = [other for _, other in pairs] + [one for one, _ in pairs]
+    return sp.csr_matrix(([*coefficients, *coefficients], (i, j)), shape=(n, n))

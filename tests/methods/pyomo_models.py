@@ -12,8 +12,6 @@ from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
-from ded_bench.solvers.ipopt import LINEAR_OPTIONS, CasadiIpopt
-from ded_bench.solvers.status import Status
 
 
 def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVarying) -> pyo.ConcreteModel:
@@ -95,10 +93,3 @@ def build_ded_slp(case: Case, instance: Instance, bounds: Bounds, model: TimeVar
         return generation + price * pyo.quicksum(m.p_slack_up[k] + m.p_slack_down[k] for k in m.point)
 
     return m
-
-
-def least(model: pyo.ConcreteModel) -> float:
-    """The optimum, by IPOPT on the model's .nl form."""
-    outcome = CasadiIpopt(model, LINEAR_OPTIONS | {"tol": 1e-9}).solve()
-    assert outcome.status == Status.OPTIMAL
-    return outcome.objective

@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ded_bench.methods import ed
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.lossless import stepper
+from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.lossless.stepper import KUTTA_4
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.simulate import simulate

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.plants.lossless.stepper import solve_angles
+from ded_bench.plants.lossless.algebraic import solve_angles
 from ded_bench.problem.compiled import _Announced, sources_stamp
 
 CALLED = "@compiled\ndef called(x):\n    return x + 1\n"

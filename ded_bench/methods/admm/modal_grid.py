@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules, time_grid
 from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, set_jacobian, solve_algebraic
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.lossless.stepper import CompiledGrid, Indices, set_jacobian, solve_algebraic
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 

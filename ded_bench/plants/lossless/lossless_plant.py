@@ -96,7 +96,7 @@ class LosslessPlant:
             if past is None or past.recent.shape[1] != len(tableau.c):
                 carried = carried_from(tableau, grid, theta[0])
             else:
-                carried = Carried(*(part.copy() for part in past))
+                carried = Carried(*(part.copy() for part in past))  # type: ignore[arg-type]
             done = integrate(tableau, grid, inputs, steps, carried, theta, omega, p_slack)
         except np.linalg.LinAlgError:
             done = 0

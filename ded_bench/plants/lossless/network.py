@@ -20,7 +20,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 
 if TYPE_CHECKING:
-    from ded_bench.plants.lossless.stepper import CompiledGrid
+    from ded_bench.plants.lossless.algebraic import CompiledGrid
 
 #: Newton stops at this mismatch, pu, or where lines of great coupling let doubles resolve no less.
 MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
@@ -85,7 +85,7 @@ class Network:
     @functools.cached_property
     def grid(self) -> CompiledGrid:
         """What compiled functions see of this network."""
-        from ded_bench.plants.lossless.stepper import CompiledGrid  # and with it Numba: help does without
+        from ded_bench.plants.lossless.algebraic import CompiledGrid  # and with it Numba: help does without
 
         places = self.generators, self.algebraic, self.slack
         return CompiledGrid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
@@ -173,7 +173,7 @@ class Network:
         return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
 
     def _newton(self, theta: Array, wanted: Array, grid: CompiledGrid) -> tuple[Array, Array]:
-        from ded_bench.plants.lossless.stepper import solve_angles  # here only, as in `grid`
+        from ded_bench.plants.lossless.algebraic import solve_angles  # here only, as in `grid`
 
         theta, f = np.array(theta), np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)

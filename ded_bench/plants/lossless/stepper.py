@@ -1,12 +1,10 @@
 """The index-1 swing DAE, integrated with steps of fixed length; compiled.
 
 Steps are those of an explicit Runge-Kutta method, whatever tableau is given. Where powers and loads have been
-linear for long enough, a multistep method may follow, which needs two evaluations a step: Adams's predictor
-and corrector of order 8. Where both differ by more than is left to an exact answer, the step is one of
-Runge-Kutta's.
+linear for eight steps, one of order 8 is followed by Adams's predictor and corrector of the same order, which
+need two evaluations a step. Where these two differ too much, a Runge-Kutta step is taken.
 
-At every evaluation the angles of load and junction buses are solved for. Newton's method keeps the inverse of
-the Jacobian ("chord"), and renews it where it converges slowly.
+At every evaluation the angles of load and junction buses are solved for (`algebraic`).
 """
 
 from __future__ import annotations
@@ -14,18 +12,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
+from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, invert, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
-
-Indices = NDArray[np.int_]
-
-#: Newton gives up after so many steps.
-NEWTON_STEPS = 30
-#: What a step has to leave of the mismatch at most, else the Jacobian is renewed.
-CONTRACTION = 0.02
 
 
 class Tableau(NamedTuple):
@@ -58,19 +49,6 @@ ADAMS_TOLERANCE = 3e-10
 LINEAR = 1e-12
 
 
-class CompiledGrid(NamedTuple):
-    """A lossless network and its machines."""
-
-    lines: Indices  # (n_line, 2): the buses that each joins
-    coupling: Array  # (n_line,), pu
-    generators: Indices  # (n_gen,): their buses
-    algebraic: Indices  # (n_algebraic,): buses whose angles follow from injections, such as loads
-    slack: int
-    m: Array  # (n_gen,), s² pu/rad
-    d: Array  # (n_gen,), s pu/rad
-    mismatch: float  # algebraic equations are solved to this, pu
-
-
 class GridInputs(NamedTuple):
     """What drives the grid at the points of time, linear between them."""
 
@@ -90,6 +68,16 @@ class Carried(NamedTuple):
     slope: Array  # change of powers and injections in the last interval, (n_gen + n_algebraic,), pu
 
 
+class Work(NamedTuple):
+    """Of one step."""
+
+    state: Array  # angles and frequencies of the generators where it begins, (2, n_gen), rad and rad/s
+    stage: Array  # at one of its stages, likewise
+    rates: Array  # their derivatives at all of them, (n_stages, 2, n_gen)
+    angle: Array  # of all buses, (n_bus,), rad
+    f: Array  # injections of all buses, (n_bus,), pu
+
+
 @compiled
 def carried_from(tableau: Tableau, grid: CompiledGrid, theta: Array) -> Carried:
     """What a state without a past has, at angles (n_bus,); LinAlgError if the Jacobian is singular."""
@@ -104,7 +92,7 @@ def carried_from(tableau: Tableau, grid: CompiledGrid, theta: Array) -> Carried:
     )
     for i in range(n):
         carried.recent[:, :, i] = carried.ahead[i] = theta[grid.algebraic[i]]
-    _invert(grid, theta, carried.inverse)
+    invert(grid, theta, carried.inverse)
     return carried
 
 
@@ -122,7 +110,7 @@ def integrate(
     """Integrate from the first point of time to the last.
 
     Args:
-        tableau: the Runge-Kutta method; that of order 8 is followed by Adams's.
+        tableau: the Runge-Kutta method.
         grid: the network.
         inputs: powers at n points of time.
         steps: steps from one point to the next.
@@ -138,9 +126,9 @@ def integrate(
     n_gen, n_bus = omega.shape[1], theta.shape[1]
     n_stages = len(tableau.c)
     h = inputs.dt / steps
+    state, stage, rates = np.empty((2, n_gen)), np.empty((2, n_gen)), np.empty((n_stages, 2, n_gen))
     angle, f = theta[0].copy(), np.empty(n_bus)
-    rates = np.empty((n_stages, 2, n_gen))
-    state, stage, predicted = np.empty((2, n_gen)), np.empty((2, n_gen)), np.empty((2, n_gen))
+    work = Work(state, stage, rates, angle, f)
     for g in range(n_gen):
         state[0, g], state[1, g] = angle[grid.generators[g]], omega[0, g]
     for k in range(n):
@@ -157,14 +145,14 @@ def integrate(
             carried.counts[0] = 0
         for j in range(steps):
             angle[grid.algebraic] = carried.ahead
-            if not _evaluate(grid, inputs, k, j / steps, carried, 0, state, angle, f, rates[0]):
+            if not _evaluate(grid, inputs, (k, j / steps), carried, 0, state, work):
                 return k
             if j == 0:
                 theta[k], omega[k], p_slack[k] = angle, state[1], f[grid.slack]
                 if k == n - 1:
                     return n
             if tableau.order == len(BASHFORTH) and _adams(
-                grid, inputs, k, j, steps, carried, state, predicted, angle, f, rates
+                grid, inputs, (k, (j + 1) / steps), h, carried, work
             ):
                 continue
             if carried.counts[1] > 0:  # of stages that Adams steps left out there is no past
@@ -176,8 +164,7 @@ def integrate(
                         for g in range(n_gen):
                             stage[q, g] += h * tableau.a[s, r] * rates[r, q, g]
                 _extrapolate(grid, carried.recent[:, s], angle)
-                inside = (j + tableau.c[s]) / steps
-                if not _evaluate(grid, inputs, k, inside, carried, s, stage, angle, f, rates[s]):
+                if not _evaluate(grid, inputs, (k, (j + tableau.c[s]) / steps), carried, s, stage, work):
                     return k
             for s in range(n_stages):
                 for q in range(2):
@@ -190,52 +177,50 @@ def integrate(
 
 @compiled
 def _adams(
-    grid: CompiledGrid,
-    inputs: GridInputs,
-    k: int,
-    j: int,
-    steps: int,
-    carried: Carried,
-    state: Array,
-    predicted: Array,
-    angle: Array,
-    f: Array,
-    rates: Array,
+    grid: CompiledGrid, inputs: GridInputs, end: tuple[int, float], h: float, carried: Carried, work: Work
 ) -> bool:
     """Take a step of Adams's methods, if powers and loads have been linear for long enough.
 
+    Args:
+        grid: the network.
+        inputs: what drives it.
+        end: of the step, see `_evaluate`.
+        h: its length, s.
+        carried: receives the derivatives at its beginning.
+        work: with these; the state becomes that of the end, if the step is exact enough.
+
     Returns:
-        Whether it was exact enough; else `state` is as before.
+        Whether it is.
     """
-    past, h = carried.past, inputs.dt / steps
+    past, predicted, rates = carried.past, work.stage, work.rates[-1]
     for i in range(len(past) - 1, 0, -1):
         past[i] = past[i - 1]
-    past[0] = rates[0]
+    past[0] = work.rates[0]
     carried.counts[0] += 1
     if carried.counts[0] < len(past):
         return False
-    predicted[:] = state
+    predicted[:] = work.state
     for i in range(len(past)):
         for q in range(2):
-            for g in range(state.shape[1]):
+            for g in range(predicted.shape[1]):
                 predicted[q, g] += h * BASHFORTH[i] * past[i, q, g]
-    _extrapolate(grid, carried.recent[:, 0], angle)
-    if not _evaluate(grid, inputs, k, (j + 1) / steps, carried, -1, predicted, angle, f, rates[1]):
+    _extrapolate(grid, carried.recent[:, 0], work.angle)
+    if not _evaluate(grid, inputs, end, carried, -1, predicted, work):
         return False
     off = 0.0
     for q in range(2):
-        for g in range(state.shape[1]):
-            change = MOULTON[0] * rates[1, q, g]
+        for g in range(predicted.shape[1]):
+            mean = MOULTON[0] * rates[q, g]
             for i in range(1, len(MOULTON)):
-                change += MOULTON[i] * past[i - 1, q, g]
-            corrected = state[q, g] + h * change
+                mean += MOULTON[i] * past[i - 1, q, g]
+            corrected = work.state[q, g] + h * mean
             off = max(off, abs(corrected - predicted[q, g]))
             predicted[q, g] = corrected
     if not off < ADAMS_TOLERANCE:
         return False
-    state[:] = predicted
+    work.state[:] = predicted
+    carried.ahead[:] = work.angle[grid.algebraic]
     carried.counts[1] += 1
-    carried.ahead[:] = angle[grid.algebraic]
     return True
 
 
@@ -265,165 +250,47 @@ def _extrapolate(grid: CompiledGrid, recent: Array, angle: Array) -> None:
 def _evaluate(
     grid: CompiledGrid,
     inputs: GridInputs,
-    k: int,
-    inside: float,
+    moment: tuple[int, float],
     carried: Carried,
     s: int,
     state: Array,
-    angle: Array,
-    f: Array,
-    rates: Array,
+    work: Work,
 ) -> bool:
-    """Derivatives of angles and frequencies, (2, n_gen) like the state, at a part of the interval after k.
+    """Derivatives of a state, (2, n_gen).
 
     Args:
-        s: the stage; the algebraic angles become its latest. -1: none.
-        angle: guesses of the algebraic ones become answers.
-        f: receives the injections of all buses.
-        rates: receives the derivatives.
+        grid: the network.
+        inputs: what drives it.
+        moment: a point of time, and the part of the interval after it that has gone by.
+        carried: gives the inverse, and receives the algebraic angles as a stage's latest.
+        s: the stage whose derivatives they are; -1: no stage.
+        state: where.
+        work: guesses of algebraic angles become answers; receives injections and derivatives.
 
     Returns:
         Whether the algebraic equations have a solution.
     """
+    (k, inside), angle = moment, work.angle
     n_gen, n_algebraic, after = state.shape[1], len(grid.algebraic), min(k + 1, len(inputs.p_gen) - 1)
-    wanted = np.empty(n_algebraic)
+    recent, wanted = carried.recent[:, max(s, 0)], np.empty(n_algebraic)
     for g in range(n_gen):
         angle[grid.generators[g]] = state[0, g]
     for i in range(n_algebraic):
         wanted[i] = inputs.injection[k, i]
         wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
-    recent = carried.recent[:, max(s, 0)]
-    if not solve_algebraic(grid, wanted, carried.inverse, angle, f):
-        for i in range(n_algebraic):  # a bad guess? from the angles of the step before, then
+    solved = solve_algebraic(grid, wanted, carried.inverse, angle, work.f)
+    if not solved:  # a bad guess? from the angles of the step before, then
+        for i in range(n_algebraic):
             angle[grid.algebraic[i]] = recent[0, i]
-        if not solve_algebraic(grid, wanted, carried.inverse, angle, f):
-            return False
+        solved = solve_algebraic(grid, wanted, carried.inverse, angle, work.f)
+    if not solved:
+        return False
     if s >= 0:
         for i in range(n_algebraic):
             recent[3, i], recent[2, i], recent[1, i] = recent[2, i], recent[1, i], recent[0, i]
             recent[0, i] = angle[grid.algebraic[i]]
     for g in range(n_gen):
         power = inputs.p_gen[k, g] + inside * (inputs.p_gen[after, g] - inputs.p_gen[k, g])
-        force = power - f[grid.generators[g]] - grid.d[g] * state[1, g]
-        rates[0, g], rates[1, g] = state[1, g], force / grid.m[g]
+        force = power - work.f[grid.generators[g]] - grid.d[g] * state[1, g]
+        work.rates[s, 0, g], work.rates[s, 1, g] = state[1, g], force / grid.m[g]
     return True
-
-
-@compiled
-def solve_algebraic(
-    grid: CompiledGrid,
-    wanted: Array,
-    inverse: Array,
-    angle: Array,
-    f: Array,
-    contraction: float = CONTRACTION,
-) -> bool:
-    """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
-
-    The inverse of the Jacobian is renewed where a step makes the mismatch smaller by less than `contraction`.
-
-    Returns:
-        Whether there is a solution; if there is none, angles and f mean nothing.
-    """
-    n = len(wanted)
-    correction = np.empty(n)
-    last = np.inf
-    for _ in range(NEWTON_STEPS):
-        worst = _mismatch(grid, wanted, angle, f)
-        if worst < grid.mismatch:
-            return True
-        if not worst < np.inf:
-            return False
-        if worst > contraction * last:
-            _invert(grid, angle, inverse)
-        last = worst
-        correction[:] = 0.0
-        for i in range(n):  # the inverse is symmetric: row after row is the fastest way through it
-            off, row = f[grid.algebraic[i]] - wanted[i], inverse[i]
-            for j in range(n):
-                correction[j] += off * row[j]
-        for i in range(n):
-            angle[grid.algebraic[i]] -= correction[i]
-    return False
-
-
-@compiled
-def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> bool:
-    """Find the angles of algebraic buses that give wanted injections, one instance after another.
-
-    Newton's method, whose equations are solved anew in every step.
-
-    Args:
-        grid: the network.
-        wanted: injections, (batch, n_algebraic), pu.
-        theta: angles of all buses, (batch, n_bus), rad; guesses of the algebraic ones become answers.
-        f: receives the injections of all buses, (batch, n_bus), pu.
-
-    Returns:
-        Whether there is a solution for all; LinAlgError where a Jacobian is singular.
-    """
-    n = wanted.shape[1]
-    jacobian, off = np.empty((n, n)), np.empty(n)
-    for b in range(len(theta)):
-        solved = False
-        for _ in range(NEWTON_STEPS):
-            worst = _mismatch(grid, wanted[b], theta[b], f[b])
-            solved = worst < grid.mismatch
-            if solved or not worst < np.inf:
-                break
-            set_jacobian(grid, theta[b], jacobian)
-            for i in range(n):
-                off[i] = f[b, grid.algebraic[i]] - wanted[b, i]
-            step = np.linalg.solve(jacobian, off)
-            for i in range(n):
-                theta[b, grid.algebraic[i]] -= step[i]
-        if not solved:
-            return False
-    return True
-
-
-@inlined
-def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> float:
-    """Largest difference of algebraic buses' injections from those wanted, pu; infinite if one is no number.
-
-    f receives the injections of all buses.
-    """
-    f[:] = 0.0
-    for i in range(len(grid.coupling)):
-        near, far = grid.lines[i, 0], grid.lines[i, 1]
-        flow = grid.coupling[i] * np.sin(angle[near] - angle[far])
-        f[near] += flow
-        f[far] -= flow
-    worst = 0.0
-    for i in range(len(wanted)):
-        off = abs(f[grid.algebraic[i]] - wanted[i])
-        if not off < np.inf:  # before max, which passes over what is not a number
-            return np.inf
-        worst = max(worst, off)
-    return worst
-
-
-@compiled
-def _invert(grid: CompiledGrid, angle: Array, inverse: Array) -> None:
-    """Set the inverse of the algebraic buses' Jacobian; LinAlgError if it is singular."""
-    set_jacobian(grid, angle, inverse)
-    inverse[:] = np.linalg.inv(inverse)
-
-
-@compiled
-def set_jacobian(grid: CompiledGrid, angle: Array, jacobian: Array) -> None:
-    """Set ∂f/∂θ of the algebraic buses, (n_algebraic, n_algebraic), pu/rad."""
-    place = np.full(len(angle), -1)
-    for i in range(len(grid.algebraic)):
-        place[grid.algebraic[i]] = i
-    jacobian[:] = 0.0
-    for i in range(len(grid.coupling)):
-        near, far = place[grid.lines[i, 0]], place[grid.lines[i, 1]]
-        slope = grid.coupling[i] * np.cos(angle[grid.lines[i, 0]] - angle[grid.lines[i, 1]])
-        if near >= 0:
-            jacobian[near, near] += slope
-        if far >= 0:
-            jacobian[far, far] += slope
-        if near >= 0 and far >= 0:
-            jacobian[near, far] -= slope
-            jacobian[far, near] -= slope

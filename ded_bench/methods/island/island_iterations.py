@@ -5,8 +5,9 @@ Set-points x at the knots, outputs y = y_0 + Φ (x - x_0) along a simulation of 
     min  price · c · P_m   with   |y| ≤ bound,   limits, ramps and transfers of x
 
 by the alternating direction method of multipliers with over-relaxation (Stellato and others, OSQP, 2020).
-Φ and the penalties are the same for all instances, so that one matrix is inverted once. With no price it
-finds set-points near the given ones that keep the bounds.
+Φ and the penalties are the same for all instances, so that one matrix is inverted once. Swings forget within
+seconds what they were moved by: their rows are those of one knot, moved in time. With no price the iterations
+find set-points near the given ones that keep the bounds.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +26,16 @@ from ded_bench.methods.ramp_follower import track
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.limits import Bounds
 
 Array32 = NDArray[np.float32]
 
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
+#: How long swings remember a knot, s, about.
+MEMORY_S = 16.0
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
 MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
@@ -48,7 +54,6 @@ SETTINGS = ("mean", "swing", "limit", "ramp", "price")
 class IslandProblem:
     """One instance, as iterations see it."""
 
-    instance: Instance
     begun: CoarseStart
     p_initial: Array  # (n_gen,), pu
     cost: Array  # (n_gen,)
@@ -61,9 +66,18 @@ class Found:
     """What a schedule leads to, in coarse steps."""
 
     schedule: Array  # (n_knots, n_gen), pu
-    outputs: Array  # of the bounds, in parts of them, (n_rows,)
+    mean: Array  # mean frequency at the knots after the first, in parts of its bound, (n_intervals,)
+    swings: Array  # in parts of their bound, at the points of an interval, (n_intervals, n_swings)
     cost: float
     excess: float  # over the bounds, as a part of them; negative within
+
+
+class Maps(NamedTuple):
+    """The linear answer to set-points at the knots after the first; n_columns of them, knot after knot."""
+
+    mean: Array32  # mean frequency at the knots, (n_intervals, n_columns)
+    swing: Array32  # swings in an interval by the knots of the last n_memory, (n_memory n_gen, n_swings)
+    back: Array32  # the same, transposed: (n_memory n_swings, n_gen)
 
 
 class IslandGrid:
@@ -73,36 +87,41 @@ class IslandGrid:
         """Linearise; InputError where the plant has no coarse steps that fit."""
         if case.slack is not None or case.plant_name != "detailed":
             raise InputError(f"case {case.id}", "plant", "is no island of detailed machines")
-        self.case, self.bounds, self.plant = case, case.bounds(regime), plant_of(case)
+        self.case, self.plant, bounds = case, plant_of(case), case.bounds(regime)
         self.knots = case.knot_times(horizon_s)
-        between = max(round(float(self.knots[1]) / SPACING_S), 1)
-        self.points = np.linspace(0.0, horizon_s, between * (len(self.knots) - 1) + 1)
+        self.between = max(round(float(self.knots[1]) / SPACING_S), 1)
+        self.points = np.linspace(0.0, horizon_s, self.between * (len(self.knots) - 1) + 1)
         self.coarse = CoarsePlant(self.plant.system, float(self.points[1]))  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
         self.hat = np.maximum(1.0 - np.abs(part), 0.0)
-        n_gen = len(case.generators)
-        inputs = np.einsum("tk,gi->tgki", self.hat[:, 1:], np.eye(n_gen)).reshape(len(self.points), n_gen, -1)
-        omega, delivered = self.coarse.response(inputs)
+        self.step = case.ramp * float(self.knots[1])
         weight = np.full(len(self.points), self.points[1])
         weight[[0, -1]] /= 2.0
         self.weight = weight / horizon_s
+        kinds = np.array(bounds.kinds)
+        rows = np.concatenate([np.flatnonzero(kinds == "mean"), np.flatnonzero(kinds == "relative")])
+        #: The mean frequency and swings in parts of their bounds, by frequencies, (1 + n_relative, n_gen).
+        self.outputs = bounds.matrix[rows] / bounds.limit[rows, None]
+        #: The bound on the mean at the end, as a part of that before.
+        self.last = float(bounds.limit[bounds.at_end].min(initial=bounds.limit[rows[0]]) / bounds.limit[rows[0]])
+        self.maps = self._maps()
+
+    def _maps(self) -> Maps:
+        n, n_gen, each = len(self.knots) - 1, len(self.case.generators), np.eye(len(self.case.generators))
+        inputs = np.einsum("tk,gi->tgki", self.hat[:, 1:], each).reshape(len(self.points), n_gen, -1)
+        omega, delivered = self.coarse.response(inputs)
         #: Mean delivered powers by set-points, (n_gen, n_columns).
         self.delivered = np.einsum("t,tgi->gi", self.weight, delivered)
-        outputs = np.einsum("og,tgi->toi", self.bounds.matrix, omega)
-        self.rows = self._chosen(outputs / self.bounds.limit[:, None])
-        is_mean = np.array([kind != "relative" for kind in self.bounds.kinds])
-        #: Which rows are of the mean frequency.
-        self.is_mean = self._chosen(np.broadcast_to(is_mean, (len(self.points), len(is_mean))))
-        self.room = 1.0 - np.where(self.is_mean, MEAN_MARGIN, SWING_MARGIN)
-        self.step = case.ramp * float(self.knots[1])
-        #: Swings in parts of their bound while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
-        ramps = (self.knots[1:, None, None] * np.eye(n_gen)).reshape(-1, n_gen)
-        self.ramping = (outputs[-1] / self.bounds.limit[:, None])[~is_mean] @ ramps
-
-    def _chosen(self, outputs: Array) -> Array:
-        """Outputs (n_points, n_out, ...) where they are limited, (n_rows, ...)."""
-        always, last = outputs[1:, ~self.bounds.at_end], outputs[-1, self.bounds.at_end]
-        return np.concatenate([always.reshape(-1, *outputs.shape[2:]), last])
+        mean = np.einsum("g,tgi->ti", self.outputs[0], omega[self.between :: self.between])
+        omega, _ = self.coarse.response(self.points[:, None, None] * each, agc=False)
+        #: Swings while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
+        self.ramping = self.outputs[1:] @ omega[-1]
+        memory = min(max(round(MEMORY_S / float(self.knots[1])), 1), n)
+        omega, _ = self.coarse.response(self.hat[:, 1][:, None, None] * each, agc=False)
+        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[1:]).reshape(n_gen, n, -1)[:, :memory]
+        recent = swings[:, ::-1].swapaxes(0, 1).reshape(memory * n_gen, -1)
+        back = swings.reshape(n_gen, -1).T
+        return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in (mean, recent, back)))
 
     def ask(self, instance: Instance) -> IslandProblem:
         """Read an instance.
@@ -123,8 +142,8 @@ class IslandGrid:
         room = np.empty((len(self.knots) - 1, 0))
         if case.transfers:
             room = transfer_room(case, instance, knot_points(self.knots, instance.dt_s)) - TRANSFER_MARGIN
-        begun = self.coarse.begin(instance)
-        return IslandProblem(instance, begun, p_initial, cost, room, self.within(start, p_initial, room))
+        start = self.within(start, p_initial, room)
+        return IslandProblem(self.coarse.begin(instance), p_initial, cost, room, start)
 
     def _merit_order(self, cost: Array, demand: Array, room: Array) -> Array:
         """Cheapest powers, whatever losses they cause; transfers are kept; (n_knots, n_gen)."""
@@ -159,9 +178,11 @@ class IslandGrid:
     def follow(self, asked: IslandProblem, schedule: Array) -> Found:
         """Simulate in coarse steps; SimulationError where the network has no voltages any more."""
         omega, delivered = self.coarse.follow(asked.begun, self.hat @ schedule)
-        outputs = self._chosen(omega @ self.bounds.matrix.T / self.bounds.limit)
-        cost = float(self.weight @ delivered @ asked.cost)
-        return Found(schedule, outputs, cost, float(np.abs(outputs).max()) - 1.0)
+        outputs = omega @ self.outputs.T
+        most = max(float(np.abs(outputs).max()), abs(float(outputs[-1, 0])) / self.last)
+        mean, swings = outputs[self.between :: self.between, 0], outputs[1:, 1:]
+        swings = swings.reshape(len(schedule) - 1, -1)
+        return Found(schedule, mean, swings, float(self.weight @ delivered @ asked.cost), most - 1.0)
 
 
 class IslandIterations:
@@ -170,35 +191,32 @@ class IslandIterations:
     def __init__(self, grid: IslandGrid, settings: Sequence[float] | Array) -> None:
         self.grid = grid
         mean, swing, limit, ramp, self.price = np.exp(np.asarray(settings, dtype=np.float64)).tolist()
-        n_gen, n = len(grid.case.generators), grid.rows.shape[1]
-        #: Roots of penalties: rows and limits are scaled by them.
-        self.by_row = np.sqrt(np.where(grid.is_mean, mean, swing)).astype(np.float32)
-        self.by_limit, self.by_ramp = np.sqrt(limit), (np.sqrt(ramp) / grid.step).astype(np.float32)
-        self.groups = (np.sqrt(limit) * grid.case.transfer_rows[0]).astype(np.float32)
-        rows = grid.rows * self.by_row[:, None]
-        change = np.eye(n) - np.eye(n, k=-n_gen)
-        steps = change * np.tile(self.by_ramp.astype(np.float64), n // n_gen)[:, None]
-        groups = np.kron(np.eye(n // n_gen), self.groups)
-        normal = rows.T @ rows + steps.T @ steps + groups.T @ groups
-        normal += (limit + REGULARISATION) * np.eye(n)
-        inverse = np.linalg.inv(normal)
-        self.rows, self.inverse = rows.astype(np.float32), inverse.astype(np.float32)
+        n_gen, n = len(grid.case.generators), grid.maps.mean.shape[1]
+        n_swings, identity = grid.maps.swing.shape[1], np.eye(n)
+        self.penalties = np.array([mean, swing, limit, ramp, limit], dtype=np.float32)
+        rows = np.zeros((n // n_gen, n_swings, n))
+        for column, one in zip(np.moveaxis(rows, 2, 0), identity, strict=True):
+            column[:] = swings_by(grid.maps, one.reshape(-1, n_gen).astype(np.float32))
+        blocks = [
+            (mean, grid.maps.mean.astype(np.float64)),
+            (swing, rows.reshape(-1, n)),
+            (limit + REGULARISATION, identity),
+            (ramp, (identity - np.eye(n, k=-n_gen)) / np.tile(grid.step, n // n_gen)[:, None]),
+            (limit, np.kron(np.eye(n // n_gen), grid.case.transfer_rows[0])),
+        ]
+        inverse = np.linalg.inv(sum(penalty * rows.T @ rows for penalty, rows in blocks))
+        self.inverse = inverse.astype(np.float32)
         #: Set-points by the costs of machines.
         self.pull = (inverse @ grid.delivered.T).astype(np.float32)
 
     def __call__(
-        self,
-        asked: IslandProblem,
-        near: Found,
-        iterations: int,
-        priced: bool,
-        dual: list[Array32] | None = None,
-    ) -> tuple[Array, list[Array32]]:
-        """Iterate from what was simulated.
+        self, asked: IslandProblem, near: Found, iterations: int, priced: bool, dual: Array32 | None = None
+    ) -> tuple[Array, Array32]:
+        """Iterate from a schedule.
 
         Args:
             asked: the instance.
-            near: a schedule and its outputs.
+            near: a schedule and what it leads to.
             iterations: how many.
             priced: whether costs count.
             dual: to go on from; None: zero.
@@ -206,46 +224,121 @@ class IslandIterations:
         Returns:
             Set-points, (n_knots, n_gen), pu, and the dual variables.
         """
-        grid, (n_knots, n_gen) = self.grid, near.schedule.shape
-        x0 = near.schedule[1:].astype(np.float32)
-        by_row, by_limit, by_ramp = self.by_row, np.float32(self.by_limit), self.by_ramp
-        first = asked.p_initial.astype(np.float32)
+        grid, case = self.grid, self.grid.case
+        n, n_gen = len(grid.knots) - 1, len(case.generators)
         spread = max(float(np.ptp(asked.cost)), 1e-9)
         pull = self.pull @ (asked.cost * (self.price / spread if priced else 0.0)).astype(np.float32)
-        free = (near.outputs * by_row).astype(np.float32) - self.rows @ x0.ravel()
-        # Outputs, set-points, their changes, transfers: stacked, each with its scale.
-        room = (grid.room * by_row).astype(np.float32)
-        ramp = np.float32(1.0 - RAMP_MARGIN) * by_ramp * grid.step
-        start = first * by_ramp
-        low = [-room - free, by_limit * grid.case.p_min, -ramp, -np.inf]
-        high = [room - free, by_limit * grid.case.p_max, ramp, by_limit * asked.room]
-        low, high = ([np.asarray(part, dtype=np.float32) for part in side] for side in (low, high))
-
-        def images(x: Array32) -> list[Array32]:
-            change = x * by_ramp
-            change[1:] -= x[:-1] * by_ramp
-            change[0] -= start
-            return [self.rows @ x.ravel(), by_limit * x, change, x @ self.groups.T]
-
-        at = images(x0)
-        dual = [np.zeros_like(a) for a in at] if dual is None else list(dual)
-        z = []
-        for i, a in enumerate(at):
-            z.append(np.clip(a + dual[i], low[i], high[i]))
-            dual[i] = dual[i] + a - z[i]
-        x = x0
-        for _ in range(iterations):
-            y, u, r, t = (b - d for b, d in zip(z, dual, strict=True))
-            r[0] += start
-            right = by_limit * u + r * by_ramp + t @ self.groups
-            right[:-1] -= r[1:] * by_ramp
-            x = (self.inverse @ (y @ self.rows + right.ravel()) - pull).reshape(n_knots - 1, n_gen)
-            for i, a in enumerate(images(x)):
-                ahead = RELAXATION * a + (1.0 - RELAXATION) * z[i] + dual[i]
-                z[i] = np.clip(ahead, low[i], high[i])
-                dual[i] = ahead - z[i]
-        found = np.concatenate([near.schedule[:1], x.astype(np.float64)])
+        mean = np.full(n, 1.0 - MEAN_MARGIN)
+        mean[-1] *= grid.last
+        by_transfer = case.transfer_rows[0].astype(np.float32)
+        step, ones = grid.step.astype(np.float32), np.ones((n, n_gen))
+        offset = [
+            near.mean,
+            near.swings,
+            near.schedule[1:],
+            np.diff(near.schedule, axis=0) / grid.step,
+            near.schedule[1:] @ by_transfer.T,
+        ]
+        swing = np.full_like(near.swings, 1.0 - SWING_MARGIN)
+        ramp = (1.0 - RAMP_MARGIN) * ones
+        low = [-mean, -swing, case.p_min * ones, -ramp, np.full_like(asked.room, -np.inf)]
+        high = [mean, swing, case.p_max * ones, ramp, asked.room]
+        flat = (np.concatenate([p.ravel() for p in part]).astype(np.float32) for part in (offset, low, high))
+        offset32, low32, high32 = flat
+        dual = np.zeros_like(offset32) if dual is None else dual.copy()
+        change = np.zeros((n, n_gen), dtype=np.float32)
+        given = Given(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
+        iterate(grid.maps, given, change, dual, iterations)
+        found = near.schedule.copy()
+        found[1:] += change
         return grid.within(found, asked.p_initial, asked.room), dual
+
+
+class Given(NamedTuple):
+    """What iterations are given. Rows: mean at knots, swings, set-points, ramps in parts, transfers."""
+
+    inverse: Array32  # (n_columns, n_columns)
+    pull: Array32  # of costs, (n_columns,), pu
+    penalties: Array32  # of the five kinds of rows
+    by_transfer: Array32  # (n_transfers, n_gen)
+    step: Array32  # largest changes between knots, (n_gen,), pu
+    offset: Array32  # rows at the given schedule, (n_rows,)
+    low: Array32
+    high: Array32
+
+
+@compiled
+def swings_by(maps: Maps, change: Array32) -> Array32:
+    """Swings by changes of set-points (n, n_gen), (n, n_swings)."""
+    n, n_gen = change.shape
+    memory = len(maps.swing) // n_gen
+    recent = np.zeros((n, memory, n_gen), dtype=np.float32)
+    for k in range(n):
+        for lag in range(min(memory, k + 1)):
+            recent[k, memory - 1 - lag] = change[k - lag]
+    return np.dot(recent.reshape(n, memory * n_gen), maps.swing)
+
+
+@compiled
+def rows_by(maps: Maps, given: Given, change: Array32) -> Array32:
+    """All rows by changes of set-points, (n_rows,)."""
+    n, n_gen = change.shape
+    rows = np.empty_like(given.offset)
+    rows[:n] = np.dot(maps.mean, change.ravel())
+    at = n + n * maps.swing.shape[1]
+    rows[n:at] = swings_by(maps, change).ravel()
+    rows[at : at + change.size] = change.ravel()
+    at += change.size
+    for g in range(n_gen):
+        rows[at + g] = change[0, g] / given.step[g]
+        for k in range(1, n):
+            rows[at + k * n_gen + g] = (change[k, g] - change[k - 1, g]) / given.step[g]
+    rows[at + change.size :] = np.dot(change, given.by_transfer.T).ravel()
+    return rows
+
+
+@compiled
+def changes_by(maps: Maps, given: Given, rows: Array32, shape: tuple[int, int]) -> Array32:
+    """The transpose of `rows_by`, each kind of rows times its penalty, (n_columns,)."""
+    (n, n_gen), n_swings = shape, maps.swing.shape[1]
+    found = given.penalties[0] * np.dot(rows[:n], maps.mean)
+    at, memory = n + n * n_swings, len(maps.swing) // n_gen
+    swings = rows[n:at].reshape(n, n_swings)
+    ahead = np.zeros((n, memory, n_swings), dtype=np.float32)
+    for k in range(n):
+        for lag in range(min(memory, n - k)):
+            ahead[k, lag] = swings[k + lag]
+    found += given.penalties[1] * np.dot(ahead.reshape(n, memory * n_swings), maps.back).ravel()
+    found += given.penalties[2] * rows[at : at + n * n_gen]
+    at += n * n_gen
+    for g in range(n_gen):
+        for k in range(n):
+            ramp = rows[at + k * n_gen + g]
+            if k + 1 < n:
+                ramp -= rows[at + (k + 1) * n_gen + g]
+            found[k * n_gen + g] += given.penalties[3] * ramp / given.step[g]
+    transfers = rows[at + n * n_gen :].reshape(n, len(given.by_transfer))
+    found += given.penalties[4] * np.dot(transfers, given.by_transfer).ravel()
+    return found
+
+
+@compiled
+def iterate(maps: Maps, given: Given, change: Array32, dual: Array32, count: int) -> None:
+    """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed."""
+    relaxed = np.float32(RELAXATION)
+    kept = np.empty_like(dual)
+    for i in range(len(dual)):
+        ahead = given.offset[i] + dual[i]
+        kept[i] = min(max(ahead, given.low[i]), given.high[i])
+        dual[i] = ahead - kept[i]
+    for _ in range(count):
+        wanted = changes_by(maps, given, kept - dual - given.offset, change.shape)
+        change[:] = (np.dot(given.inverse, wanted) - given.pull).reshape(change.shape)
+        rows = rows_by(maps, given, change)
+        for i in range(len(dual)):
+            ahead = relaxed * (rows[i] + given.offset[i]) + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
+            kept[i] = min(max(ahead, given.low[i]), given.high[i])
+            dual[i] = ahead - kept[i]
 
 
 @functools.lru_cache(maxsize=8)

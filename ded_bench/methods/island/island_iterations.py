@@ -35,7 +35,7 @@ Array32 = NDArray[np.float32]
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
 #: How long swings remember a knot, s, about.
-MEMORY_S = 16.0
+MEMORY_S = 10.0
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
 MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.

@@ -27,7 +27,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Simulations after which costs count, and after which bounds are mended, at most.
-PRICED, MENDED = 3, 4
+PRICED, MENDED = 2, 1
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.

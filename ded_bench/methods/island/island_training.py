@@ -24,11 +24,11 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Iterations of each round with costs, and of each mending.
-ITERATIONS, MENDING = 12, 12
+ITERATIONS, MENDING = 16, 12
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.
-FIRST = np.log([0.3, 0.3, 1.0, 0.3, 20.0])
+FIRST = np.log([0.3, 0.2, 2.0, 0.2, 24.0])
 SIGMA = 0.7
 #: Most instances that are held out.
 HELD_OUT = 40

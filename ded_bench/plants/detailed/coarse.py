@@ -71,6 +71,7 @@ class CoarseMaps(NamedTuple):
     x: Array  # nominal states, (N_STATES, n_machine)
     v: Array  # nominal voltages, (2 n_port,), pu
     drawn: Array  # nominal loads, (n_load,), pu
+    load: LoadSlopes  # at nominal voltages
     p_ref: Array  # nominal references of governors, (n_machine,), pu
     held: Array  # answer to what secondary control holds, (n,)
     gain: float  # of secondary control, pu/rad
@@ -83,6 +84,7 @@ class CoarseStart(NamedTuple):
     x: Array  # states at t = 0, (N_STATES, n_machine)
     v_ref: Array  # exciters' references, (n_machine,), pu
     drawn: Array  # loads at the points, (n_steps + 1, n_load), pu
+    by_drawn: Array  # linear answer of rates to them, (n_steps + 1, n_seen)
     push: Array  # linear answer to loads, and to governors' offsets, over each step, (n_steps, n)
     held: float  # what secondary control holds at t = 0, pu
     first: int  # step at which it acts next
@@ -148,6 +150,8 @@ class CoarsePlant:
         seen = np.flatnonzero(np.abs(by_load).max(axis=1) > 0.0)
         curved = np.flatnonzero(np.isin(system.moving // len(system.data), CURVED))
         x, v, drawn, p_ref, _ = self._nominal
+        load = LoadSlopes(np.empty((len(drawn), 4)), np.empty((len(v), len(v))))
+        renew(system.compiled_network, drawn, v, load)
         agc, period, gain = self.system.case.agc, 2**40, 0.0
         if agc is not None:
             period, gain = round(agc.period_s / self.spacing_s), agc.k
@@ -161,7 +165,7 @@ class CoarsePlant:
             np.ascontiguousarray(np.hstack([f, first[:, seen]])),
             np.ascontiguousarray(a[np.ix_(seen, curved)]),
             np.ascontiguousarray(by_load[seen]),
-            *(x, v, drawn, p_ref),
+            *(x, v, drawn, load, p_ref),
             first @ by_reference @ self.system.shares,
             gain,
             period,
@@ -201,7 +205,9 @@ class CoarsePlant:
         push = windows.swapaxes(1, 2).reshape(n, -1) @ self._load_answer
         push += self._inputs[0] @ (state.offset - maps.p_ref)
         first = round(state.next_s / self.spacing_s) if system.case.agc is not None else maps.period
-        return CoarseStart(state.x, state.v_ref, drawn[::PARTS].copy(), push, state.held, first)
+        at_points = drawn[::PARTS].copy()
+        by_drawn = (at_points - maps.drawn) @ maps.by_load.T
+        return CoarseStart(state.x, state.v_ref, at_points, by_drawn, push, state.held, first)
 
     def follow(self, begun: CoarseStart, p_set: Array) -> tuple[Array, Array]:
         """Frequencies and delivered powers at the points, (n_points, n_gen), rad/s and pu.
@@ -269,10 +275,9 @@ def advance(
     state, rates, p_e = begun.x.copy(), np.zeros_like(begun.x), np.empty(n_machine)
     flat, changing, nominal = state.ravel(), rates.ravel(), maps.x.ravel()
     source, v = np.empty(len(maps.v)), maps.v.copy()
-    load = LoadSlopes(np.empty((len(maps.drawn), 4)), np.empty((len(v), len(v))))
-    renew(network, maps.drawn, v, load)
+    last = v.copy()
     both, bent, held = np.zeros(n + n_seen), np.empty(len(maps.curved)), begun.held
-    before, beyond = np.zeros(n_seen), np.empty(n_seen)
+    before, linear, after = np.zeros(n_seen), np.empty(n_seen), np.empty(n)
     for i in range(n):
         both[i] = flat[maps.moving[i]] - nominal[maps.moving[i]]
         flat[maps.moving[i]] = nominal[maps.moving[i]]
@@ -289,13 +294,17 @@ def advance(
         if k >= begun.first and (k - begun.first) % maps.period == 0:
             held = -maps.gain * mean_angle(data, state)
         sources(data, state, source)
-        if solve_voltages(network, begun.drawn[k], source, load, v, STEPS) > STEPS:
+        for i in range(2 * len(maps.drawn)):
+            last[i], v[i] = v[i], 2.0 * v[i] - last[i] if k > 1 else v[i]
+        if solve_voltages(network, begun.drawn[k], source, maps.load, v, STEPS) > STEPS:
             return k
         machine_rates(data, state, v, maps.p_ref, begun.v_ref, rates, p_e)
-        beyond[:] = np.dot(maps.slopes, bent) + np.dot(maps.by_load, begun.drawn[k] - maps.drawn)
+        np.dot(maps.slopes, bent, linear)
         for i in range(n_seen):
-            new = changing[maps.moving[maps.seen[i]]] - beyond[i]
+            new = changing[maps.moving[maps.seen[i]]] - linear[i] - begun.by_drawn[k, i]
             both[n + i] = 1.5 * new - 0.5 * before[i] if k else new
             before[i] = new
-        both[:n] = np.dot(maps.onward, both) + push[k] + held * maps.held
+        np.dot(maps.onward, both, after)
+        for i in range(n):
+            both[i] = after[i] + push[k, i] + held * maps.held[i]
     return len(states)

@@ -34,8 +34,8 @@ Array32 = NDArray[np.float32]
 
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
-#: How long swings remember a knot, s, about.
-MEMORY_S = 10.0
+#: Part of what a knot does to swings that iterations leave out, once it is long ago.
+FORGOTTEN = 0.02
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
 MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
@@ -116,9 +116,11 @@ class IslandGrid:
         omega, _ = self.coarse.response(self.points[:, None, None] * each, agc=False)
         #: Swings while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
         self.ramping = self.outputs[1:] @ omega[-1]
-        memory = min(max(round(MEMORY_S / float(self.knots[1])), 1), n)
         omega, _ = self.coarse.response(self.hat[:, 1][:, None, None] * each, agc=False)
-        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[1:]).reshape(n_gen, n, -1)[:, :memory]
+        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[1:]).reshape(n_gen, n, -1)
+        size = np.linalg.norm(swings, axis=(0, 2)) ** 2
+        memory = int(np.count_nonzero(np.cumsum(size[::-1])[::-1] > FORGOTTEN**2 * size.sum()))
+        swings = swings[:, :memory]
         recent = swings[:, ::-1].swapaxes(0, 1).reshape(memory * n_gen, -1)
         back = swings.reshape(n_gen, -1).T
         return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in (mean, recent, back)))

@@ -26,7 +26,7 @@ HORIZON = 8.0
 
 
 def policy(case: Case, settings: Any = FIRST, regime: str = "TO") -> IslandPolicy:
-    facts = {"iterations": 15, "mending": 6}
+    facts = {"rounds": 2, "iterations": 15, "mending": 6}
     return IslandPolicy(Scope(case, regime, HORIZON), {"settings": np.float32(settings)}, facts)
 
 

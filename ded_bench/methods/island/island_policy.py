@@ -26,8 +26,6 @@ from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
-#: Simulations after which costs count, and after which bounds are mended, at most.
-PRICED, MENDED = 2, 1
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.
@@ -35,7 +33,7 @@ NEAR = 0.04
 
 
 class IslandPolicy(TrainedPolicy):
-    """Learned settings; `training` has the iterations with costs, and those of each mending."""
+    """Learned settings; `training` has the rounds and iterations with costs, and those of mending."""
 
     method = "ded-admm"
 
@@ -75,13 +73,11 @@ class IslandPolicy(TrainedPolicy):
         """The start, if nothing better can be simulated."""
         answer, dual = start, None
         try:
-            for _ in range(PRICED):
+            for _ in range(self.training["rounds"]):
                 found = self.grid.follow(asked, answer)
                 answer, dual = self.iterate(asked, found, count, True, dual)
-            for _ in range(MENDED):
-                found = self.grid.follow(asked, answer)
-                if found.excess <= -NEAR:
-                    break
+            found = self.grid.follow(asked, answer)
+            if found.excess > -NEAR:
                 answer, _ = mending_of(self.grid)(asked, found, self.training["mending"], False)
         except SimulationError:
             pass
@@ -90,7 +86,7 @@ class IslandPolicy(TrainedPolicy):
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
-        for name in ("iterations", "mending"):
+        for name in ("rounds", "iterations", "mending"):
             count = training.get(name)
             if not (isinstance(count, int) and 0 < count < 1000):
                 raise ValueError(f"number of {name} is missing or mistyped")

@@ -10,7 +10,15 @@ import pytest
 from scipy.optimize import linprog
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.island.island_iterations import IslandGrid, IslandIterations
+from ded_bench.methods.island.island_iterations import (
+    FORGOTTEN,
+    MEAN_MARGIN,
+    RAMP_MARGIN,
+    SWING_MARGIN,
+    IslandGrid,
+    IslandIterations,
+    swings_by,
+)
 from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.island.island_training import FIRST, train
 from ded_bench.methods.registry import get_method
@@ -36,23 +44,40 @@ def test_many_iterations_solve_the_linear_program(island: Case, instance: Instan
     asked = grid.ask(instance)
     near = grid.follow(asked, asked.start)
     found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))(asked, near, 1500, True)
-    n, n_gen = grid.rows.shape[1], len(island.generators)
-    x0 = near.schedule[1:].ravel()
+    n, n_gen = grid.maps.mean.shape[1], len(island.generators)
+    swings = [swings_by(grid.maps, np.float32(one).reshape(-1, n_gen)).ravel() for one in np.eye(n)]
+    rows = np.vstack([grid.maps.mean, np.transpose(swings)])
+    room = np.repeat([1.0 - MEAN_MARGIN, 1.0 - SWING_MARGIN], [len(near.mean), near.swings.size])
+    room[len(near.mean) - 1] *= grid.last
+    x0, at = near.schedule[1:].ravel(), np.concatenate([near.mean, near.swings.ravel()])
     change = np.eye(n) - np.eye(n, k=-n_gen)
-    reach = 0.98 * np.tile(grid.step, n // n_gen)
+    reach = (1.0 - RAMP_MARGIN) * np.tile(grid.step, n // n_gen)
     first = np.concatenate([asked.p_initial, np.zeros(n - n_gen)])
-    free = near.outputs - grid.rows @ x0
-    rows = np.vstack([grid.rows, -grid.rows, change, -change])
-    most = np.concatenate([grid.room - free, grid.room + free, reach + first, reach - first])
+    free = at - rows @ x0
+    most = np.concatenate([room - free, room + free, reach + first, reach - first])
     cost = asked.cost @ grid.delivered
     limits = list(zip(np.tile(island.p_min, n // n_gen), np.tile(island.p_max, n // n_gen), strict=True))
-    best = linprog(cost, A_ub=rows, b_ub=most, bounds=limits)
+    best = linprog(cost, A_ub=np.vstack([rows, -rows, change, -change]), b_ub=most, bounds=limits)
     assert best.status == 0
     gain = cost @ x0 - best.fun
     assert gain > 0.0
     assert abs(cost @ found[1:].ravel() - best.fun) < 0.02 * gain
-    outputs = near.outputs + grid.rows @ (found[1:].ravel() - x0)
-    assert (np.abs(outputs) < grid.room + 0.01).all()
+    outputs = at + rows @ (found[1:].ravel() - x0)
+    assert (np.abs(outputs) < room + 0.01).all()
+
+
+def test_rows_are_the_linear_answer(island: Case) -> None:
+    """Those of the coarse plant; swings are forgotten once 2 % of them remain."""
+    grid = IslandGrid(island, "TO", HORIZON)
+    change = np.zeros((len(grid.knots), len(island.generators)))
+    change[1:4, 0], change[2, 1] = (0.02, 0.03, 0.01), -0.04
+    omega, _ = grid.coarse.response((grid.hat @ change)[:, :, None], agc=False)
+    swings = omega[1:, :, 0] @ grid.outputs[1:].T
+    found = swings_by(grid.maps, np.float32(change[1:])).reshape(swings.shape)
+    assert np.abs(found - swings).max() < 2.0 * FORGOTTEN * np.abs(swings).max()
+    omega, _ = grid.coarse.response((grid.hat @ change)[:, :, None])
+    mean = (omega[:, :, 0] @ grid.outputs[0])[grid.between :: grid.between]
+    np.testing.assert_allclose(grid.maps.mean @ np.float32(change[1:].ravel()), mean, atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(2))

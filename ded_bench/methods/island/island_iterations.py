@@ -28,7 +28,6 @@ from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.limits import Bounds
 
 Array32 = NDArray[np.float32]
 
@@ -103,7 +102,9 @@ class IslandGrid:
         #: The mean frequency and swings in parts of their bounds, by frequencies, (1 + n_relative, n_gen).
         self.outputs = bounds.matrix[rows] / bounds.limit[rows, None]
         #: The bound on the mean at the end, as a part of that before.
-        self.last = float(bounds.limit[bounds.at_end].min(initial=bounds.limit[rows[0]]) / bounds.limit[rows[0]])
+        self.last = float(
+            bounds.limit[bounds.at_end].min(initial=bounds.limit[rows[0]]) / bounds.limit[rows[0]]
+        )
         self.maps = self._maps()
 
     def _maps(self) -> Maps:
@@ -278,7 +279,8 @@ def swings_by(maps: Maps, change: Array32) -> Array32:
     for k in range(n):
         for lag in range(min(memory, k + 1)):
             recent[k, memory - 1 - lag] = change[k - lag]
-    return np.dot(recent.reshape(n, memory * n_gen), maps.swing)
+    swings: Array32 = np.dot(recent.reshape(n, memory * n_gen), maps.swing)
+    return swings
 
 
 @compiled
@@ -303,7 +305,7 @@ def rows_by(maps: Maps, given: Given, change: Array32) -> Array32:
 def changes_by(maps: Maps, given: Given, rows: Array32, shape: tuple[int, int]) -> Array32:
     """The transpose of `rows_by`, each kind of rows times its penalty, (n_columns,)."""
     (n, n_gen), n_swings = shape, maps.swing.shape[1]
-    found = given.penalties[0] * np.dot(rows[:n], maps.mean)
+    found: Array32 = given.penalties[0] * np.dot(rows[:n], maps.mean)
     at, memory = n + n * n_swings, len(maps.swing) // n_gen
     swings = rows[n:at].reshape(n, n_swings)
     ahead = np.zeros((n, memory, n_swings), dtype=np.float32)

@@ -5,9 +5,9 @@ r the exact linear answer to set-points and loads over a step h,
 
     x⁺ = exp(A h) x + h φ_1 (3 N - N⁻) / 2 + r,
 
-N⁻ being that of the step before (Adams-Bashforth with the exponential of what is linear; Hochbruck and
-Ostermann, Acta Numerica 2010, have others of order 2). N is small and changes slowly, so that a step may be a hundred times that of an exact
-simulation. For planning, never for judging.
+N⁻ being that of the step before (Adams-Bashforth behind the exponential of what is linear; Hochbruck and
+Ostermann, Acta Numerica 2010, have others of order 2). N is small and changes slowly, so that a step may be
+a hundred times that of an exact simulation. For planning, never for judging.
 """
 
 from __future__ import annotations

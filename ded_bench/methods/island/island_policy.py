@@ -28,8 +28,10 @@ from ded_bench.problem.instance import Instance
 
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
-#: What is as near a bound as this part of it is mended.
-NEAR = 0.04
+#: What is as near a bound as the first part of it is mended; beyond it by the second, more than once.
+NEAR, FAR = 0.04, 0.5
+#: How often, at most.
+MENDED = 3
 
 
 class IslandPolicy(TrainedPolicy):
@@ -76,9 +78,12 @@ class IslandPolicy(TrainedPolicy):
             for _ in range(self.training["rounds"]):
                 found = self.grid.follow(asked, answer)
                 answer, dual = self.iterate(asked, found, count, True, dual)
-            found = self.grid.follow(asked, answer)
-            if found.excess > -NEAR:
-                answer, _ = mending_of(self.grid)(asked, found, self.training["mending"], False)
+            for _ in range(MENDED):
+                found = self.grid.follow(asked, answer)
+                if found.excess > -NEAR:
+                    answer, _ = mending_of(self.grid)(asked, found, self.training["mending"], False)
+                if found.excess < FAR:
+                    break
         except SimulationError:
             pass
         return answer

@@ -214,7 +214,7 @@ class IslandIterations:
 
     def __call__(
         self, asked: IslandProblem, near: Found, iterations: int, priced: bool, dual: Array32 | None = None
-    ) -> tuple[Array, Array32]:
+    ) -> tuple[Array, Array32, float]:
         """Iterate from a schedule.
 
         Args:
@@ -225,7 +225,8 @@ class IslandIterations:
             dual: to go on from; None: zero.
 
         Returns:
-            Set-points, (n_knots, n_gen), pu, and the dual variables.
+            Set-points, (n_knots, n_gen), pu; the dual variables; by what part of its bound an output is
+            beyond it and its margin, by the linear answer.
         """
         grid, case = self.grid, self.grid.case
         n, n_gen = len(grid.knots) - 1, len(case.generators)
@@ -250,14 +251,14 @@ class IslandIterations:
         offset32, low32, high32 = flat
         dual = np.zeros_like(offset32) if dual is None else dual.copy()
         change = np.zeros((n, n_gen), dtype=np.float32)
-        given = Given(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
-        iterate(grid.maps, given, change, dual, iterations)
+        given = Iterated(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
+        left = iterate(grid.maps, given, change, dual, iterations)
         found = near.schedule.copy()
         found[1:] += change
-        return grid.within(found, asked.p_initial, asked.room), dual
+        return grid.within(found, asked.p_initial, asked.room), dual, left
 
 
-class Given(NamedTuple):
+class Iterated(NamedTuple):
     """What iterations are given. Rows: mean at knots, swings, set-points, ramps in parts, transfers."""
 
     inverse: Array32  # (n_columns, n_columns)
@@ -284,7 +285,7 @@ def swings_by(maps: Maps, change: Array32) -> Array32:
 
 
 @compiled
-def rows_by(maps: Maps, given: Given, change: Array32) -> Array32:
+def rows_by(maps: Maps, given: Iterated, change: Array32) -> Array32:
     """All rows by changes of set-points, (n_rows,)."""
     n, n_gen = change.shape
     rows = np.empty_like(given.offset)
@@ -302,7 +303,7 @@ def rows_by(maps: Maps, given: Given, change: Array32) -> Array32:
 
 
 @compiled
-def changes_by(maps: Maps, given: Given, rows: Array32, shape: tuple[int, int]) -> Array32:
+def changes_by(maps: Maps, given: Iterated, rows: Array32, shape: tuple[int, int]) -> Array32:
     """The transpose of `rows_by`, each kind of rows times its penalty, (n_columns,)."""
     (n, n_gen), n_swings = shape, maps.swing.shape[1]
     found: Array32 = given.penalties[0] * np.dot(rows[:n], maps.mean)
@@ -327,22 +328,31 @@ def changes_by(maps: Maps, given: Given, rows: Array32, shape: tuple[int, int]) 
 
 
 @compiled
-def iterate(maps: Maps, given: Given, change: Array32, dual: Array32, count: int) -> None:
-    """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed."""
+def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: int) -> float:
+    """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed.
+
+    Returns:
+        By how much outputs are outside of their limits at the end, at most.
+    """
     relaxed = np.float32(RELAXATION)
     kept = np.empty_like(dual)
     for i in range(len(dual)):
         ahead = given.offset[i] + dual[i]
         kept[i] = min(max(ahead, given.low[i]), given.high[i])
         dual[i] = ahead - kept[i]
+    left = 0.0
     for _ in range(count):
+        left = 0.0
         wanted = changes_by(maps, given, kept - dual - given.offset, change.shape)
         change[:] = (np.dot(given.inverse, wanted) - given.pull).reshape(change.shape)
-        rows = rows_by(maps, given, change)
+        rows = rows_by(maps, given, change) + given.offset
+        for i in range(len(change) * (1 + maps.swing.shape[1])):
+            left = max(left, rows[i] - given.high[i], given.low[i] - rows[i])
         for i in range(len(dual)):
-            ahead = relaxed * (rows[i] + given.offset[i]) + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
+            ahead = relaxed * rows[i] + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
             kept[i] = min(max(ahead, given.low[i]), given.high[i])
             dual[i] = ahead - kept[i]
+    return left
 
 
 @functools.lru_cache(maxsize=8)

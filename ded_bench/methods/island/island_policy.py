@@ -28,8 +28,10 @@ from ded_bench.problem.instance import Instance
 
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
-#: What is as near a bound as the first part of it is mended; beyond it by the second, more than once.
-NEAR, FAR = 0.04, 0.5
+#: What is as near a bound as this part of it is mended.
+NEAR = 0.04
+#: Part of a bound by which mending may miss what it aims at, or it is simulated and mended again.
+LEFT = 0.03
 #: How often, at most.
 MENDED = 3
 
@@ -72,21 +74,24 @@ class IslandPolicy(TrainedPolicy):
         return answer
 
     def _improved(self, asked: IslandProblem, start: Array, count: int) -> Array:
-        """The start, if nothing better can be simulated."""
-        answer, dual = start, None
+        """Of what is simulated, that with the least excess, if mending does not end well."""
+        answer, dual, seen = start, None, []
         try:
             for _ in range(self.training["rounds"]):
-                found = self.grid.follow(asked, answer)
-                answer, dual = self.iterate(asked, found, count, True, dual)
+                seen.append(self.grid.follow(asked, answer))
+                answer, dual, _ = self.iterate(asked, seen[-1], count, True, dual)
             for _ in range(MENDED):
-                found = self.grid.follow(asked, answer)
-                if found.excess > -NEAR:
-                    answer, _ = mending_of(self.grid)(asked, found, self.training["mending"], False)
-                if found.excess < FAR:
-                    break
+                seen.append(self.grid.follow(asked, answer))
+                if seen[-1].excess <= -NEAR:
+                    return answer
+                mending = mending_of(self.grid)(asked, seen[-1], self.training["mending"], False)
+                answer, _, left = mending
+                if left < LEFT:
+                    return answer
         except SimulationError:
-            pass
-        return answer
+            if not seen:
+                return start
+        return min(seen, key=lambda found: found.excess).schedule
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

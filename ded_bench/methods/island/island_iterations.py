@@ -254,7 +254,7 @@ class IslandIterations:
         given = Iterated(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
         left = iterate(grid.maps, given, change, dual, iterations)
         found = near.schedule.copy()
-        found[1:] += change
+        found[1:] = (found[1:] + change).astype(np.float32)  # half the size in archives
         return grid.within(found, asked.p_initial, asked.room), dual, left
 
 

@@ -24,14 +24,14 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Iterations of each round with costs, and of mending.
-ITERATIONS, MENDING = 24, 8
+ITERATIONS, MENDING = 28, 16
 #: What a second round must gain, as a part of cost: each costs a simulation.
 WORTH = 1e-3
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.
-FIRST = np.log([0.3, 0.2, 2.0, 0.2, 24.0])
-SIGMA = 0.7
+FIRST = np.log([0.2, 0.25, 2.5, 0.2, 20.0])
+SIGMA = 0.4
 #: Most instances that are held out.
 HELD_OUT = 40
 #: Cost, as a part of it, of what is beyond a bound by the whole of it; the most that counts for one instance.

@@ -26,7 +26,7 @@ from ded_bench.problem.instance import Instance
 #: Iterations of each round with costs, and of mending.
 ITERATIONS, MENDING = 28, 16
 #: What a second round must gain, as a part of cost: each costs a simulation.
-WORTH = 1e-3
+WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.

@@ -18,7 +18,6 @@ from pathlib import Path
 import pandas as pd
 
 from ded_bench import Case, Settings
-from ded_bench.problem.benchmark import scenario_folder
 from ded_bench.problem.case import SHIPPED_CASES
 from ded_bench.problem.scenario import Forecast, Scenario, ScenarioRamp, forecast, load_scenarios
 from ded_bench.results.folder import search_folders
@@ -74,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("announcements.csv"), help="(default: %(default)s)")
     asked = parser.parse_args(arguments)
     case = Case.load("9bus")
-    files = asked.scenario or sorted(scenario_folder(SHIPPED_CASES / case.id).glob(f"{case.id}-s*.json"))
+    files = asked.scenario or sorted((SHIPPED_CASES / case.id / "scenarios").glob(f"{case.id}-s*.json"))
     rows = []
     for scenario in load_scenarios(files, case):
         loop.forecast = forecast

@@ -72,7 +72,11 @@ def main() -> None:
     """Print a table for each results folder."""
     for folder in map(Path, sys.argv[1:]):
         grid = read_grid(folder)
-        seconds = trainings(grid.results.paths.policies).set_index("name")["seconds"].dropna()
+        seconds = (
+            trainings(sorted(grid.results.paths.policies.glob("*.safetensors")))
+            .set_index("name")["seconds"]
+            .dropna()
+        )
         cost = {str(name): float(value) for name, value in seconds.items()}
         print(f"\n{grid.case.id}\n{break_even(grid.judged, grid.timing, cost).to_string(index=False)}")
 

@@ -14,6 +14,7 @@ from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import LosslessCase
+from ded_bench.problem.quantities import largest_divisor
 from ded_bench.problem.sampling import VALIDATION_SEED, drawn_with_redraws
 
 #: Longest distance of knots, in periods of the fastest mode.
@@ -109,8 +110,7 @@ def suggested_knots(case: Case, fastest_hz: float) -> int:
     1.2 s 0.2 %.
     """
     steps = round(case.sampling.horizon_s / case.sampling.dt_s)
-    most = max(int(KNOT_PERIODS / (fastest_hz * case.sampling.dt_s) + 1e-9), 1)
-    return 1 + next(steps // apart for apart in range(min(most, steps), 0, -1) if steps % apart == 0)
+    return 1 + steps // largest_divisor(steps, min(KNOT_PERIODS / (fastest_hz * case.sampling.dt_s), steps))
 
 
 def _static(case: Case, instance: Instance) -> Array | None:

@@ -22,7 +22,7 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import PLANTS
-from ded_bench.problem.benchmark import problem_folder, scenario_files, scenario_folder
+from ded_bench.problem.benchmark import problem_folder, scenario_files
 from ded_bench.problem.case import Case
 from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders
@@ -73,7 +73,7 @@ def _online(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
-    files = a.scenario or scenario_files(scenario_folder(problem_folder(a.case, case)), a.scenarios)
+    files = a.scenario or scenario_files(problem_folder(a.case, case) / "scenarios", a.scenarios)
     scenarios = load_scenarios(files, case)
     if "timing" in a.latency and not _timed(a, case, search_folders(case, folder)):
         return 1

@@ -21,7 +21,6 @@ from ded_bench.problem.benchmark import (
     load_manifest,
     load_split,
     problem_folder,
-    scenario_folder,
     write_benchmark,
     write_scenarios,
 )
@@ -249,7 +248,7 @@ def _scenarios(a: argparse.Namespace) -> int:
         check_whole_steps(f"a scenario's duration of {DURATION_S:g} s", DURATION_S, case.sampling.dt_s)
     except ValueError as error:
         raise InputError(a.case, "sampling", str(error)) from None
-    folder = a.out or scenario_folder(problem_folder(a.case, case))
+    folder = a.out or problem_folder(a.case, case) / "scenarios"
     hours = len(list(folder.glob("*-h[0-9]*.json"))) if a.hours is None else a.hours
 
     def draw(folder: Path) -> Manifest:

@@ -24,7 +24,7 @@ from ded_bench.files.strict import check_writable
 from ded_bench.methods.registry import trainable
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
-from ded_bench.results.folder import default_results, search_folders
+from ded_bench.results.folder import ResultsFolder, default_results, search_folders
 from ded_bench.surrogates.find import TRAINED
 
 
@@ -55,10 +55,8 @@ def add_commands(commands: Any) -> None:
 
 
 def _train_ko(a: argparse.Namespace) -> int:
-    from ded_bench.surrogates.find import model_file
-
     case = Case.load(a.case)
-    out = a.out or model_file(a.results or default_results(case), a.kind)
+    out = a.out or ResultsFolder(a.results or default_results(case)).model(a.kind)
     if out.exists() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0

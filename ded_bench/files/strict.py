@@ -6,12 +6,14 @@ import contextlib
 import difflib
 import errno
 import functools
+import gzip
 import hashlib
 import json
 import os
 import secrets
 import stat
 import tempfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -62,16 +64,25 @@ def read_record(kind: type[R], path: str | Path) -> R:
     return parse_record(kind, read_text(path), path)
 
 
-def read_text(path: str | Path) -> str:
-    """Return the text of a UTF-8 file; InputError if it cannot be read, is no regular file or too large."""
-    check_readable(path)
+def read_text(path: str | Path, largest: int = MAX_BYTES) -> str:
+    """Return the text of a UTF-8 file, unpacked if its name ends in `.gz`.
+
+    Raises:
+        InputError: it cannot be read, is no regular file, or larger than `largest`, also when unpacked.
+    """
+    check_readable(path, largest)
     try:
-        return Path(path).read_text(encoding="utf-8")
+        opened: Any = gzip.open if str(path).endswith(".gz") else open
+        with opened(path, "rt", encoding="utf-8") as file:
+            text: str = file.read(largest + 1)
     except UnicodeDecodeError:
         raise InputError(path, "", "is not UTF-8 text") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        reason = getattr(error, "strerror", None) or error
         raise InputError(path, "", f"cannot be read ({reason})") from None
+    if len(text) > largest:
+        raise InputError(path, "", f"is larger than {largest >> 20} MiB")
+    return text
 
 
 def check_readable(path: str | Path, largest: int = MAX_BYTES) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, create_model
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import read_text, write_atomically
@@ -68,12 +68,9 @@ class Table(Generic[T]):
         fields.sort(key=lambda f: (f.default is not dataclasses.MISSING, depth[f.name]))
         self.names = tuple(field.name for field in fields)
         self._required = [field.name for field in fields if field.default is dataclasses.MISSING]
-        plain, limited = typing.get_type_hints(kind), typing.get_type_hints(kind, include_extras=True)
+        plain = typing.get_type_hints(kind)
         self._floats = [name for name in self.names if float in (plain[name], *typing.get_args(plain[name]))]
-        cells: dict[str, Any] = {
-            f.name: (limited[f.name], ... if f.name in self._required else f.default) for f in fields
-        }
-        self._record: type[BaseModel] = create_model(kind.__name__, **cells)
+        self._row = TypeAdapter(kind)
 
     def read(self, path: str | Path) -> list[T]:
         """Read a table.
@@ -119,15 +116,17 @@ class Table(Generic[T]):
                 raise InputError(source, f"line {line}", f"{len(texts)} values for {len(header)} columns")
             cells = {name: text for name, text in zip(header, texts, strict=True) if text}
             try:
-                values = vars(self._record.model_validate_strings(upgrade(cells) if upgrade else cells))
-                large = (n for n, v in values.items() if isinstance(v, float | int) and not abs(v) <= LARGEST)
+                row = self._row.validate_strings(upgrade(cells) if upgrade else cells)
+                large = (
+                    n for n, v in vars(row).items() if isinstance(v, float | int) and not abs(v) <= LARGEST
+                )
                 wrong = next(large, "")
             except ValidationError as error:
                 wrong = str(error.errors()[0]["loc"][0])
             if wrong:
                 text = texts[header.index(wrong)] if wrong in header else ""
                 raise InputError(source, f"line {line}, {wrong}", f"{text[:30]!r} is not a valid value")
-            yield self.kind(**values)
+            yield row
 
     def format(self, rows: Iterable[T]) -> str:
         """Rows as CSV text under a header of all columns; missing values are empty."""

@@ -140,12 +140,7 @@ class KnotProgram:
             form, none = form.with_rows(rows, low, high), np.zeros(self._n)
             if not self.condensed:
                 return self._answer(form, left_s), none
-            places = self._output_rows.places(self._held, limits)
-            start = None if self._basis is None else self._basis.start(places)
-            answer = solve_by_highs(form, max(left_s, 0.0), start)
-            if answer.status == Status.OPTIMAL and answer.basis is not None:
-                self._basis = BasisByPlaces.of(answer.basis, places)
-            return answer, none
+            return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
 
         return self._at_all_knots(once, time_limit_s)
 
@@ -211,14 +206,18 @@ class KnotProgram:
         """The program with priced excess, from where the last one ended; how far limits are widened."""
         form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
         places = self._output_rows.places(self._held, limits)
-        both = np.append(places, -1 - places)
-        start = None if self._basis is None else self._basis.start(both)
-        answer = solve_by_highs(form, max(left_s, 0.0), start)
+        answer = self._by_simplex(form, np.append(places, -1 - places), left_s)
         if answer.status != Status.OPTIMAL:
             return answer, np.zeros(self._n)
-        if answer.basis is not None:
-            self._basis = BasisByPlaces.of(answer.basis, both)
         return replace(answer, x=answer.x[place]), answer.x[excess]
+
+    def _by_simplex(self, form: FreeForm, places: Indices, left_s: float) -> FormAnswer:
+        """HiGHS's, from where the last program ended; `places` are those of the last rows."""
+        start = None if self._basis is None else self._basis.start(places)
+        answer = solve_by_highs(form, max(left_s, 0.0), start)
+        if answer.status == Status.OPTIMAL and answer.basis is not None:
+            self._basis = BasisByPlaces.of(answer.basis, places)
+        return answer
 
     def _at_all_knots(
         self, once: Callable[[float], tuple[FormAnswer, Array]], time_limit_s: float

@@ -74,11 +74,6 @@ def problem_folder(name: str | Path, case: Case) -> Path:
     return path.parent if path.is_file() else SHIPPED_CASES / case.id
 
 
-def scenario_folder(problem_folder: Path) -> Path:
-    """Where the scenarios of a benchmark's folder lie."""
-    return problem_folder / "scenarios"
-
-
 def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
     if not (folder / MANIFEST).is_file():

@@ -33,6 +33,11 @@ class Extended(Record):
         return {name: value for name, value in write(self).items() if value is not None}
 
 
+def largest_divisor(count: int, most: float) -> int:
+    """The largest divisor of a number that is at most so large; 1 if none is."""
+    return next(n for n in range(max(int(most + 1e-9), 1), 0, -1) if count % n == 0)
+
+
 def check_whole_steps(name: str, length_s: float, dt_s: float) -> None:
     """Raise ValueError unless a time of this name is a number of steps, and not too many."""
     steps = length_s / dt_s

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-
-from ded_bench.problem.case import Array, Case
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 import contextlib
 import gzip
 import io
 import math
-import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import check_readable, write_atomically
+from ded_bench.files.strict import read_text, write_atomically
 from ded_bench.files.table import records
+from ded_bench.problem.case import Array, Case
 
 if TYPE_CHECKING:
     import pandas as pd
-
 
 #: How far a schedule's last time may lie from the horizon, s.
 HORIZON_TOLERANCE = 1e-9
@@ -140,18 +131,7 @@ def as_schedule(given: Schedule | pd.DataFrame, case: Case) -> Schedule:
 
 def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Column names, and the other rows that are not blank, each with its line number."""
-    check_readable(path, MAX_BYTES)
-    try:
-        with open(path, "rb") as raw:
-            stream = gzip.GzipFile(fileobj=raw) if str(path).endswith(".gz") else raw
-            data = stream.read(MAX_BYTES + 1)
-        text = data.decode()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror or error})") from None
-    except (EOFError, ValueError, zlib.error):
-        raise InputError(path, "", "is not a CSV text file") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(path, "", "is too large for a schedule")
+    text = read_text(path, MAX_BYTES)
     if text.count("\n") > MAX_ROWS:
         raise InputError(path, "", f"has more than {MAX_ROWS} rows")
     rows = [(line, cells) for line, cells in records(text, path) if cells]

@@ -54,6 +54,7 @@ class ResultsFolder:
         self.online = path / "online.csv"  # rows of scenario × regime × method × settings × loop
         self.hindsight = path / "hindsight.csv"  # rows of scenario × regime, with full knowledge
         self.koopman = path / "koopman"  # identified models, see `model`
+        self.policies = path / "policies"  # trained ones, see `policy`
         self.certificates = path / "certificate.json"  # certificates of policies
         self.tables, self.figures = path / "tables", path / "figures"  # of the report
         self.objectives = self.tables / "objectives.csv"  # see `rows.OBJECTIVES`
@@ -62,7 +63,7 @@ class ResultsFolder:
     def contents(self) -> tuple[Path, ...]:
         """What makes a folder one of results: at least one of these is there."""
         tables = self.results, self.timing, self.online
-        return *tables, self.certificates, self.koopman, self.path / "policies"
+        return *tables, self.certificates, self.koopman, self.policies
 
     def archive(self, method: str, settings: str, regime: str) -> Path:
         """The schedules of some rows (see `results.archive`)."""
@@ -78,19 +79,9 @@ class ResultsFolder:
         """An identified model."""
         return self.koopman / f"{kind}.safetensors"
 
-    @property
-    def models(self) -> list[Path]:
-        """The models that are there, by name."""
-        return sorted(self.koopman.glob("*.safetensors"))
-
     def policy(self, name: str) -> Path:
         """A trained policy."""
-        return self.path / "policies" / f"{name}.safetensors"
-
-    @property
-    def policies(self) -> list[Path]:
-        """The policies that are there, by name."""
-        return sorted((self.path / "policies").glob("*.safetensors"))
+        return self.policies / f"{name}.safetensors"
 
     def certificate_rows(self, *name: str) -> Path:
         """What one certificate counts, one row per instance; `name` is what makes it unique."""

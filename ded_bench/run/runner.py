@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
@@ -150,14 +149,6 @@ def fallbacks(tasks: Sequence[Task], folder: Path) -> list[str]:
 SUFFIXES = (".csv", ".csv.gz")
 
 
-@dataclass(frozen=True)
-class Submission:
-    """The rows of a folder of schedules, and its files that no chosen instance asked for."""
-
-    rows: list[Row]
-    unused: list[Path]
-
-
 def submit(
     chosen: Selection,
     folder: Path,
@@ -165,11 +156,14 @@ def submit(
     regimes: Sequence[str],
     results: Results,
     workers: int = 1,
-) -> Submission:
+) -> tuple[list[Row], list[Path]]:
     """Score the schedules of a folder as rows of a method called `name`.
 
     Every chosen instance gets a row per regime: where its schedule is missing or wrong, a failed one
     that says so. Rows whose schedule is unchanged are not scored again.
+
+    Returns:
+        The rows, and the folder's files that no chosen instance asked for.
 
     Raises:
         InputError: the name is not a plain one or belongs to a method, a regime is unknown, or the
@@ -195,7 +189,7 @@ def submit(
     rows = run(case, tasks, results, workers, chosen.version)
     places = [folder, *(folder / regime for regime in regimes)]
     found = {path for place in places for suffix in SUFFIXES for path in place.glob(f"*{suffix}")}
-    return Submission(rows, sorted(found - used))
+    return rows, sorted(found - used)
 
 
 def _check_name(name: str) -> None:

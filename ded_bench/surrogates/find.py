@@ -65,11 +65,6 @@ class AlongTrajectory:
 Surrogate = Koopman | AlongTrajectory
 
 
-def model_file(results: Path, kind: str) -> Path:
-    """Where a results folder keeps a model."""
-    return ResultsFolder(results).model(kind)
-
-
 def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
     """Return a surrogate by its kind, from the first folder that has it, or by its file's path.
 
@@ -108,12 +103,10 @@ def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | Non
     if name in ("linear", TRAJECTORY):
         return None
     if name in TRAINED:
-        for folder in search:
-            if model_file(folder, name).is_file():
-                return model_file(folder, name)
+        for path in (ResultsFolder(folder).model(name) for folder in search):
+            if path.is_file():
+                return path
         problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
-        if case.plant_name != "lossless":
-            problem = f"is of lossless networks, and {case.id} is none; use --model {TRAJECTORY}"
         raise InputError("--model", name, problem)
     if Path(name).is_file():
         return Path(name)

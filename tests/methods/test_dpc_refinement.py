@@ -11,13 +11,14 @@ from scipy.optimize import linprog
 from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import artifacts, prepare
-from ded_bench.methods.dpc.refinement import Refiner, coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.refinement import Refiner, coarse_free_response
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.training_record import policy_file
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.quantities import largest_divisor
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.surrogates.koopman import CondensedRollout
 from ded_bench.surrogates.linear import linear_model
@@ -41,7 +42,7 @@ def optimum(case: Case, regime: str, instance: Instance) -> float:
     """The condensed problem's optimum, written as a linear program for another solver."""
     model, n_gen = linear_model(case), len(case.generators)
     knots = case.knot_times(instance.horizon_s)
-    stride = coarse_stride(instance.dt_s, instance.steps, refinement.SPACING_S)
+    stride = largest_divisor(instance.steps, round(refinement.SPACING_S / instance.dt_s))
     inputs = StackedInstances.of(case, [instance])
     free = coarse_free_response(Network(case), model, inputs, instance.grid, stride)[0]
     condensed = CondensedRollout.make(case, model, instance.grid, knots, stride)

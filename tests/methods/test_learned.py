@@ -15,8 +15,8 @@ from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import policy_file
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.run.tasks import make_tasks, pack, solve_task
-from ded_bench.surrogates.find import model_file
 from ded_bench.surrogates.linear import linear_model
 from tests.learned_method import LEARNED
 
@@ -26,7 +26,7 @@ def out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, threebus: Case) -> Path
     """The method's one line is added; a results folder that has a Koopman model."""
     monkeypatch.setitem(METHODS, LEARNED.name, LEARNED)
     monkeypatch.chdir(tmp_path)
-    linear_model(threebus).save(model_file(tmp_path / "out", "koopman"))
+    linear_model(threebus).save(ResultsFolder(tmp_path / "out").model("koopman"))
     return tmp_path / "out"
 
 

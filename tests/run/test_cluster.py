@@ -22,6 +22,7 @@ from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Artifact, Settings, model_artifact
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
 from ded_bench.run import cluster as module
 from ded_bench.run import runner
@@ -29,7 +30,7 @@ from ded_bench.run.cluster import Cluster
 from ded_bench.run.pool import WorkersLostError
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import make_tasks, pack, solve_task, unpacked
-from ded_bench.surrogates.find import find_model, model_file
+from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.linear import linear_model
 from tests.run.test_pool import wait_until
 from tests.strange_methods import STRANGE, solve_strange
@@ -99,7 +100,7 @@ def strange(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_rows_are_those_of_this_process(address: str, make, threebus: Case, tmp_path: Path) -> None:
     """With a model that only this side has: no worker sees the results folder."""
-    linear_model(threebus).save(model_file(tmp_path / "mine", "koopman"))
+    linear_model(threebus).save(ResultsFolder(tmp_path / "mine").model("koopman"))
     tasks = make("a", "b", method="ded-ko", settings=Settings(search=(tmp_path / "mine",)))
     for task, row in zip(tasks, run(threebus, tasks, Results(tmp_path), scheduler=address), strict=True):
         solution, _, host, _ = solve_task(threebus, task)
@@ -212,8 +213,8 @@ def test_what_is_shipped_is_what_was_there(threebus: Case, tmp_path: Path) -> No
     """Models and policies arrive under the names by which methods look for them; the first folder wins."""
     model = linear_model(threebus)
     first, second = tmp_path / "first", tmp_path / "second"
-    model.save(model_file(first, "koopman"))
-    model.save(model_file(second, "koopman-paper"))
+    model.save(ResultsFolder(first).model("koopman"))
+    model.save(ResultsFolder(second).model("koopman-paper"))
     model.save(tmp_path / "own.safetensors")
     for folder, name in ((first, "m-TO"), (second, "m-TO"), (second, "m-TO-long"), (second, "m-NO")):
         (folder / "policies").mkdir(exist_ok=True)

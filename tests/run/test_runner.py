@@ -14,6 +14,7 @@ from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
+from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import ROWS, Results, Row
 from ded_bench.run import runner
 from ded_bench.run.environment import commit
@@ -21,7 +22,6 @@ from ded_bench.run.pool import ATTEMPTS
 from ded_bench.run.runner import fallbacks, run, unfinished, unscored_row
 from ded_bench.run.tasks import Task, make_tasks
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.find import model_file
 from ded_bench.surrogates.linear import linear_model
 from tests.strange_methods import STRANGE, solve_strange
 
@@ -80,7 +80,7 @@ def test_finished_rows_are_not_made_again(strange, make, threebus: Case, tmp_pat
 def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp_path: Path) -> None:
     """A limited answer is another row than an unlimited one; model, policy, commit and version are named."""
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
-    linear_model(threebus).save(model_file(elsewhere, "koopman"))
+    linear_model(threebus).save(ResultsFolder(elsewhere).model("koopman"))
     settings = Settings(search=(folder, elsewhere))
     instances = [(quiet_instance(threebus, horizon_s=0.2), "none")]
 
@@ -97,7 +97,7 @@ def test_a_row_says_what_it_depends_on(make, threebus: Case, quiet_instance, tmp
     assert limited.model == f"linear@{linear_model(threebus).fingerprint}"
     assert (limited.policy, limited.plant) == ("", "lossless")
     assert (limited.commit, limited.method_version) == (commit(), METHODS["ded-ko-knots"].version)
-    path = model_file(elsewhere, "koopman")
+    path = ResultsFolder(elsewhere).model("koopman")
     assert fallbacks(tasks(settings), folder) == [
         f"ded-ko-knots {regime}: model {limited.model} from {path}" for regime in ("NO", "TO")
     ]

@@ -47,14 +47,14 @@ def test_rows_are_those_of_a_method(chosen, results, tmp_path) -> None:
     folder = put(tmp_path / "mine", a=text(0.6), NO__b=text(0.6), TO__b=text(0.7), c=text(0.6))
     (folder / "a.csv.gz").write_bytes(gzip.compress((folder / "a.csv").read_bytes()))
     (folder / "a.csv").unlink()
-    done = submit(chosen, folder, "mine", ["NO", "TO"], results)
-    assert [(row.regime, row.instance) for row in done.rows] == [
+    rows, unused = submit(chosen, folder, "mine", ["NO", "TO"], results)
+    assert [(row.regime, row.instance) for row in rows] == [
         ("NO", "a"),
         ("NO", "b"),
         ("TO", "a"),
         ("TO", "b"),
     ]
-    assert [path.name for path in done.unused] == ["c.csv"]
+    assert [path.name for path in unused] == ["c.csv"]
     by_key = {(row.regime, row.instance): row for row in Results(results.folder).rows.values()}
     for (regime, name), row in by_key.items():
         instance = next(i for i, _ in chosen.instances if i.id == name)
@@ -74,7 +74,7 @@ def test_what_is_missing_or_wrong_is_a_failed_row(chosen, results, tmp_path) -> 
         tmp_path / "mine", NO__a=text(0.6), TO__a="t,P_plant\n0,0.6\n0.2,oops\n", TO__b=text(0.6, 60)
     )
     rows = {
-        (row.regime, row.instance): row for row in submit(chosen, folder, "mine", ["NO", "TO"], results).rows
+        (row.regime, row.instance): row for row in submit(chosen, folder, "mine", ["NO", "TO"], results)[0]
     }
     assert rows["NO", "a"].objective is not None
     assert {key: row.status for key, row in rows.items() if row.objective is None} == {
@@ -90,35 +90,35 @@ def test_what_is_missing_or_wrong_is_a_failed_row(chosen, results, tmp_path) -> 
 
 def test_one_that_the_grid_cannot_follow_has_no_score(chosen, results, tmp_path) -> None:
     folder = put(tmp_path / "mine", a=text(1e6), b=text(0.6))
-    row_a, row_b = submit(chosen, folder, "mine", ["NO"], results).rows
+    row_a, row_b = submit(chosen, folder, "mine", ["NO"], results)[0]
     assert row_a.error.startswith("scoring failed")
     assert row_b.objective is not None
 
 
 def test_only_what_changed_is_scored_again(chosen, results, tmp_path, monkeypatch) -> None:
     folder = put(tmp_path / "mine", a=text(0.6), b=text(0.6))
-    first = submit(chosen, folder, "mine", ["NO"], results).rows
+    first = submit(chosen, folder, "mine", ["NO"], results)[0]
     before = results.path.read_bytes()
     monkeypatch.setattr("ded_bench.run.runner.now", lambda: "later")
-    assert submit(chosen, folder, "mine", ["NO"], results).rows == first
+    assert submit(chosen, folder, "mine", ["NO"], results)[0] == first
     assert results.path.read_bytes() == before
     put(folder, b=text(0.61))
-    again = submit(chosen, folder, "mine", ["NO"], results).rows
+    again = submit(chosen, folder, "mine", ["NO"], results)[0]
     assert again[0] == first[0]
     assert again[1].objective != first[1].objective
     (folder / "b.csv").unlink()
-    gone = submit(chosen, folder, "mine", ["NO"], results).rows
+    gone = submit(chosen, folder, "mine", ["NO"], results)[0]
     assert gone[0] == first[0]
     assert gone[1].status == "Failed"
     assert not results.has_schedule(gone[1])  # no stale schedule for a figure to draw
     put(folder, b=text(0.6))
-    assert submit(chosen, folder, "mine", ["NO"], results).rows[1].objective == first[1].objective
+    assert submit(chosen, folder, "mine", ["NO"], results)[0][1].objective == first[1].objective
 
 
 def test_two_files_for_one_schedule_are_a_question(chosen, results, tmp_path) -> None:
     folder = put(tmp_path / "mine", a=text(0.6), b=text(0.6))
     (folder / "a.csv.gz").write_bytes(gzip.compress(b""))
-    row_a, _ = submit(chosen, folder, "mine", ["NO"], results).rows
+    row_a, _ = submit(chosen, folder, "mine", ["NO"], results)[0]
     assert "a.csv: is one of two, beside a.csv.gz" in row_a.error
 
 

@@ -16,7 +16,8 @@ from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
-from ded_bench.surrogates.find import find_model, model_file
+from ded_bench.results.folder import ResultsFolder
+from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.identify import (
     held_out,
     identify,
@@ -178,7 +179,7 @@ def test_model_files_round_trip(case: Case, tmp_path: Path) -> None:
             (rng.normal(size=(3, 5)), rng.normal(size=3)),
         ),
     )
-    path = model_file(tmp_path, "koopman")
+    path = ResultsFolder(tmp_path).model("koopman")
     model.save(path)
     loaded = find_model(case, "koopman", [tmp_path / "nowhere", tmp_path])
     assert loaded.fingerprint == model.fingerprint

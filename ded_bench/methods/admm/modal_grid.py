@@ -24,6 +24,7 @@ from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, set_jacob
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import largest_divisor
 
 #: Mismatch of a power flow that is good enough here, pu.
 MISMATCH = 1e-5
@@ -225,11 +226,6 @@ def averaged(values: Array, every: int) -> Array:
     for k, weight in enumerate(hat, start=1):
         found[:, 1:-1] += weight * values[:, k : last + k - every : every]
     return found
-
-
-def largest_divisor(count: int, most: float) -> int:
-    """The largest divisor of a number that is at most so large; 1 if none is."""
-    return max(n for n in range(1, max(int(most + 1e-9), 1) + 1) if count % n == 0)
 
 
 @compiled

@@ -28,6 +28,7 @@ from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import largest_divisor
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import linear_model
 
@@ -53,7 +54,7 @@ class Refiner:
         """Condense and factorise."""
         self.case, self.network, self.model, self.grid = case, Network(case), model, grid
         n_gen, n_knots = len(case.generators), len(knots)
-        self.stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
+        self.stride = largest_divisor(len(grid) - 1, round(SPACING_S / model.dt_s))
         condensed = CondensedRollout.make(case, model, grid, knots, self.stride)
         gamma = condensed.gamma
         self.hat_weights, self.quadrature_weights = condensed.hat_weights, condensed.quadrature_weights
@@ -141,12 +142,6 @@ class Refiner:
         generators = (np.einsum("bkg,k->bg", p_gen, self.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
         cost = generators + inputs.cost[:, 0] * (np.abs(p_slack) @ self.quadrature_weights)
         return np.asarray(cost * (1.0 + EXCESS_PRICE * np.maximum(omega - (1.0 - 0.5 * MARGIN), 0.0)))
-
-
-def coarse_stride(dt_s: float, steps: int, spacing_s: float) -> int:
-    """Largest divisor of the number of steps that keeps to a spacing."""
-    most = max(1, round(spacing_s / dt_s))
-    return next(s for s in range(most, 0, -1) if steps % s == 0)
 
 
 def coarse_free_response(

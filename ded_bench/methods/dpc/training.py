@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from ded_bench.methods.dpc.channels import Channels, Response, n_channels
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.inference import DILATIONS, EMBEDDING, STAGES, WIDTH
-from ded_bench.methods.dpc.refinement import coarse_free_response, coarse_stride
+from ded_bench.methods.dpc.refinement import coarse_free_response
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.torch_follower import follow_within
 from ded_bench.methods.trained_policy import Scope, weights_of
@@ -34,6 +34,7 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.quantities import largest_divisor
 from ded_bench.problem.sampling import POLICY_SEED, sample_instances
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman
 
@@ -171,7 +172,7 @@ class Pool(NamedTuple):
         grid: Array,
     ) -> Pool:
         """Convert channels, and compute free responses on a time grid; float32."""
-        stride = coarse_stride(model.dt_s, len(grid) - 1, SPACING_S)
+        stride = largest_divisor(len(grid) - 1, round(SPACING_S / model.dt_s))
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
         free = [coarse_free_response(network, model, part, grid, stride) for part in parts]
         scale = np.maximum(channels.static_cost(inputs), SMALLEST_COST) * len(grid)
@@ -224,7 +225,7 @@ def train(
     inputs = [StackedInstances.of(case, part) for part in (drawn, instances)]
     channels = [Channels.of(case, part, response) for part in inputs]
     data, check = (Pool.of(c, i, model, network, first.grid) for c, i in zip(channels, inputs, strict=True))
-    stride = coarse_stride(model.dt_s, first.steps, SPACING_S)
+    stride = largest_divisor(first.steps, round(SPACING_S / model.dt_s))
     condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)

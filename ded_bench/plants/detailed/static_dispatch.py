@@ -245,9 +245,7 @@ class StaticDispatch:
         sizes, port = np.abs(point.voltage), network.machine_port
         machines, drawn = self.system.p_machine(near.power), self.system.p_drawn(p_load)
         for _ in range(REGULATIONS):
-            missed = np.zeros_like(
-                sizes
-            )  # by the mean of the machines at a bus, which share its reactive power
+            missed = np.zeros_like(sizes)  # by the mean of machines at a bus, which share its reactive power
             np.add.at(missed, port, (v_ref - system.equilibrium(point).v_ref) / np.bincount(port)[port])
             if np.abs(missed).max() < REGULATED:
                 return point

@@ -209,11 +209,8 @@ def _ends(case: Case, seen: State) -> dict[str, tuple[Array, Array]]:
     ranges, n = case.sampling, len(case.generators)
     ramped = case.load_rate[1] * ranges.duration_s[1] + ranges.load_relative * np.abs(case.load_nominal)
     load = np.tile(case.load_nominal, (len(AHEAD_S), 1))
-    fast, half, total = (
-        np.full(n, 2 * np.pi * LARGEST_DEVIATION_HZ),
-        np.full(n, np.pi),
-        case.p_max - case.p_min,
-    )
+    fast, half = np.full(n, 2 * np.pi * LARGEST_DEVIATION_HZ), np.full(n, np.pi)
+    total = case.p_max - case.p_min
     period = 0.0 if case.agc is None else case.agc.period_s
     agc = np.array([total.sum(), 2 * np.pi * LARGEST_DEVIATION_HZ * ranges.horizon_s, period])
     found = {

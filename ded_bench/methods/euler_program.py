@@ -136,11 +136,7 @@ class EulerPrograms:
 
         deadline = started + (np.inf if time_limit_s is None else time_limit_s)
         still = np.tile(initial, (len(load), 1))
-        end = sequence(
-            Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1),
-            [still],
-            deadline,
-        )
+        end = sequence(Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1), [still], deadline)
         schedule, objective = None, None
         if end.status == Status.OPTIMAL and end.answer and end.answer.solution and end.followed:
             power = np.vstack([instance.p_initial(self._case), end.answer.solution[1][self._p_gen]])

@@ -96,10 +96,7 @@ class DetailedProgram:
         scheme = {"wrt": m.t, "nfe": len(mesh.ends) - 1, "ncp": len(POINTS), "scheme": "LAGRANGE-RADAU"}
         pyo.TransformationFactory("dae.collocation").apply_to(m, **scheme)
         self._slopes = eliminated(m, m.x_rate)
-        self._x, self._v = (
-            _by_time(m.x, m.t),
-            _by_time(m.v, m.t),
-        )  # (n_points, n_moving), (n_points, 2 n_port)
+        self._x, self._v = _by_time(m.x, m.t), _by_time(m.v, m.t)  # (n_points, n_moving or 2 n_port)
         m.gen, m.knot = pyo.RangeSet(0, len(self.case.generators) - 1), pyo.RangeSet(0, len(mesh.knots) - 1)
         m.p_set, m.held = pyo.Var(m.gen, m.knot), pyo.Var(pyo.RangeSet(0, len(mesh.acts)))
         self._p_set, self._held = _by_time(m.p_set, m.knot), np.array(list(m.held.values()))

@@ -15,13 +15,7 @@ from pydantic import PrivateAttr, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, parse_record, read_text
-from ded_bench.problem.grid_files import (
-    GRID_FILES,
-    MACHINES_FILE,
-    NETWORK_FILE,
-    GridFiles,
-    load_grid_files,
-)
+from ded_bench.problem.grid_files import GRID_FILES, MACHINES_FILE, NETWORK_FILE, GridFiles, load_grid_files
 from ded_bench.problem.limits import Agc, Bounds, IslandRegime, Regime, Transfer
 from ded_bench.problem.quantities import Array as Array
 from ded_bench.problem.quantities import (

@@ -17,15 +17,7 @@ from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.rows import (
-    SCORING_FAILED,
-    VALIDATED,
-    Key,
-    Results,
-    Row,
-    ValidatedRow,
-    differences,
-)
+from ded_bench.results.rows import SCORING_FAILED, VALIDATED, Key, Results, Row, ValidatedRow, differences
 from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import Question, reason_of, score_all
 

@@ -27,13 +27,7 @@ from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import (
-    EnergyForm,
-    discretised,
-    energy_form,
-    injection_lift,
-    steady_state,
-)
+from ded_bench.surrogates.linear import EnergyForm, discretised, energy_form, injection_lift, steady_state
 
 #: Range of a uniform draw.
 Span = tuple[float, float]

@@ -124,7 +124,7 @@ def simulate(
     case: Case | None = None,
     plant: str | Plant | None = None,
 ) -> Trajectory:
-    """Simulate a schedule on a plant; see `plants.simulate.simulate`.
+    """Simulate a schedule on a plant; see `plants.plant.simulate`.
 
     Args:
         instance: its loads and its initial state.
@@ -136,12 +136,11 @@ def simulate(
         InputError: the schedule does not span the horizon, or the case or plant is unknown.
         SimulationError: the plant cannot follow this schedule.
     """
-    from ded_bench.plants import simulate
-    from ded_bench.plants.plant import plant_of
+    from ded_bench.plants import plant as plants
     from ded_bench.problem.schedule import as_schedule
 
     own = _case_of(instance, case)
-    return simulate.simulate(own, instance, as_schedule(schedule, own), plant_of(own, plant))
+    return plants.simulate(own, instance, as_schedule(schedule, own), plants.plant_of(own, plant))
 
 
 def simulate_many(
@@ -169,8 +168,7 @@ def simulate_many(
         InputError: there are not as many instances as schedules, or the case or plant is unknown.
     """
     from ded_bench.files.errors import InputError
-    from ded_bench.plants.plant import plant_of
-    from ded_bench.plants.simulate import in_threads
+    from ded_bench.plants.plant import in_threads, plant_of
     from ded_bench.problem.instance import Instance
 
     many = [instances] * len(schedules) if isinstance(instances, Instance) else list(instances)

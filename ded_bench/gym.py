@@ -62,7 +62,6 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         plant: its name, or a plant of the case; None: the case's own.
         price: of 1 Hz of excess in a step; None: an excess as large as the bound costs as much as nominal
             loads at the sampler's mean cost.
-        render_mode: nothing is rendered.
 
     Raises:
         InputError: there is no such case, regime or plant.
@@ -76,10 +75,9 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         regime: str,
         plant: str | Plant | None = None,
         price: float | None = None,
-        render_mode: None = None,
     ) -> None:
         self.case = case if isinstance(case, Case) else Case.load(case)
-        self.regime, self.plant, self.render_mode = regime, plant_of(self.case, plant), render_mode
+        self.regime, self.plant = regime, plant_of(self.case, plant)
         self._bounds = self.case.bounds(regime)
         ranges = self.case.sampling
         self._points = max(round(STEP_S / ranges.dt_s), 1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from ded_bench.analysis.summary import GROUP, line_table, records, summary
+from ded_bench.analysis.summary import GROUP, records, summary
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.overview import read_grid
 from ded_bench.report.sources import trainings
@@ -65,7 +65,7 @@ def break_even(rows: pd.DataFrame, timing: pd.DataFrame, training_s: Mapping[str
                 )
                 own = policy | {"many_s": cost + policy["many_s"], "training_s": cost}
                 found.append(own | compared | {"rival": rival["title"], "paid_after": paid})
-    return line_table(found, COLUMNS)
+    return pd.DataFrame(found, columns=list(COLUMNS))
 
 
 def main() -> None:

@@ -15,9 +15,8 @@ import numpy as np
 
 from ded_bench import Case
 from ded_bench.methods import ed
-from ded_bench.plants.plant import SimulationError, servable
+from ded_bench.plants.plant import SimulationError, servable, simulate
 from ded_bench.plants.score import ISLAND_HZ, judge
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instances
 
 PERCENT = (0, 10, 50, 90, 100)

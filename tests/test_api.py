@@ -20,7 +20,7 @@ import ded_bench
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import Method
 from ded_bench.methods.solution import Settings
-from ded_bench.plants import score, simulate
+from ded_bench.plants import plant, score
 from ded_bench.plants.detailed.detailed_stepper import integrate_plant
 from ded_bench.plants.lossless.stepper import integrate
 from ded_bench.problem.benchmark import write_benchmark
@@ -149,7 +149,7 @@ def test_functions_are_those_of_the_floors(ninebus: Case, quiet_instance, consta
     instance = quiet_instance(ninebus, horizon_s=0.1)
     schedule = constant(instance, ninebus.p_nominal)
     assert ded_bench.score(instance, schedule, "TO") == score.score(ninebus, instance, schedule, "TO")
-    ours, theirs = ded_bench.simulate(instance, schedule), simulate.simulate(ninebus, instance, schedule)
+    ours, theirs = ded_bench.simulate(instance, schedule), plant.simulate(ninebus, instance, schedule)
     assert np.array_equal(ours.omega, theirs.omega)
 
 
@@ -183,7 +183,7 @@ def test_a_case_that_is_not_shipped_must_be_given(
 
 def test_a_trajectory_is_a_frame_by_bus(case: Case, quiet_instance, constant) -> None:
     instance = quiet_instance(case, horizon_s=0.1)
-    trajectory = simulate.simulate(case, instance, constant(instance, case.p_nominal))
+    trajectory = plant.simulate(case, instance, constant(instance, case.p_nominal))
     frame = trajectory.to_frame()
     assert len(frame) == 11
     assert len(frame.columns) == 2 + 2 * len(case.generators) + len(case.loads) + len(case.buses)
@@ -240,6 +240,6 @@ def test_many_simulations_are_those_of_one_after_the_other(folder, quiet_instanc
 def test_threads_work_at_once() -> None:
     """Each of two waits until the other is there; and compiled plants let go of the interpreter."""
     together = threading.Barrier(2)
-    assert sorted(simulate.in_threads(lambda _: together.wait(20), range(2), 2)) == [0, 1]
+    assert sorted(plant.in_threads(lambda _: together.wait(20), range(2), 2)) == [0, 1]
     for compiled in (integrate, integrate_plant):
         assert compiled.targetoptions["nogil"]

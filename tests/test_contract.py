@@ -19,9 +19,8 @@ from ded_bench.methods.options import described
 from ded_bench.methods.registry import METHODS, trainable
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.training_record import policy_file
-from ded_bench.plants.plant import plant_of
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.plants.score import judge, score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.lossless_case import LosslessCase

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.methods import ed
-from ded_bench.plants.plant import NominalPoint, SimulationError, plant_of, servable
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import NominalPoint, SimulationError, plant_of, servable, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import LosslessCase
@@ -74,21 +73,15 @@ def implausible(case: Case, found: CaseCheck) -> Iterator[str]:
         f"{bus} {power:g}" for bus, power in zip(case.loads, case.load_nominal, strict=True) if power > 0
     ]:
         yield f"loads that feed in, pu (a load that draws is negative): {', '.join(feeding)}"
-    if isinstance(
-        case, LosslessCase
-    ):  # behind x'd a generator's |V| is no bus's; its largest power is its base
+    if isinstance(case, LosslessCase):
+        # Behind x'd a generator's |V| is no bus's; its largest power is its base.
         voltages = {bus.id: bus.v for bus in case.buses if bus.kind != "generator"}
         rated = {n: m.m * np.pi * case.f0_hz / m.p_max for n, m in case.machines.items() if m.p_max > 0}
     else:
         voltages = {bus.id: bus.v for bus in case.detailed.network.buses}
         rated = {name: machine.h for name, machine in case.detailed.machines.items()}
     modes = {str(place): value for place, value in enumerate(found.frequency_hz.tolist(), start=1)}
-    for name, values in (
-        ("|V| of buses, pu", voltages),
-        ("inertia constants, s", rated),
-        ("modes, Hz", modes),
-    ):
-        low, high = PLAUSIBLE[name]
+    for (name, (low, high)), values in zip(PLAUSIBLE.items(), (voltages, rated, modes), strict=True):
         if outside := [f"{key} {value:.3g}" for key, value in values.items() if not low <= value <= high]:
             yield f"{name}, outside {low:g} to {high:g}: {', '.join(outside[:5])}{', …' * (len(outside) > 5)}"
     if found.knots and case.n_knots < found.knots:

@@ -7,7 +7,7 @@ from typing import Any
 import pandas as pd
 
 from ded_bench.analysis import summary
-from ded_bench.analysis.summary import GROUP, line_table, named
+from ded_bench.analysis.summary import GROUP, named
 from ded_bench.problem.scenario import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
@@ -62,7 +62,7 @@ def practice_lines(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, kind of forecast, length, method, period and latency of `practice_rows`."""
     by = ["regime", "forecast", "minutes", "method", "settings", "model", "period_s", "latency_s"]
     made = [dict(zip(by, key, strict=True)) | _beside(rows) for key, rows in frame.groupby(by, sort=False)]
-    return line_table(made, [*by, *_beside(frame[:0])])
+    return pd.DataFrame(made, columns=[*by, *_beside(frame[:0])])
 
 
 def _beside(rows: pd.DataFrame) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def _predicted(results: OnlineResults, case: str) -> pd.DataFrame:
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method, period and latency."""
     made = [dict(zip(LOOP, key, strict=True)) | _line(rows) for key, rows in frame.groupby(LOOP, sort=False)]
-    return line_table(made, [*LOOP, *_line(frame)])
+    return pd.DataFrame(made, columns=[*LOOP, *_line(frame)])
 
 
 def _line(rows: pd.DataFrame) -> dict[str, Any]:

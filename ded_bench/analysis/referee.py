@@ -26,8 +26,7 @@ from tqdm import tqdm
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Table
-from ded_bench.plants.plant import SimulationError, plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds

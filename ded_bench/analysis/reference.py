@@ -22,7 +22,6 @@ from ded_bench.analysis.summary import (
     HEAD,
     head,
     is_usual,
-    line_table,
     records,
     statistics,
     summary,
@@ -126,7 +125,7 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
         lines.append(line)
     own = ("is_reference", "solve_s", "timing_failures", "increase_percent")
     papers = (f"paper_{name}" for name in PaperRow.model_fields)
-    return line_table(lines, [*HEAD, *statistics(rows[:0]), *own, *papers])
+    return pd.DataFrame(lines, columns=[*HEAD, *statistics(rows[:0]), *own, *papers])
 
 
 #: References of cases without a paper's numbers, the first that has objectives.

@@ -10,7 +10,7 @@ row without a score counts in `failures` and enters no mean.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -152,11 +152,6 @@ def where(frame: pd.DataFrame, marks: Iterable[bool]) -> pd.DataFrame:
     return frame[np.array(list(marks), dtype=bool)]
 
 
-def line_table(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
-    """Rows as a frame that has its columns even when it has no rows."""
-    return pd.DataFrame(list(rows), columns=list(columns))
-
-
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
     """The rows of a frame."""
     return [{str(name): value for name, value in row.items()} for row in frame.to_dict("records")]
@@ -232,7 +227,7 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
     judge could judge, of `validated_asked` and `confirmed_asked` whose schedules it was given.
     """
     rows = [head(regime, key) | statistics(group) for regime, key, group in groups(frame)]
-    return line_table(rows, [*HEAD, *statistics(frame[:0])])
+    return pd.DataFrame(rows, columns=[*HEAD, *statistics(frame[:0])])
 
 
 def statistics(group: pd.DataFrame) -> dict[str, Any]:

@@ -175,10 +175,6 @@ def lines_of(method: Method) -> list[str]:
     return lines
 
 
-def _cases(a: argparse.Namespace) -> int:
-    return _list() if a.case is None else _check(Case.load(a.case), a.count)
-
-
 def _list() -> int:
     import pandas as pd
 
@@ -193,15 +189,18 @@ def _list() -> int:
     return 0
 
 
-def _check(case: Case, count: int) -> int:
+def _cases(a: argparse.Namespace) -> int:
+    if a.case is None:
+        return _list()
     from ded_bench.analysis.inspect_case import check_case, implausible
     from ded_bench.plants.plant import SimulationError
 
+    case = Case.load(a.case)
     sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
     print(f"case {case.id}: {sizes}", flush=True)
-    say(f"drawing and simulating {counted(count, 'instance')}")
+    say(f"drawing and simulating {counted(a.count, 'instance')}")
     try:
-        found = check_case(case, count)
+        found = check_case(case, a.count)
     except SimulationError as error:
         print(f"ded-bench: case {case.id}: {error}", file=sys.stderr)
         return 1

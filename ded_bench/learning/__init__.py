@@ -12,29 +12,29 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ded_bench.learning.as_arrays import CondensedMap as CondensedMap
+    from ded_bench.learning.as_arrays import SplitArrays as SplitArrays
+    from ded_bench.learning.as_arrays import condense as condense
+    from ded_bench.learning.as_arrays import linearise as linearise
+    from ded_bench.learning.as_arrays import split_arrays as split_arrays
     from ded_bench.learning.casadi_expressions import CasadiModel as CasadiModel
     from ded_bench.learning.casadi_expressions import casadi_model as casadi_model
     from ded_bench.learning.differentiable import cost_and_excess as cost_and_excess
     from ded_bench.learning.differentiable import simulated as simulated
-    from ded_bench.learning.linear_maps import CondensedMap as CondensedMap
-    from ded_bench.learning.linear_maps import condense as condense
-    from ded_bench.learning.linear_maps import linearise as linearise
     from ded_bench.learning.linear_programs import export_programs as export_programs
-    from ded_bench.learning.splits import SplitArrays as SplitArrays
-    from ded_bench.learning.splits import split_arrays as split_arrays
 
 _HOMES = {
     "CasadiModel": "ded_bench.learning.casadi_expressions",
-    "CondensedMap": "ded_bench.learning.linear_maps",
-    "SplitArrays": "ded_bench.learning.splits",
+    "CondensedMap": "ded_bench.learning.as_arrays",
+    "SplitArrays": "ded_bench.learning.as_arrays",
     "casadi_model": "ded_bench.learning.casadi_expressions",
-    "condense": "ded_bench.learning.linear_maps",
+    "condense": "ded_bench.learning.as_arrays",
     "cost_and_excess": "ded_bench.learning.differentiable",
     "export_programs": "ded_bench.learning.linear_programs",
-    "linearise": "ded_bench.learning.linear_maps",
+    "linearise": "ded_bench.learning.as_arrays",
     "simulate_many": "ded_bench",
     "simulated": "ded_bench.learning.differentiable",
-    "split_arrays": "ded_bench.learning.splits",
+    "split_arrays": "ded_bench.learning.as_arrays",
 }
 __all__ = [*_HOMES]
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.learning.linear_maps import INTERVAL_S, from_schedule, linearised_along
-from ded_bench.plants.plant import Plant, SimulationError, plant_of
-from ded_bench.plants.simulate import in_threads, simulate
+from ded_bench.learning.as_arrays import INTERVAL_S, from_schedule, linearised_along
+from ded_bench.plants.plant import Plant, SimulationError, in_threads, plant_of, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule, Trajectory

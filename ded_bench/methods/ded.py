@@ -145,7 +145,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     m.step = pyo.RangeSet(1, steps)
 
     # Constraints.
-    injection = injections(m, m.t, case, network)
+    injection = injections(m, case, network)
 
     @m.Constraint(m.gen, m.t)
     def eq_swing(m: Any, g: str, t: float) -> Any:
@@ -191,17 +191,11 @@ def eliminated(m: pyo.ConcreteModel, derivative: dae.DerivativeVar) -> dict[Any,
     return quotients
 
 
-def injections(m: pyo.ConcreteModel, times: Any, case: Case, network: Network) -> Callable[[str, float], Any]:
+def injections(m: pyo.ConcreteModel, case: Case, network: Network) -> Callable[[str, float], Any]:
     """f_i(θ(t)) of the paper as a function of bus and time, over a model's `theta` and `angle`, pu.
 
-    Every line's flow is one named expression of the model, `flow`, that both of its ends share: a third less
-    memory than with the sines of either end for themselves.
-
-    Args:
-        m: the model; it gets `line` and `flow`.
-        times: the set of its points.
-        case: the grid.
-        network: its network.
+    The model gets `line` and `flow`: every line's flow is one named expression that both of its ends share, a
+    third less memory than with the sines of either end for themselves.
     """
     leaving: dict[str, list[int]] = {bus.id: [] for bus in network.case.buses}
     arriving: dict[str, list[int]] = {bus.id: [] for bus in network.case.buses}
@@ -213,7 +207,7 @@ def injections(m: pyo.ConcreteModel, times: Any, case: Case, network: Network) -
     def angle(bus: str, t: float) -> Any:
         return 0.0 if bus == case.slack else m.theta[bus, t] if bus in m.gen else m.angle[bus, t]
 
-    @m.Expression(m.line, times)
+    @m.Expression(m.line, m.t)
     def flow(m: Any, number: int, t: float) -> Any:
         line = network.case.lines[number]
         return float(network.coupling[number]) * pyo.sin(angle(line.from_bus, t) - angle(line.to_bus, t))

@@ -309,7 +309,7 @@ class KnotProgram:
         """The program with columns for widenings; where its own columns stand then, and these."""
         form = self._columns.program(self._radius)
         held = self._held.ravel()
-        own = np.append(np.nonzero(self._held)[0], self._interval_of(limits[:, 1]))
+        own = np.append(np.nonzero(self._held)[0], np.searchsorted(self.model.points, limits[:, 1]) - 1)
         after = self._columns.last if by_interval else self._columns.last[-1:]
         none = np.zeros(len(after))
         form, place, new = form.with_columns(
@@ -344,9 +344,6 @@ class KnotProgram:
             pairs = np.arange(len(points)), outputs
             limit, now = limit[pairs], now[pairs]
         return (-limit - now).ravel(), (limit - now).ravel()
-
-    def _interval_of(self, points: Indices) -> Indices:
-        return np.searchsorted(self.model.points, points) - 1
 
     @functools.cached_property
     def _speed(self) -> Array:

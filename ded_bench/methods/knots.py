@@ -11,9 +11,6 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
-#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
-#: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
-PIECE = 20
 #: In operation under secondary control, knots are as close as the case's so far ahead, s: on three drawn
 #: scenarios of two-area-agc and 39bus-agc 3 s let one peak pass the bound by 0.3 mHz, and from 6 to 10 s
 #: neither peaks nor costs changed by more than 0.06 %.
@@ -95,11 +92,6 @@ def knot_weights(lengths: Indices) -> Array:
     weight[:-1] += half
     weight[1:] += half
     return weight
-
-
-def piece_starts(points: Indices) -> Indices:
-    """First grid points of the pieces of Σ |P_s|; every interval between knots has its own."""
-    return divided(points, -(-np.diff(points) // PIECE))
 
 
 def divided(points: Indices, parts: Indices) -> Indices:

@@ -131,18 +131,6 @@ def installed() -> dict[str, str]:
     return found
 
 
-def slug_of(target: str) -> str:
-    """The name that rows of `module:function` carry: `module.function`.
-
-    Raises:
-        InputError: this cannot be the name of a folder.
-    """
-    slug = target.replace(":", ".")
-    if not SLUG.fullmatch(slug):
-        raise InputError("--method", target, f"does not make a method's name (wanted: {SLUG.pattern})")
-    return slug
-
-
 def load(target: str) -> Foreign:
     """Import `module:function`; modules in the working directory count.
 

@@ -167,5 +167,7 @@ def get_method(name: str) -> Method:
         return known[name]
     target = name if ":" in name else ":".join(name.rsplit(".", 1))
     plugin.load(target)
-    slug = plugin.slug_of(target)
+    slug = target.replace(":", ".")  # what rows carry
+    if not plugin.SLUG.fullmatch(slug):
+        raise InputError("--method", target, f"does not make a method's name (wanted: {plugin.SLUG.pattern})")
     return Method(slug, target, slug)

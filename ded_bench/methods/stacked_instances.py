@@ -37,10 +37,9 @@ class StackedInstances:
         Raises:
             SimulationError: an instance gives angles at t = 0, but there is no equilibrium to compare with.
         """
-        machines = case.priced
         return StackedInstances(
             load=load_segments(case, instances),
-            cost=np.array([[i.cost[bus] for bus in machines] for i in instances]),
+            cost=np.array([[i.cost[bus] for bus in case.priced] for i in instances]),
             p_initial=np.array([i.p_initial(case) for i in instances]),
             delta=np.array([_deviation(case, i) for i in instances]),
             omega=np.array([i.omega_initial(case) for i in instances]),

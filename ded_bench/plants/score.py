@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.plants.plant import Plant
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import Plant, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule, Trajectory

@@ -25,8 +25,7 @@ from ded_bench.analysis.summary import (
 )
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, simulate
 from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 
-from ded_bench.files.arrays import read_arrays, write_arrays
+from ded_bench.files.arrays import write_arrays
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import Count, NotNegative, PlainName, Table
 from ded_bench.plants.score import AGC_COLUMN
@@ -133,8 +132,3 @@ def keep_trajectory(path: Path, trajectory: Trajectory) -> None:
     if AGC_COLUMN in trajectory.columns:
         arrays[AGC_COLUMN] = trajectory.columns[AGC_COLUMN][::stride]
     write_arrays(path, arrays, {"kept_s": KEPT_S})
-
-
-def read_trajectory(path: Path) -> dict[str, np.ndarray]:
-    """Read what `keep_trajectory` wrote; InputError if it is missing or damaged."""
-    return read_arrays(path)[0]

@@ -242,10 +242,6 @@ class Results(KeyedTable[Key, Row]):
         return ROWS.frame(self.rows.values())
 
 
-#: Rows of drawn validation instances serve choices, not comparisons.
-_LEFT_OUT = "validation"
-
-
 @dataclass(frozen=True)
 class Objective:
     """The re-simulated objective of one method in its default settings; comparable within one version."""
@@ -269,7 +265,7 @@ def objectives_of(rows: Iterable[Row]) -> list[Objective]:
         if row.objective is not None
         and row.settings == "default"
         and not (row.model or row.policy)
-        and row.split != _LEFT_OUT
+        and row.split != "validation"  # their rows serve choices, not comparisons
     ]
     return sorted(found, key=lambda o: (o.regime, o.method, o.instance))
 

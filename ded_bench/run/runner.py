@@ -169,7 +169,10 @@ def submit(
         InputError: the name is not a plain one or belongs to a method, a regime is unknown, or the
             folder has no schedule for any of the instances.
     """
-    _check_name(name)
+    if not SLUG.fullmatch(name):
+        raise InputError("--name", name, "must be letters, digits, dots, dashes and underscores, at most 64")
+    if name in registered():
+        raise InputError("--name", name, "is the name of a method; its rows come from `ded-bench solve`")
     chosen.case.check_regimes(regimes)
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
@@ -190,13 +193,6 @@ def submit(
     places = [folder, *(folder / regime for regime in regimes)]
     found = {path for place in places for suffix in SUFFIXES for path in place.glob(f"*{suffix}")}
     return rows, sorted(found - used)
-
-
-def _check_name(name: str) -> None:
-    if not SLUG.fullmatch(name):
-        raise InputError("--name", name, "must be letters, digits, dots, dashes and underscores, at most 64")
-    if name in registered():
-        raise InputError("--name", name, "is the name of a method; its rows come from `ded-bench solve`")
 
 
 def _candidates(folder: Path, regime: str, instance: str) -> list[Path]:

@@ -117,22 +117,6 @@ class Answered(NamedTuple):
     trace: str = ""
 
 
-def solve_task(case: Case, task: Task) -> Answered:
-    """Solve one task in this process, without a verdict.
-
-    A method that raises, or answers with something that is no Solution for this instance, gives a
-    failed Solution that says so.
-    """
-    if task.given is not None:
-        return Answered(task.given, None, host())
-    started = time.perf_counter()
-    try:
-        answer = prepared(case, task.method, task.regime, task.settings, task.files)(task.instance)
-        return Answered(accept(answer, case, task.instance, time.perf_counter() - started), None, host())
-    except Exception as error:  # the boundary to other people's methods: a failure is a row
-        return Answered(failed(error), None, host(), trace_of(error))
-
-
 @functools.lru_cache(maxsize=4)
 def prepared(case: Case, method: str, regime: str, settings: Settings, files: Files = ()) -> Solver:
     """A method that is ready to solve, kept for the next call in this process; raises as `Method.prepare`."""
@@ -159,12 +143,22 @@ def score_all(case: Case, questions: Sequence[Question]) -> list[Score | Excepti
 
 
 def solve_and_score(case: Case, task: Task, plant: str) -> Answered:
-    """Solve and score one task in this process."""
-    answered = solve_task(case, task)
-    if (schedule := answered.solution.schedule) is None:
-        return answered
-    (verdict,) = score_all(case, [(task.instance, schedule, task.regime, plant)])
-    return answered._replace(verdict=verdict)
+    """Solve and score one task in this process.
+
+    A method that raises, or answers with something that is no Solution for this instance, gives a
+    failed Solution that says so.
+    """
+    solution, trace, started = task.given, "", time.perf_counter()
+    try:
+        if solution is None:
+            solve = prepared(case, task.method, task.regime, task.settings, task.files)
+            solution = accept(solve(task.instance), case, task.instance, time.perf_counter() - started)
+    except Exception as error:  # the boundary to other people's methods: a failure is a row
+        solution, trace = failed(error), trace_of(error)
+    verdict = None
+    if solution.schedule is not None:
+        (verdict,) = score_all(case, [(task.instance, solution.schedule, task.regime, plant)])
+    return Answered(solution, verdict, host(), trace)
 
 
 def failed(error: object) -> Solution:

@@ -55,11 +55,7 @@ class CasadiIpopt:
                 info = NLWriter().write(model, stream, linear_presolve=False, symbolic_solver_labels=False)
             builder = casadi.NlpBuilder()
             builder.import_nl(str(path))
-        nlp = {
-            "x": casadi.vertcat(*builder.x),
-            "f": builder.f,
-            "g": casadi.vertcat(*builder.g),
-        }
+        nlp = {"x": casadi.vertcat(*builder.x), "f": builder.f, "g": casadi.vertcat(*builder.g)}
         self._columns = tuple(info.variables)
         self._rows = {"lbg": np.array(builder.g_lb), "ubg": np.array(builder.g_ub)}
         # Scalar expressions must be expanded, or every evaluation takes several times as long.

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import Plant, PlantState, plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import Plant, PlantState, plant_of, simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -89,9 +88,7 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
         problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {TRAJECTORY}"
         raise InputError("--model", name, problem)
     path = find_model_file(case, name, search)
-    if path is None:
-        return nominal_model(case)
-    return Koopman.load(path, case)
+    return nominal_model(case) if path is None else Koopman.load(path, case)
 
 
 def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | None:

@@ -18,8 +18,7 @@ from scipy.optimize import least_squares
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import SimulationError, servable
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, servable, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance

@@ -306,11 +306,6 @@ class CondensedRollout:
             hat_functions(grid, points).sum(axis=0) if stride > 1 else np.ones(len(grid)),
         )
 
-    @property
-    def n_gen(self) -> int:
-        """Number of generators."""
-        return len(self.gamma) - 1
-
 
 def free_response(model: Koopman, psi: Array, p_load: Array, stride: int = 1) -> Array:
     """(ω, P_s) without generator power, at every `stride`-th grid point.

@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from ded_bench.methods.admm.modal_grid import MISMATCH, SMALLEST_COST
 from ded_bench.methods.admm.problems import POINTS, problems_of, sampled
 from ded_bench.methods.stacked_instances import load_segments
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule

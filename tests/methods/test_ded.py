@@ -8,8 +8,8 @@ import pytest
 
 from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.plant import simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance

@@ -15,8 +15,8 @@ from ded_bench.methods.radau_program import (
 )
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance

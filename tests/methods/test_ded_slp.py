@@ -13,9 +13,8 @@ from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.slp import Parts
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.plant import SimulationError, plant_of
+from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds

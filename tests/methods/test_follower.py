@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ded_bench.methods.ramp_follower import track
-from ded_bench.methods.torch_follower import follow_within
+from ded_bench.methods.training_run import follow_within
 from ded_bench.problem.compiled import compiled
 
 LOW, HIGH, STEP = np.array([-0.5, -0.6, -9.0]), np.array([0.4, 0.8, 9.0]), np.array([0.1, 0.3, 0.5])

@@ -16,7 +16,7 @@ from ded_bench.methods.training_record import policy_file
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.run.tasks import make_tasks, pack, solve_task
+from ded_bench.run.tasks import make_tasks, pack, solve_and_score
 from ded_bench.surrogates.linear import linear_model
 from tests.learned_method import LEARNED
 
@@ -60,7 +60,7 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
     chosen = select_split(problem)
     settings = Settings("slope=0.001", search=(out,))
     (task, *_) = make_tasks(chosen.case, chosen.instances, ["learned"], ["TO"], settings)
-    here = solve_task(chosen.case, task).solution
+    here = solve_and_score(chosen.case, task, "lossless").solution
     assert here.schedule is not None
     files = pack(LEARNED.artifacts(chosen.case, "TO", settings))
     assert sorted(name for name, _ in files) == [
@@ -68,10 +68,11 @@ def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: 
         "policies/learned-TO.safetensors",
     ]
     elsewhere = dataclasses.replace(settings, search=(tmp_path / "nowhere",))
-    there = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere, files=files)).solution
+    packed = dataclasses.replace(task, settings=elsewhere, files=files)
+    there = solve_and_score(chosen.case, packed, "lossless").solution
     assert there.schedule is not None, there.error
     np.testing.assert_array_equal(there.schedule.p, here.schedule.p)
-    alone = solve_task(chosen.case, dataclasses.replace(task, settings=elsewhere)).solution
+    alone = solve_and_score(chosen.case, dataclasses.replace(packed, files=()), "lossless").solution
     assert "train-dpc --method learned --regime TO" in alone.error
 
 

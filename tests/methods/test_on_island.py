@@ -22,9 +22,8 @@ from ded_bench.methods.solution import Settings
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S, DetailedPlant
-from ded_bench.plants.plant import plant_of
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Transfer

@@ -10,9 +10,8 @@ from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.slp import Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.plant import plant_of
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.limits import IslandRegime
 from ded_bench.problem.schedule import Schedule

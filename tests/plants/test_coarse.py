@@ -9,8 +9,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed.coarse import CoarsePlant
-from ded_bench.plants.plant import plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -75,7 +75,8 @@ def test_eliminated_buses_carry_no_current(grid):
     for bus in files.network.buses:
         current[bus.id] += (bus.gs + 1j * bus.bs) * voltage[bus.id]
     injected = dict.fromkeys(network.buses, 0.0 + 0.0j)
-    for name, p, q in zip(network.port_names, point.p_drawn, network.q_drawn, strict=True):
+    names = [network.buses[i] for i in network.ports]
+    for name, p, q in zip(names, point.p_drawn, network.q_drawn, strict=True):
         injected[name] -= p + 1j * q
     for machine, power in zip(files.data.machines, point.power, strict=True):
         injected[machine.bus] += power

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from tests.detailed_cases import MIXED, detailed_case

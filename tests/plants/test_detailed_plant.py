@@ -13,8 +13,7 @@ from sksundae.ida import IDA
 from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.detailed.machine_arrays import DELTA, E1Q, GATE, N_STATES, SPEED, WASHOUT
-from ded_bench.plants.plant import SimulationError, plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from tests.detailed_cases import GRIDS, MIXED, VARIANTS, andes_trace, detailed_case

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.plant import PLANTS, Plant, plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import PLANTS, Plant, plant_of, simulate
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance

@@ -10,8 +10,7 @@ from ded_bench.methods import ed
 from ded_bench.plants.lossless import stepper
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.lossless.stepper import KUTTA_4
-from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule

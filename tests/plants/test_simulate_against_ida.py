@@ -18,7 +18,7 @@ from scipy.optimize import root
 from sksundae.ida import IDA
 
 from ded_bench.files.strict import parse_record
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import simulate
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance

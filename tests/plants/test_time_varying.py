@@ -11,8 +11,7 @@ from scipy.linalg import expm
 
 from ded_bench.methods import ed
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import plant_of
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import plant_of, simulate
 from ded_bench.plants.time_varying import Delivered, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

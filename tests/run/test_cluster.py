@@ -20,7 +20,6 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Artifact, Settings, model_artifact
-from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.rows import Results
@@ -29,7 +28,7 @@ from ded_bench.run import runner
 from ded_bench.run.cluster import Cluster
 from ded_bench.run.pool import WorkersLostError
 from ded_bench.run.runner import run
-from ded_bench.run.tasks import make_tasks, pack, solve_task, unpacked
+from ded_bench.run.tasks import make_tasks, pack, solve_and_score, unpacked
 from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.linear import linear_model
 from tests.run.test_pool import wait_until
@@ -103,9 +102,8 @@ def test_rows_are_those_of_this_process(address: str, make, threebus: Case, tmp_
     linear_model(threebus).save(ResultsFolder(tmp_path / "mine").model("koopman"))
     tasks = make("a", "b", method="ded-ko", settings=Settings(search=(tmp_path / "mine",)))
     for task, row in zip(tasks, run(threebus, tasks, Results(tmp_path), scheduler=address), strict=True):
-        solution, _, host, _ = solve_task(threebus, task)
+        solution, verdict, host, _ = solve_and_score(threebus, task, "lossless")
         assert solution.schedule is not None
-        verdict = score(threebus, task.instance, solution.schedule, task.regime)
         assert row.objective == pytest.approx(verdict.objective, rel=1e-9)  # the CSV keeps 15 digits
         assert (row.status, row.workers, row.host) == ("Optimal", 2, host)
     with Cluster(address) as pool:  # it lives on, and its memory is for others

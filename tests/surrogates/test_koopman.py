@@ -12,8 +12,7 @@ import torch
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import SimulationError, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder

@@ -24,7 +24,7 @@ from ded_bench.methods.admm.admm_inference import (
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start, linear_between
 from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, modal_products, swing, swing_adjoint
 from ded_bench.methods.admm.problems import POINTS
-from ded_bench.methods.torch_follower import follow_within
+from ded_bench.methods.training_run import follow_within
 from ded_bench.problem.case import Array
 
 #: Powers (batch, n_knots, n_gen), ω (batch, n_points, n_gen) and P_s (batch, n_points).

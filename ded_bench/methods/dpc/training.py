@@ -26,10 +26,9 @@ from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.inference import DILATIONS, EMBEDDING, STAGES, WIDTH
 from ded_bench.methods.dpc.refinement import coarse_free_response
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.methods.torch_follower import follow_within
 from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
-from ded_bench.methods.training_run import TrainingRun, repeatable
+from ded_bench.methods.training_run import TrainingRun, follow_within, repeatable
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
@@ -195,7 +194,7 @@ class RolloutLoss:
         self.gamma, self.hat_weights, self.quadrature_weights = (
             torch.as_tensor(array, dtype=torch.float32) for array in arrays
         )
-        self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
+        self.n_gen, self.omega_bound = len(condensed.gamma) - 1, omega_bound
         self.spacing_s = condensed.stride * condensed.model.dt_s
 
     def __call__(self, powers: Tensor, pool: Pool, margin: float = 0.0) -> tuple[Tensor, Tensor]:

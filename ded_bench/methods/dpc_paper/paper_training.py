@@ -115,7 +115,7 @@ class PaperLoss:
         gamma = condensed.gamma.reshape(-1, condensed.gamma.shape[2])
         arrays = gamma, hat_functions(condensed.points, condensed.knots), ramp
         self.gamma, self.hats, self.ramp = (torch.as_tensor(array, dtype=dtype) for array in arrays)
-        self.n_gen, self.omega_bound = condensed.n_gen, omega_bound
+        self.n_gen, self.omega_bound = len(condensed.gamma) - 1, omega_bound
 
     def __call__(self, knots: Tensor, batch: Batch) -> dict[str, Tensor]:
         """The six terms of eq. (DPC_loss) of each instance, weighted, shape (batch,) each.

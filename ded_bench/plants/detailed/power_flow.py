@@ -55,11 +55,6 @@ class PortNetwork:
     guess: Complex  # voltages of that power flow, (n_port,), pu; magnitudes at machines are held
     balancing: int  # the machine that balances the power flow, alone at its bus
 
-    @property
-    def port_names(self) -> tuple[str, ...]:
-        """The buses of the ports."""
-        return tuple(self.buses[i] for i in self.ports)
-
     def power_flow(
         self, p_machine: Array, p_drawn: Array, guess: Complex | None = None, sizes: Array | None = None
     ) -> OperatingPoint:

@@ -116,7 +116,8 @@ class PowerSystem:
     @functools.cached_property
     def load_ports(self) -> Indices:
         """The port of each load, (n_load,)."""
-        return np.array([self.network.port_names.index(bus) for bus in self.case.loads])
+        ports = [self.network.buses[i] for i in self.network.ports]
+        return np.array([ports.index(bus) for bus in self.case.loads])
 
     @functools.cached_property
     def shares(self) -> Array:

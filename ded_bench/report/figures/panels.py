@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 
 from ded_bench.analysis.online_summary import PRACTICE, STATIC
 from ded_bench.analysis.summary import main_lines, records, titled, where
+from ded_bench.files.arrays import read_arrays
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.scenario import QUALITIES
 from ded_bench.report.figures.style import DASHES, GREY, PALETTE, Drawn, legend_below, look, new_figure, plain
 from ded_bench.report.sources import Sources
-from ded_bench.results.online_results import read_trajectory
 
 RAD_TO_HZ = 1 / (2 * np.pi)
 #: How many generators or loads a figure shows one by one.
@@ -120,11 +120,6 @@ def balance_panel(case: Case, regime: str, shown: Sequence[Shown]) -> Panel:
         limit = 1e3 * RAD_TO_HZ * float(case.bounds(regime).limit[0])
         return Panel(MEAN, [one.curve(1e3 * RAD_TO_HZ * one.omega @ mean) for one in shown], (limit, -limit))
     return Panel(f"slack $P_{{{case.slack}}}$ (pu)", [one.curve(one.p_slack) for one in shown])
-
-
-def agc_panel(shown: Sequence[Shown]) -> Panel:
-    """What secondary control asks of all machines, pu."""
-    return Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])
 
 
 def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:
@@ -229,7 +224,8 @@ def draw_scenario(sources: Sources) -> Iterator[Drawn]:
         caption = f"Scenario {heading}: loads, powers, frequencies and {last} under {names}."
         panels = [load_panel(case, shown[0]), *power_panels(case, shown, GENERATORS_SHOWN)]
         panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
-        panels.append(balance_panel(case, sources.tightest, shown) if case.slack else agc_panel(shown))
+        agc = Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])
+        panels.append(balance_panel(case, sources.tightest, shown) if case.slack else agc)
         yield Drawn("online_scenario", caption, time_figure(heading, panels, 1))
 
 
@@ -258,5 +254,5 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     hindsight = files.hindsight_trajectory(scenario, sources.tightest, sources.case.plant_name)
     if hindsight.is_file():  # first, below the others
         paths = {("", "hindsight"): hindsight} | paths
-    read = [(*key, read_trajectory(path)) for key, path in paths.items()]
+    read = [(*key, read_arrays(path)[0]) for key, path in paths.items()]
     return scenario, [Shown(m, label, i, **arrays) for i, (m, label, arrays) in enumerate(read)]

@@ -12,9 +12,8 @@ import numpy as np
 
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.plant import Plant
+from ded_bench.plants.plant import Plant, simulate
 from ded_bench.plants.score import STRICT_HZ, Score, judge, mean_hz
-from ded_bench.plants.simulate import simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario, forecast

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from ded_bench.cli import main
+from ded_bench.files.arrays import read_arrays
 from ded_bench.files.strict import read_record, write_atomically
 from ded_bench.methods import ed
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
-from ded_bench.plants.plant import plant_of, servable
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import plant_of, servable, simulate
 from ded_bench.problem.benchmark import Manifest, scenario_files
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import AgcState, Instance
 from ded_bench.problem.sampling import DRIFT, HOUR_RANGE, HOUR_S, sample_scenario
 from ded_bench.problem.scenario import Scenario, load_scenarios
 from ded_bench.problem.schedule import Schedule
-from ded_bench.results.online_results import OnlineResults, read_trajectory
+from ded_bench.results.online_results import OnlineResults
 from ded_bench.run.online.judgement import EPSILON_HZ, cps1, hindsight, judge_operation, whole_instance
 from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from ded_bench.run.online.operation import make_operations, operate
@@ -175,7 +175,7 @@ def test_rows_are_the_same_to_the_last_bit(island, scenario, tmp_path):
     assert first.max_excess_hz == max(excesses) > 0
     assert first.mean_freq_max_hz == pytest.approx(0.01 + first.excess_mean_hz)
     assert first.swing_max_hz > first.swing_rms_hz > 0
-    kept = read_trajectory(files[0].files.trajectory(first.key))
+    kept = read_arrays(files[0].files.trajectory(first.key))[0]
     assert np.abs(np.diff(kept["agc"])).sum() == pytest.approx(first.agc_travel_pu, rel=1e-12)
 
 

@@ -7,8 +7,7 @@ import pytest
 
 from ded_bench.methods import ded_slp
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.plant import plant_of, servable
-from ded_bench.plants.simulate import simulate
+from ded_bench.plants.plant import plant_of, servable, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario

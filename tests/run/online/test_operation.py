@@ -11,12 +11,13 @@ import pytest
 
 from ded_bench.cli import main
 from ded_bench.cli.online_commands import _print_row
+from ded_bench.files.arrays import read_arrays
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import scenario_files, write_scenarios
 from ded_bench.problem.scenario import load_scenarios
 from ded_bench.results.folder import OnlineKey
-from ded_bench.results.online_results import OnlineResults, OnlineRow, read_trajectory
+from ded_bench.results.online_results import OnlineResults, OnlineRow
 from ded_bench.results.timing import TIMING, TimingRow
 from ded_bench.run.online.loop import LoopOptions
 from ded_bench.run.online.operation import make_operations, operate
@@ -67,10 +68,10 @@ def test_rows_hold_all_that_is_judged(threebus, first_run):
         assert row.max_excess_hz > row.mean_excess_hz >= 0
         assert row.loop_s > 0
         assert (row.settings, row.plant, row.method_version) == ("every=1", "lossless", 1)
-        kept = read_trajectory(results.files.trajectory(row.key))
+        kept = read_arrays(results.files.trajectory(row.key))[0]
         np.testing.assert_allclose(kept["t"], np.arange(61) * 0.1, atol=1e-12)
         assert kept["omega"].shape == (61, len(threebus.generators))
-        look = read_trajectory(results.files.hindsight_trajectory(row.scenario, "TO", "lossless"))
+        look = read_arrays(results.files.hindsight_trajectory(row.scenario, "TO", "lossless"))[0]
         assert np.abs(look["omega"]).max() <= threebus.omega_bound("TO") + 1e-5
 
 

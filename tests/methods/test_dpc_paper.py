@@ -132,7 +132,7 @@ def loss_and_data(case: Case, count: int, bound: float) -> tuple[PaperLoss, Batc
     """In double precision."""
     model, instances = linear_model(case), some_instances(case, count)
     condensed = CondensedRollout.make(case, model, instances[0].grid, case.knot_times(HORIZON))
-    data = Batch.of(case, model, instances, "cpu")
+    data = Batch.of(case, model, instances)
     data = Batch(*(part.double() for part in data))
     return PaperLoss(condensed, bound, case.ramp * instances[0].dt_s, dtype=torch.float64), data
 
@@ -162,7 +162,7 @@ def test_the_recipe_is_the_papers_and_nothing_else(threebus: Case, tmp_path: Pat
     options = TrainingOptions(seed=3, epochs=7, model=str(tmp_path / "model.safetensors"))
     policy = train(threebus, regime, instances, tmp_path / "p.safetensors", options)
     assert (policy.training["instances"], policy.training["held_out"]) == (10, 0)
-    data = Batch.of(threebus, model, instances, "cpu")
+    data = Batch.of(threebus, model, instances)
     condensed = CondensedRollout.make(threebus, model, instances[0].grid, threebus.knot_times(HORIZON))
     loss = PaperLoss(condensed, threebus.omega_bound(regime), threebus.ramp * instances[0].dt_s)
     torch.manual_seed(3)

@@ -39,6 +39,8 @@ FORGOTTEN = 0.02
 MEAN_MARGIN, SWING_MARGIN = 0.3, 0.12
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
+#: Of set-points, pu: 1.5 kW, and half the size in archives.
+RESOLUTION = 2.0**-16
 #: Of squares of set-points, beside the penalties.
 REGULARISATION = 1e-4
 #: Part of the bound on swings that the first schedule's way to the merit order takes.
@@ -254,7 +256,7 @@ class IslandIterations:
         given = Iterated(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
         left = iterate(grid.maps, given, change, dual, iterations)
         found = near.schedule.copy()
-        found[1:] = (found[1:] + change).astype(np.float32)  # half the size in archives
+        found[1:] = np.round((found[1:] + change) / RESOLUTION) * RESOLUTION
         return grid.within(found, asked.p_initial, asked.room), dual, left
 
 

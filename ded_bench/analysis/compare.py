@@ -10,6 +10,8 @@ depend on the machine: they are named, not compared.
 
 from __future__ import annotations
 
+import json
+import math
 import random
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -176,6 +178,20 @@ def to_text(comparison: Comparison) -> str:
         lines += _section(f"{column}: {len(found)} of {c.common} common rows", said)
     verdict = f"differ: {', '.join(counts)}" if counts else f"agree on {c.common} common rows"
     return "\n".join([*lines, f"A and B {verdict}"]) + "\n"
+
+
+def to_json(comparison: Comparison) -> str:
+    """The comparison as one JSON object; infinite sizes and missing numbers are null."""
+    c = comparison
+    changes = [
+        change.key._asdict()
+        | {"column": change.column, "before": change.before, "after": change.after}
+        | {"size": change.size if math.isfinite(change.size) else None}
+        for change in c.changes
+    ]
+    made = {name: getattr(c, name) for name in ("a", "b", "same", "incomparable", "common")}
+    made |= {name: [key._asdict() for key in getattr(c, name)] for name in ("only_a", "only_b")}
+    return json.dumps(made | {"changes": changes}, default=str)
 
 
 def _section(heading: str, items: Iterable[str]) -> list[str]:

@@ -51,6 +51,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--tolerance-hz", type=not_negative, default=1e-6, metavar="HZ", help="violations")
     p.add_argument("--tolerance-pu", type=not_negative, default=1e-8, metavar="PU", help="violations")
     p.add_argument("--common", action="store_true", help="rows that only one has are no difference")
+    p.add_argument("--json", action="store_true", help="one JSON object instead of lines")
     p.set_defaults(run=_compare)
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
@@ -143,11 +144,11 @@ def _certify(a: argparse.Namespace) -> int:
 def _compare(a: argparse.Namespace) -> int:
     if all(ResultsFolder(folder).results.is_file() for folder in (a.a, a.b)):
         say(f"comparing {a.a} with {a.b}")
-    from ded_bench.analysis.compare import compare, limits, to_text
+    from ded_bench.analysis.compare import compare, limits, to_json, to_text
 
     largest = limits(a.tolerance, a.tolerance_hz, a.tolerance_pu)
     found = compare(a.a, a.b, largest, common_only=a.common)
-    print(to_text(found), end="")
+    print(to_json(found) if a.json else to_text(found), end="\n" if a.json else "")
     return 0 if found.same else 1
 
 

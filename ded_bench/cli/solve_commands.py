@@ -83,6 +83,7 @@ def _add_score(commands: Any) -> None:
     given.add_argument("--schedule", type=Path, metavar="CSV", help="one, for one --instance")
     given.add_argument("--schedules", type=Path, metavar="DIR", help="[REGIME/]INSTANCE.csv[.gz] become rows")
     given.add_argument("--results", type=Path, metavar="DIR", help="compare its rows and kept schedules")
+    p.add_argument("--update", action="store_true", help="write the new scores into the rows of --results")
     p.add_argument("--plant", choices=PLANTS, help="default: that of the rows; another: validated.csv")
     p.add_argument("--name", help="what the rows of --schedules call your method")
     p.add_argument("--regime", type=names, metavar="R[,R]", help="of the case; not for --results")
@@ -131,8 +132,11 @@ def _solve(a: argparse.Namespace) -> int:
 
 
 def _score(a: argparse.Namespace) -> int:
-    if a.plant and a.schedules:
-        raise InputError("--plant", a.plant, "is not for --schedules, whose rows are of the case's own plant")
+    if a.update and not a.results:
+        raise InputError("--update", "", "is only for --results")
+    if a.plant and (a.schedules or a.update):
+        option = "--schedules" if a.schedules else "--update"
+        raise InputError("--plant", a.plant, f"is not for {option}, whose rows are of the case's own plant")
     if a.results:
         return _score_results(a)
     if not a.regime:
@@ -181,18 +185,18 @@ def _score_results(a: argparse.Namespace) -> int:
         return _validate(a, case, instances, results)
     from ded_bench.run.scoring import rescore
 
-    check = rescore(case, instances, results, a.workers, on_difference=tell)
+    check = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)
     if a.json:
         for row in check.rows:
             _print_row(results, row)
     parts = [
-        f"{counted(len(check.rows), 'row')} checked in {results.path}",
+        f"{counted(len(check.rows), 'row')} {'scored anew' if a.update else 'checked'} in {results.path}",
         counted(len(check.differences), "difference"),
         f"{counted(check.without_schedule, 'row')} without a kept schedule",
         *([f"{check.unknown} of unknown instances"] if check.unknown else []),
     ]
     tell(", ".join(parts))
-    return 1 if check.differences else 0
+    return 0 if a.update or not check.differences else 1
 
 
 def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance], results: Results) -> int:

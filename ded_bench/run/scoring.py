@@ -97,6 +97,8 @@ def rescore(
     instances: Mapping[str, Instance],
     results: Results,
     workers: int = 1,
+    *,
+    update: bool = False,
     on_difference: Callable[[str], None] = lambda sentence: None,
 ) -> Check:
     """Score the kept schedules of a results folder again, and compare with its rows.
@@ -106,6 +108,7 @@ def rescore(
         instances: by id; rows of others are counted.
         results: the folder's.
         workers: processes.
+        update: write the new scores into the rows.
         on_difference: called with each sentence.
 
     Raises:
@@ -119,6 +122,9 @@ def rescore(
             for sentence in _differences(old, rows[-1]):
                 found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
                 on_difference(found[-1])
+    if update:
+        results.add(rows)
+        results.compact()
     unknown = sum(row.instance not in instances for row in results.rows.values())
     return Check(rows, found, len(results.rows) - unknown - len(kept), unknown)
 

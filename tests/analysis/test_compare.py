@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 
-from ded_bench.analysis.compare import compare, limits, to_text
+from ded_bench.analysis.compare import compare, limits, to_json, to_text
 from ded_bench.files.errors import InputError
 from ded_bench.results.rows import Results, Row
 from tests.analysis import test_summary
@@ -105,6 +106,14 @@ def test_rows_of_one_folder_only_count_unless_told_otherwise(folders) -> None:
     assert "only in A: 1 rows\n  b TO mine\n" in to_text(found)
     assert not found.same
     assert compare(*pair, common_only=True).same
+
+
+def test_a_comparison_is_one_json_object(folders) -> None:
+    changed = [dataclasses.replace(BASE[0], objective=None), *BASE[1:3]]
+    found = json.loads(to_json(compare(*folders(changed))))
+    assert (found["same"], found["common"], len(found["only_a"]), found["only_b"]) == (False, 3, 1, [])
+    [lost] = [change for change in found["changes"] if change["column"] == "objective"]
+    assert (lost["instance"], lost["before"], lost["after"], lost["size"]) == ("a", 100.0, None, None)
 
 
 def test_other_problems_cannot_be_compared(folders) -> None:

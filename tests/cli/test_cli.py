@@ -130,6 +130,8 @@ def test_anyone_can_check_a_results_folder(problem: Path, tmp_path: Path, capsys
     out_text, err = capsys.readouterr()
     assert len([json.loads(line) for line in out_text.splitlines()]) == 4
     assert f"ded default NO {second.instance}: objective" in err
+    assert main([*check, "--update"]) == 0
+    assert main(check) == 0
     again = [*SOLVE, "--case", str(problem), "--split", "all", "--out", str(out)]
     capsys.readouterr()
     assert main(again) == 0  # a scored row is finished, though its schedule is not kept

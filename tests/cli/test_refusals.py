@@ -152,6 +152,7 @@ def test_a_results_folder_that_cannot_be_checked(problem: Path, tmp_path: Path, 
     assert "(found: a, b)" in refused(capsys, "score", "--results", tmp_path / "empty")
     Results(tmp_path / "odd").add([Row("x", "test", "NO", "ded", "default", "Optimal", case="atlantis")])
     assert "atlantis" in refused(capsys, "score", "--results", tmp_path / "odd")
+    assert "--update" in refused(capsys, "score", "--schedule", "a.csv", "--regime", "NO", "--update")
     assert "--regime" in refused(capsys, "score", "--schedule", "a.csv")
 
 

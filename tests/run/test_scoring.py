@@ -93,6 +93,18 @@ def test_a_schedule_that_is_damaged_or_another_is_a_difference(threebus: Case, i
     assert {line.split(": ")[0] for line in check.differences} == {"ded default TO a", "ded default TO c"}
 
 
+def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Results) -> None:
+    rescore(threebus, instances, results, update=True)
+    right = dict(results.rows)
+    old = dataclasses.replace(row_of(results, "b"), objective=1.0)
+    empty = dataclasses.replace(row_of(results, "c"), objective=None, feasible=None)
+    results.add([old, empty])
+    check = rescore(threebus, instances, results, update=True)
+    assert [line.split(":")[0] for line in check.differences] == ["ded default TO b", "ded default TO c"]
+    assert Results(results.folder).rows == right
+    assert len(results.path.read_text().splitlines()) == 5
+
+
 def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> None:
     with pytest.raises(InputError, match=r"schedules: holds no schedule of these rows"):
         rescore(threebus, {"d": instances["d"]}, results)

@@ -30,9 +30,8 @@ from ded_bench.problem.instance import Instance
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.06
-#: Mending is simulated, and goes on, if it misses what it aims at by the first part of a bound, or where
-#: the second was exceeded before.
-LEFT, FAR = 0.03, 0.1
+#: Part of a bound by which mending may miss what it aims at, or it is simulated and mended again.
+LEFT = 0.03
 #: How often, at most.
 MENDED = 3
 
@@ -87,7 +86,7 @@ class IslandPolicy(TrainedPolicy):
                     return answer
                 mending = mending_of(self.grid)(asked, seen[-1], self.training["mending"], False)
                 answer, _, left = mending
-                if left < LEFT and seen[-1].excess < FAR:
+                if left < LEFT:
                     return answer
         except SimulationError:
             if not seen:

@@ -222,6 +222,8 @@ def draw_scenario(sources: Sources) -> Iterator[Drawn]:
         names = ", ".join(one.label for one in shown)
         last = "slack power" if case.slack else "secondary control (AGC)"
         caption = f"Scenario {heading}: loads, powers, frequencies and {last} under {names}."
+        if not case.slack:
+            caption += " Limits of powers are those of set-points: droop and AGC move deliveries beyond them."
         panels = [load_panel(case, shown[0]), *power_panels(case, shown, GENERATORS_SHOWN)]
         panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
         agc = Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])

@@ -36,7 +36,7 @@ SPACING_S = 0.25
 #: Part of what a knot does to swings that iterations leave out, once it is long ago.
 FORGOTTEN = 0.02
 #: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
-MEAN_MARGIN, SWING_MARGIN = 0.3, 0.12
+MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of set-points, pu: 1.5 kW, and half the size in archives.

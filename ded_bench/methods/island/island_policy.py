@@ -29,7 +29,7 @@ from ded_bench.problem.instance import Instance
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.
-NEAR = 0.06
+NEAR = 0.04
 #: Part of a bound by which mending may miss what it aims at, or it is simulated and mended again.
 LEFT = 0.03
 #: How often, at most.

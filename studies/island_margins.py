@@ -1,4 +1,4 @@
-"""Margins of the islands' policies on fresh validation draws: `python studies/island_margins.py 39bus-agc 24`.
+"""Margins of the islands' policies on fresh validation draws: `python studies/island_margins.py CASE COUNT`.
 
 Each line has other parts of the bound on swings that iterations leave free, and other distances from a bound
 within which a schedule is mended; the committed weights answer.

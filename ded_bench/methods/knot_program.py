@@ -31,7 +31,7 @@ import scipy.sparse as sp
 
 from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows
 from ded_bench.methods.knots import divided, knot_weights
-from ded_bench.methods.reserve import Reserve
+from ded_bench.methods.reserve import Room
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -86,6 +86,7 @@ class KnotProgram:
         bounds: of outputs of ω.
         model: a linear model along a trajectory that starts at P_0.
         reserve: that programs with priced excess keep, if any.
+        margin: by how much bounds are tighter at every grid point, (n_points,), rad/s; None: nothing.
         radius: most that a set-point may move, pu (trust region).
         condensed: whether states are substituted; None: on islands.
         before: the program along the trajectory before, near whose end to start.
@@ -97,13 +98,15 @@ class KnotProgram:
         instance: Instance,
         bounds: Bounds,
         model: TimeVarying,
-        reserve: Reserve | None = None,
+        reserve: Room | None = None,
+        margin: Array | None = None,
         radius: float = np.inf,
         condensed: bool | None = None,
         before: KnotProgram | None = None,
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
         self.bounds, self._reserve, self._radius = bounds, reserve, radius
+        self._margin = np.zeros(len(model.omega)) if margin is None else margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
         self._columns = KnotColumns(case, instance, model, self.condensed)
@@ -257,7 +260,7 @@ class KnotProgram:
         """
         parts = FEW_PARTS if self.condensed else PARTS
         least = left_open if self.condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
-        size, points, beyond = np.abs(outputs.T), self.model.points, self.bounds.beyond(outputs).T
+        size, points, beyond = np.abs(outputs.T), self.model.points, self._beyond(outputs).T
         chosen = np.zeros(size.shape, dtype=bool)
         peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
         chosen[:, 1:-1] = peak
@@ -273,7 +276,11 @@ class KnotProgram:
 
     def excess(self, outputs: Array) -> float:
         """Largest excess over a bound after t_0: x_0 is given, wherever it lies; rad/s."""
-        return float(self.bounds.beyond(outputs)[1:].max())
+        return float(self._beyond(outputs)[1:].max())
+
+    def _beyond(self, outputs: Array) -> Array:
+        """How far outputs are beyond what margins leave of their bounds, (n_points, n_out), rad/s."""
+        return self.bounds.beyond(outputs) + self._margin[:, None]
 
     def predict(self, columns: Array) -> Prediction:
         """All grid points at a solution, shape (n_columns,)."""
@@ -327,19 +334,22 @@ class KnotProgram:
         return form.with_rows(rows, np.append(below, below), np.append(high, -low)), place, new
 
     def _with_reserve(
-        self, reserve: Reserve, form: FreeForm, place: Indices, excess: Indices
+        self, reserve: Room, form: FreeForm, place: Indices, excess: Indices
     ) -> tuple[FreeForm, Indices]:
         """A program with room to follow ramps at the next knots, and where its columns stand then."""
-        near = slice(0, int(np.searchsorted(self.model.points[1:], reserve.ahead_s / self._instance.dt_s)))
         mean = float(np.mean(list(self._instance.cost.values())))
         shortage = reserve.price * mean * knot_weights(self.model.lengths)[1:] / reserve.limit
-        power, p_gen = place[self._columns.u][near], self.model.p_gen[1:][near]
-        return reserve.required(form, power, p_gen, excess[near], shortage[near])
+        points, x = self.model.points[1:], self._columns.u  # no surprise asks for ω
+        if isinstance(self.model.speed, slice):
+            x = self._columns.x[:, self.model.speed]
+        at = self.model.p_gen[1:], self.model.omega[points]
+        return reserve.required(form, (place[self._columns.u], place[x]), at, excess, shortage)
 
     def _room(self, points: Indices, outputs: Indices | None = None) -> tuple[Array, Array]:
         """How far outputs may go down and up: at points of all of them, or at pairs of both; rad/s."""
         is_free = self.bounds.at_end & (points[:, None] < self.model.points[-1])
-        limit, now = np.where(is_free, np.inf, self.bounds.limit), self.model.omega[points]
+        limit = np.where(is_free, np.inf, self.bounds.limit - self._margin[points, None])
+        now = self.model.omega[points]
         if outputs is not None:
             pairs = np.arange(len(points)), outputs
             limit, now = limit[pairs], now[pairs]

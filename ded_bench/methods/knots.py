@@ -85,6 +85,20 @@ def knots_in_operation(case: Case, instance: Instance, last: Schedule | None) ->
     return knot_points(np.concatenate([*near, control_times(case, instance)]), instance.dt_s)
 
 
+def knots_on_clock(case: Case, instance: Instance, now_s: float) -> Indices:
+    """Grid points of knots at multiples of the case's distance on a clock: they keep their places.
+
+    Args:
+        case: gives the distance.
+        instance: gives the grid.
+        now_s: what the clock says at its t = 0, s.
+    """
+    distance = case.sampling.horizon_s / (case.n_knots - 1)
+    last = instance.horizon_s - distance / 2
+    inside = np.arange(np.floor(now_s / distance + 1e-6) + 1, (now_s + last) / distance) * distance - now_s
+    return knot_points(np.concatenate([[0.0], inside, [instance.horizon_s]]), instance.dt_s)
+
+
 def knot_weights(lengths: Indices) -> Array:
     """How much power at a knot counts in the sum over all grid points, shape (n_knots,)."""
     half = (lengths - 1) / 2

@@ -9,6 +9,12 @@ load's, stay within their limits, and leave every machine a steady speed within 
 
 with K the compliance S⁻¹ and T the loads' shares (`Network.linearise`) at the nominal point of the lossless
 network, λ the load's ramp and τ its duration. The shortage e has a price.
+
+A ramp that begins at once swings machines beyond their steady speeds. So a *sudden* surprise asks for
+
+    |ω + s (K (δ - T λ))| <= limit + e
+
+with ω the plan's at the knot, s > 1, and τ the time that a swing takes.
 """
 
 from __future__ import annotations
@@ -60,27 +66,56 @@ class Reserve:
         duration = float(np.mean(case.sampling.duration_s))
         return Reserve(case, np.concatenate([fast, -fast]), compliance, limit, duration)
 
+    def room(self, times: Array) -> Room:
+        """Room for every ramp at all knots of the next `ahead_s`.
+
+        Args:
+            times: of all knots but the first, (n_knots,), s.
+        """
+        n_knots, count = int(np.searchsorted(times, self.ahead_s - 1e-9)), len(self.speeds)
+        ones = np.ones(n_knots * count)
+        rows = np.repeat(np.arange(n_knots), count), np.tile(self.speeds, (n_knots, 1))
+        return Room(self.case, self.compliance, *rows, self.duration_s * ones, ones, self.limit, self.price)
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Surprises that a plan must be able to follow, each at one knot."""
+
+    case: Case
+    compliance: Array  # K, (n_gen, n_gen), rad/pu
+    knot: Indices  # of all but the first, ascending, (count,)
+    speeds: Array  # steady speeds under it if nobody follows, (count, n_gen), rad/s
+    lasts_s: Array  # τ, (count,)
+    swing: Array  # s, (count,); 1: ω counts as 0
+    limit: float  # rad/s
+    price: float
+
     def required(
-        self, form: FreeForm, power: Indices, p_gen: Array, after: Indices, price: Array
+        self,
+        form: FreeForm,
+        columns: tuple[Indices, Indices],
+        at: tuple[Array, Array],
+        after: Indices,
+        price: Array,
     ) -> tuple[FreeForm, Indices]:
-        """A program with a response to every ramp at some knots.
+        """A program with a response to every surprise.
 
         Args:
             form: the program.
-            power: its columns of powers less `p_gen`, at these knots, (n_knots, n_gen).
-            p_gen: pu, likewise.
+            columns: its columns of powers and of ω, less `at`, at all knots but the first, (n_knots, n_gen).
+            at: powers, pu, and ω, rad/s, likewise.
             after: the column after which those of a knot are to stand, (n_knots,).
             price: of a shortage of 1 rad/s at each knot, (n_knots,).
 
         Returns:
             The program, and where the columns of `form` stand in it.
         """
-        (n_knots, n_gen), n_ramps = power.shape, len(self.speeds)
-        count, ramp = n_knots * n_ramps, self.case.ramp
+        (count, n_gen), ramp, knot = self.speeds.shape, self.case.ramp, self.knot
         cost = np.zeros((count, n_gen + 1))
-        cost[:, -1] = np.repeat(price, n_ramps)
+        cost[:, -1] = price[knot]
         form, place, new = form.with_columns(
-            np.repeat(after, n_ramps * (n_gen + 1)),
+            np.repeat(after[knot], n_gen + 1),
             cost.ravel(),
             np.tile(np.append(-ramp, 0.0), count),
             np.tile(np.append(ramp, np.inf), count),
@@ -93,13 +128,20 @@ class Reserve:
             entries = np.broadcast_to(values, columns.shape).ravel()
             return sp.csc_matrix((entries, (row.ravel(), columns.ravel())), (count * n_gen, len(form.cost)))
 
-        every = (count, n_gen, n_gen)
-        speed = rows(np.broadcast_to(response[:, None, :], every), self.compliance)
-        short = rows(np.broadcast_to(shortage[:, :, None], (count, n_gen, 1)), np.ones(1))
-        at_knot = np.repeat(place[power], n_ramps, axis=0)
-        room = rows(np.stack([at_knot, response], axis=2), np.array([1.0, self.duration_s]))
-        alone = np.tile(self.speeds, (n_knots, 1)).ravel()
-        planned = np.repeat(p_gen, n_ramps, axis=0)
+        every, one = (count, n_gen, n_gen), (count, n_gen, 1)
+        power, omega = (place[c][knot][:, :, None] for c in columns)
+        swing, is_sudden = self.swing[:, None, None], (self.swing > 1.0)[:, None]
+        speed = rows(np.broadcast_to(response[:, None, :], every), swing * self.compliance)
+        if is_sudden.any():
+            speed = speed + rows(omega, np.broadcast_to(1.0 * is_sudden[:, :, None], one))
+        short = rows(np.broadcast_to(shortage[:, :, None], one), np.ones(1))
+        lasts = np.broadcast_to(self.lasts_s[:, None, None], one)
+        room = rows(
+            np.concatenate([power, response[:, :, None]], axis=2),
+            np.concatenate([np.ones(one), lasts], axis=2),
+        )
+        alone = (self.swing[:, None] * self.speeds + is_sudden * at[1][knot]).ravel()
+        planned = at[0][knot]
         free = np.full(alone.shape, np.inf)
         wider = form.with_rows(
             sp.vstack([speed - short, speed + short, room]),

@@ -19,6 +19,23 @@ from ded_bench.problem.schedule import Schedule
 SAME = 1e-6
 
 
+def passed_s(instance: Instance, in_force: Schedule | None, given: Schedule) -> float | None:
+    """How long ago the plan in force was given, s; None if it is another one.
+
+    Args:
+        instance: has the horizon of both.
+        in_force: the plan in force, on the time of the instance.
+        given: the plan, on its own time.
+    """
+    if in_force is None or len(in_force.t) < 3:
+        return None
+    # The end of the plan in force lies before the last time.
+    passed, ahead = instance.horizon_s - float(in_force.t[-2]), in_force.t[:-1]
+    if not 0 < round(passed / instance.dt_s) <= instance.steps:
+        return None
+    return passed if np.abs(given.at(ahead + passed) - in_force.p[:-1]).max() <= SAME else None
+
+
 class _Given(NamedTuple):
     """A plan, and what it was made for."""
 
@@ -57,18 +74,13 @@ class StateEstimate:
 
     def _ahead(self, in_force: Schedule | None) -> PlantState:
         """What the last plan has led to at the instance's t = 0; None if another one is in force."""
-        if self._given is None or in_force is None or len(in_force.t) < 3:
+        if self._given is None:
             return None
         instance, state, schedule = self._given
-        passed_s = instance.horizon_s - float(
-            in_force.t[-2]
-        )  # the end of the plan in force lies before the last
-        k, ahead = round(passed_s / instance.dt_s), in_force.t[:-1]
-        if (
-            not 0 < k <= instance.steps
-            or np.abs(schedule.at(ahead + passed_s) - in_force.p[:-1]).max() > SAME
-        ):
+        passed = passed_s(instance, in_force, schedule)
+        if passed is None:
             return None
+        k = round(passed / instance.dt_s)
         p_load = instance.p_load(self._plant.case)[: k + 1]
         try:
             p_set = schedule.at(instance.grid[: k + 1])

@@ -13,7 +13,7 @@ import numpy as np
 from ded_bench.methods.ed import first_schedules, slow_dispatch, within_ramps
 from ded_bench.methods.knot_program import KnotProgram, Prediction
 from ded_bench.methods.knots import is_reachable
-from ded_bench.methods.reserve import Reserve
+from ded_bench.methods.reserve import Room
 from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
 from ded_bench.plants.plant import PlantState
@@ -36,8 +36,9 @@ class Plan:
     """A plan to correct, by a program whose excess over bounds has a price."""
 
     last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
-    reserve: Reserve | None = None
+    reserve: Room | None = None
     state: PlantState = None  # of the plant at t = 0; None: the instance's
+    margin: Array | None = None  # by how much bounds are tighter at every grid point, (n_points,), rad/s
 
 
 def solve_on_surrogate(
@@ -79,8 +80,8 @@ def solve_on_surrogate(
 
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
-        reserve = None if plan is None else plan.reserve
-        program = KnotProgram(case, instance, bounds, model, reserve)
+        extra = (None, None) if plan is None else (plan.reserve, plan.margin)
+        program = KnotProgram(case, instance, bounds, model, *extra)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
         limits = program.near(program.model.omega) if is_near else set()

@@ -243,6 +243,13 @@ class Instance(Fingerprinted):
         inner = {t for load in self.load.values() for t in load.kinks if t < self.horizon_s}
         return np.array(sorted({0.0, self.horizon_s} | inner))
 
+    def until(self, horizon_s: float) -> Instance:
+        """The same with a horizon of no more than so many seconds; loads are known beyond it."""
+        shorter = self.model_copy(update={"horizon_s": min(horizon_s, self.horizon_s)})
+        for name in ("steps", "grid", "kinks"):  # cached
+            shorter.__dict__.pop(name, None)
+        return shorter
+
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
         times = self.grid if t is None else t

@@ -18,7 +18,7 @@ import numpy as np
 from ded_bench.methods.reserve import Reserve, Room
 from ded_bench.methods.state_estimate import passed_s
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance, LoadPoints
+from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
 from ded_bench.problem.sampling import RATE_ERROR, START_ERROR_S
 from ded_bench.problem.schedule import Schedule
 
@@ -71,7 +71,7 @@ class Surprises:
         self.now_s += passed or 0.0
         self._look(instance, passed or 0.0)
         later = {
-            bus: _delayed(instance.load[bus], at, WAIT_S - at)
+            bus: _delayed(instance.load[bus], at, WAIT_S - at, instance.horizon_s)
             for bus, (at, _) in zip(self._case.loads, self._next, strict=True)
             if at < WAIT_S
         }
@@ -141,14 +141,15 @@ class Surprises:
         asks = swing * np.abs(speeds).max(axis=1) > LIMIT * self._bound
         if not asks.any():
             return None
-        lasts = np.where(swing > 1.0, SWING_S, LASTS_S)
-        knots = np.array([j for j, *_ in found])
         return Room(
             self._case,
             self._all.compliance,
-            *(values[asks] for values in (knots, speeds, lasts, swing)),
-            LIMIT * self._bound,
-            PRICE,
+            knot=np.array([j for j, *_ in found])[asks],
+            speeds=speeds[asks],
+            lasts_s=np.where(swing > 1.0, SWING_S, LASTS_S)[asks],
+            swing=swing[asks],
+            limit=LIMIT * self._bound,
+            price=PRICE,
         )
 
     def _at(self, knot: int, t: float) -> list[tuple[int, int, float, bool]]:
@@ -166,9 +167,10 @@ class Surprises:
         return found
 
 
-def _delayed(load: LoadPoints, at: float, by: float) -> LoadPoints:
-    """A load that stays for some time at an instant, and goes on then; its last points are left off."""
-    here = float(load.at(np.array(at)))
-    before = tuple(point for point in load.points if point[0] < at)
-    after = tuple((t + by, value) for t, value in load.points if t > at)
-    return LoadPoints(points=(*before, (at, here), (at + by, here), *after))
+def _delayed(load: LoadRamp | LoadPoints, at: float, by: float, last: float) -> LoadPoints:
+    """A load that stays for some time at an instant, and goes on then; known up to `last`, all in s."""
+    times = sorted({0.0, *(t for t in load.kinks if t < last), at, last})
+    values = load.at(np.array(times)).tolist()
+    later = zip(((t + by if t >= at else t) for t in times), values, strict=True)
+    here = (at, float(load.at(np.array(at))))
+    return LoadPoints(points=tuple(sorted({*later, here})))

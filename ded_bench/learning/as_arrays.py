@@ -127,14 +127,13 @@ def condense(
     moved = np.einsum("jk,gi->jgki", hats, np.eye(n_gen)).reshape(len(hats), n_gen, -1)
     states, shape = model.states(moved), (len(schedule.t), n_gen)
     at = np.append(np.arange(len(model.lengths)), len(model.lengths) - 1)  # the last point is of the last
-    d_omega = states[:, model.speed] if isinstance(model.speed, slice) else model.speed[at] @ states
     d_slack = np.array([model.slack[j] @ x for j, x in zip(at, states, strict=True)])
     return CondensedMap(
         t=t,
         p=schedule.p,
         omega=model.omega[model.points],
         p_slack=model.p_slack[model.points],
-        d_omega=d_omega.reshape(-1, n_gen, *shape),
+        d_omega=states[:, model.speed].reshape(-1, n_gen, *shape),
         d_p_slack=d_slack.reshape(-1, *shape),
     )
 

@@ -20,6 +20,7 @@ import numpy as np
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
 from ded_bench.methods.admm.modal_kernels import (
     Array32,
+    Floats,
     MeanModes,
     Modes,
     mean_modes,
@@ -136,7 +137,7 @@ def limits_of(grid: ModalGrid, bound: float) -> AdmmLimits:
     )
 
 
-def filled_up(values: Array) -> Array32:
+def filled_up(values: Floats) -> Array32:
     """Values of modes, (..., n_modes), in single precision, with zeros for modes that there are not.
 
     Loops over modes take vectors; one by one, seven that are left over would take longer than all vectors.

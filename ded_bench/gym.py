@@ -11,9 +11,7 @@ import json
 from pathlib import Path
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
@@ -25,6 +23,12 @@ from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.loop import History
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box, Dict
+except ModuleNotFoundError:
+    raise InputError("gymnasium", "", "environments need it: pip install 'ded-bench[gym]'") from None
 
 __all__ = ["DispatchEnv", "register"]
 
@@ -101,6 +105,9 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             seed: of this episode and those after it; None: what follows from the seed before.
             options: `instance`, to be had instead of a draw.
 
+        Returns:
+            What is observed, as the class says, and `instance`.
+
         Raises:
             InputError: the instance is of another case.
         """
@@ -118,6 +125,12 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
 
     def step(self, action: NDArray[np.floating]) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Move the set-points for a second.
+
+        Args:
+            action: parts of the ramp limits, (n_gen,).
+
+        Returns:
+            What is observed, the reward, whether the episode is over, False, and more, as the class says.
 
         Raises:
             InputError: the action is no number for each generator, or the episode has ended.

@@ -18,9 +18,9 @@ from ded_bench.problem.benchmark import validation_instances
 from ded_bench.results.folder import search_folders
 
 #: No choice was made on these draws before.
-FIRST = 60_000
+FIRST = 70_000
 #: Of swings, and within which part of a bound is mended; the committed ones first.
-MARGINS = ((0.12, 0.06), (0.12, 0.04), (0.10, 0.04), (0.08, 0.06), (0.08, 0.04), (0.16, 0.06))
+MARGINS = ((0.10, 0.05), (0.10, 0.04), (0.08, 0.05), (0.11, 0.05), (0.12, 0.06))
 
 
 def main(name: str, count: int) -> None:

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import Plant, PlantState, plant_of, simulate
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.instance import Instance, LoadPoints, State
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import nominal_model
+
+if TYPE_CHECKING:
+    from ded_bench.plants.detailed.coarse import CoarsePlant
+    from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 
 #: Models that `ded-bench train-ko` identifies.
 TRAINED = ("koopman", "koopman-paper")
@@ -60,6 +67,55 @@ class AlongTrajectory:
         return self.plant.linearise_along(run, points)
 
 
+@dataclass(frozen=True)
+class AtNominalPoint(AlongTrajectory):
+    """`linear` on an island: the Jacobian at the nominal point, and rates of an instance's own start.
+
+    Secondary control acts on it as on the plant.
+    """
+
+    plant: DetailedPlant
+    kind: str = "linear"
+    _made: dict[tuple[bytes, float], TimeVarying] = field(default_factory=dict, compare=False, repr=False)
+    _coarse: dict[float, CoarsePlant] = field(default_factory=dict, compare=False, repr=False)
+
+    def along(
+        self,
+        case: Case,
+        instance: Instance,
+        p_gen: Array,
+        points: Indices,
+        exact: bool = True,
+        state: PlantState = None,
+    ) -> TimeVarying:
+        """See `AlongTrajectory.along`; what is followed is the linear model itself."""
+        from ded_bench.plants.detailed.coarse import CoarsePlant  # and with it Numba
+
+        start = self.plant.initial(instance) if state is None else state
+        key = points.tobytes(), start.next_s
+        if key not in self._made:
+            self._made[key] = self._at_rest(case, instance, points, start.next_s)
+        model, dt_s = self._made[key], instance.dt_s
+        coarse = self._coarse.setdefault(dt_s, CoarsePlant(self.plant.system, dt_s))
+        p_set = Schedule(instance.grid[points], p_gen).at(instance.grid)
+        omega, delivered = coarse.follow(coarse.begin(instance, start), p_set, linear=True)
+        assert model.delivered is not None
+        told = model.delivered._replace(p_gen=delivered)
+        return replace(model, omega=omega, p_gen=p_gen, delivered=told)
+
+    def _at_rest(self, case: Case, instance: Instance, points: Indices, next_s: float) -> TimeVarying:
+        """Maps of set-points along the nominal equilibrium."""
+        system = self.plant.system
+        power = system.network.nominal().power.real[system.scheduled]
+        nominal = zip(case.loads, case.load_nominal.tolist(), strict=True)
+        load = {bus: LoadPoints(points=((0.0, p), (instance.horizon_s, p))) for bus, p in nominal}
+        initial = State(None, np.zeros(len(power)), power).initial(case)
+        rest = instance.model_copy(update={"initial": initial, "load": load})
+        state = self.plant.initial(rest)._replace(next_s=next_s)
+        schedule = Schedule(instance.grid[[0, -1]], np.stack([power, power]))
+        return self.plant.linearise_along(simulate(case, rest, schedule, self.plant, state), points)
+
+
 #: A lifted model has one K for all instances and times; the other kind is made for each instance.
 Surrogate = Koopman | AlongTrajectory
 
@@ -72,6 +128,8 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
     """
     if name == TRAJECTORY:
         return AlongTrajectory(plant_of(case))
+    if name == "linear" and case.plant_name == "detailed" and case.slack is None:
+        return AtNominalPoint(plant_of(case))  # type: ignore[arg-type]
     return find_model(case, name, search)
 
 
@@ -85,7 +143,8 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
     if name == TRAJECTORY:
         raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
     if name in MODELS and case.plant_name != "lossless":
-        problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {TRAJECTORY}"
+        known = f"linear or {TRAJECTORY}" if case.slack is None else TRAJECTORY
+        problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {known}"
         raise InputError("--model", name, problem)
     path = find_model_file(case, name, search)
     return nominal_model(case) if path is None else Koopman.load(path, case)

@@ -43,7 +43,7 @@ def test_many_iterations_solve_the_linear_program(island: Case, instance: Instan
     grid = IslandGrid(island, "TO", HORIZON)
     asked = grid.ask(instance)
     near = grid.follow(asked, asked.start)
-    found, _, left = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))(asked, near, 1500, True)
+    found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))(asked, near, 1500, True)
     n, n_gen = grid.maps.mean.shape[1], len(island.generators)
     swings = [swings_by(grid.maps, np.float32(one).reshape(-1, n_gen)).ravel() for one in np.eye(n)]
     rows = np.vstack([grid.maps.mean, np.transpose(swings)])
@@ -62,7 +62,6 @@ def test_many_iterations_solve_the_linear_program(island: Case, instance: Instan
     gain = cost @ x0 - best.fun
     assert gain > 0.0
     assert abs(cost @ found[1:].ravel() - best.fun) < 0.02 * gain
-    assert left < 0.01
     outputs = at + rows @ (found[1:].ravel() - x0)
     assert (np.abs(outputs) < room + 0.01).all()
 

@@ -216,7 +216,7 @@ class IslandIterations:
 
     def __call__(
         self, asked: IslandProblem, near: Found, iterations: int, priced: bool, dual: Array32 | None = None
-    ) -> tuple[Array, Array32, float]:
+    ) -> tuple[Array, Array32]:
         """Iterate from a schedule.
 
         Args:
@@ -227,8 +227,7 @@ class IslandIterations:
             dual: to go on from; None: zero.
 
         Returns:
-            Set-points, (n_knots, n_gen), pu; the dual variables; by what part of its bound an output is
-            beyond it and its margin, by the linear answer.
+            Set-points, (n_knots, n_gen), pu; the dual variables.
         """
         grid, case = self.grid, self.grid.case
         n, n_gen = len(grid.knots) - 1, len(case.generators)
@@ -254,10 +253,10 @@ class IslandIterations:
         dual = np.zeros_like(offset32) if dual is None else dual.copy()
         change = np.zeros((n, n_gen), dtype=np.float32)
         given = Iterated(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
-        left = iterate(grid.maps, given, change, dual, iterations)
+        iterate(grid.maps, given, change, dual, iterations)
         found = near.schedule.copy()
         found[1:] = np.round((found[1:] + change) / RESOLUTION) * RESOLUTION
-        return grid.within(found, asked.p_initial, asked.room), dual, left
+        return grid.within(found, asked.p_initial, asked.room), dual
 
 
 class Iterated(NamedTuple):
@@ -330,31 +329,22 @@ def changes_by(maps: Maps, given: Iterated, rows: Array32, shape: tuple[int, int
 
 
 @compiled
-def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: int) -> float:
-    """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed.
-
-    Returns:
-        By how much outputs are outside of their limits at the end, at most.
-    """
+def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: int) -> None:
+    """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed."""
     relaxed = np.float32(RELAXATION)
     kept = np.empty_like(dual)
     for i in range(len(dual)):
         ahead = given.offset[i] + dual[i]
         kept[i] = min(max(ahead, given.low[i]), given.high[i])
         dual[i] = ahead - kept[i]
-    left = 0.0
     for _ in range(count):
-        left = 0.0
         wanted = changes_by(maps, given, kept - dual - given.offset, change.shape)
         change[:] = (np.dot(given.inverse, wanted) - given.pull).reshape(change.shape)
         rows = rows_by(maps, given, change) + given.offset
-        for i in range(len(change) * (1 + maps.swing.shape[1])):
-            left = max(left, rows[i] - given.high[i], given.low[i] - rows[i])
         for i in range(len(dual)):
             ahead = relaxed * rows[i] + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
             kept[i] = min(max(ahead, given.low[i]), given.high[i])
             dual[i] = ahead - kept[i]
-    return left
 
 
 @functools.lru_cache(maxsize=8)

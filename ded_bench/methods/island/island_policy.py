@@ -29,11 +29,9 @@ from ded_bench.problem.instance import Instance
 #: Settings of mending; the price is not used.
 MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 #: What is as near a bound as this part of it is mended.
-NEAR = 0.04
-#: Part of a bound by which mending may miss what it aims at, or it is simulated and mended again.
-LEFT = 0.03
+NEAR = 0.05
 #: How often, at most.
-MENDED = 3
+MENDED = 5
 
 
 class IslandPolicy(TrainedPolicy):
@@ -74,20 +72,18 @@ class IslandPolicy(TrainedPolicy):
         return answer
 
     def _improved(self, asked: IslandProblem, start: Array, count: int) -> Array:
-        """Of what is simulated, that with the least excess, if mending does not end well."""
+        """The first far enough from the bounds, else that with the least excess."""
         answer, dual, seen = start, None, []
         try:
             for _ in range(self.training["rounds"]):
                 seen.append(self.grid.follow(asked, answer))
-                answer, dual, _ = self.iterate(asked, seen[-1], count, True, dual)
+                answer, dual = self.iterate(asked, seen[-1], count, True, dual)
             for _ in range(MENDED):
                 seen.append(self.grid.follow(asked, answer))
                 if seen[-1].excess <= -NEAR:
                     return answer
-                mending = mending_of(self.grid)(asked, seen[-1], self.training["mending"], False)
-                answer, _, left = mending
-                if left < LEFT:
-                    return answer
+                answer, _ = mending_of(self.grid)(asked, seen[-1], self.training["mending"], False)
+            seen.append(self.grid.follow(asked, answer))
         except SimulationError:
             if not seen:
                 return start

@@ -39,7 +39,7 @@ from ded_bench.plants.detailed.machine_arrays import (
     SPEED,
     MachineArrays,
 )
-from ded_bench.plants.detailed.power_system import PowerSystem, interleaved
+from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.detailed.start import start
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.time_varying import Indices
@@ -189,13 +189,14 @@ class CoarsePlant:
             after = after @ f
         return answer.reshape(-1, len(f))
 
-    def begin(self, instance: Instance) -> CoarseStart:
-        """What an instance says.
+    def begin(self, instance: Instance, state: DetailedState | None = None) -> CoarseStart:
+        """What an instance says, from its own state at t = 0 or another.
 
         Raises:
             InputError, SimulationError: see `start`.
         """
-        system, state, maps = self.system, start(self.system, instance), self.maps
+        system, maps = self.system, self.maps
+        state = start(system, instance) if state is None else state
         n = round(instance.horizon_s / self.spacing_s)
         drawn = system.p_drawn(
             instance.p_load(system.case, np.linspace(0.0, instance.horizon_s, n * PARTS + 1))
@@ -209,12 +210,13 @@ class CoarsePlant:
         by_drawn = (at_points - maps.drawn) @ maps.by_load.T
         return CoarseStart(state.x, state.v_ref, at_points, by_drawn, push, state.held, first)
 
-    def follow(self, begun: CoarseStart, p_set: Array) -> tuple[Array, Array]:
+    def follow(self, begun: CoarseStart, p_set: Array, linear: bool = False) -> tuple[Array, Array]:
         """Frequencies and delivered powers at the points, (n_points, n_gen), rad/s and pu.
 
         Args:
             begun: the instance.
             p_set: set-points at the points, (n_points, n_gen), pu; linear between them.
+            linear: N stays what it is at t = 0.
 
         Raises:
             SimulationError: the network has no voltages any more.
@@ -223,8 +225,9 @@ class CoarsePlant:
         first, second = (part[:, machines].T for part in self._inputs)
         push = begun.push + p_set[:-1] @ first + np.diff(p_set, axis=0) @ second
         states = np.empty((len(p_set), *begun.x.shape))
-        network = system.compiled_network._replace(change=CHANGE)
-        if advance(system.data, network, self.maps, begun, push, states) < len(states):
+        network = system.compiled_network
+        network = network if linear else network._replace(change=CHANGE)
+        if advance(system.data, network, self.maps, begun, push, linear, states) < len(states):
             raise SimulationError("the network has no voltages any more")
         omega = states[:, SPEED, machines] * system.data.omega_0[machines]
         return omega, self.system.turbines(states)[:, machines]
@@ -264,6 +267,7 @@ def advance(
     maps: CoarseMaps,
     begun: CoarseStart,
     push: Array,
+    linear: bool,
     states: Array,
 ) -> int:
     """Integrate; `states` receives those at all points, (n_steps + 1, N_STATES, n_machine).
@@ -277,7 +281,7 @@ def advance(
     source, v = np.empty(len(maps.v)), maps.v.copy()
     last = v.copy()
     both, bent, held = np.zeros(n + n_seen), np.empty(len(maps.curved)), begun.held
-    before, linear, after = np.zeros(n_seen), np.empty(n_seen), np.empty(n)
+    before, sloped, after = np.zeros(n_seen), np.empty(n_seen), np.empty(n)
     for i in range(n):
         both[i] = flat[maps.moving[i]] - nominal[maps.moving[i]]
         flat[maps.moving[i]] = nominal[maps.moving[i]]
@@ -293,17 +297,18 @@ def advance(
             break
         if k >= begun.first and (k - begun.first) % maps.period == 0:
             held = -maps.gain * mean_angle(data, state)
-        sources(data, state, source)
-        for i in range(2 * len(maps.drawn)):
-            last[i], v[i] = v[i], 2.0 * v[i] - last[i] if k > 1 else v[i]
-        if solve_voltages(network, begun.drawn[k], source, maps.load, v, STEPS) > STEPS:
-            return k
-        machine_rates(data, state, v, maps.p_ref, begun.v_ref, rates, p_e)
-        np.dot(maps.slopes, bent, linear)
-        for i in range(n_seen):
-            new = changing[maps.moving[maps.seen[i]]] - linear[i] - begun.by_drawn[k, i]
-            both[n + i] = 1.5 * new - 0.5 * before[i] if k else new
-            before[i] = new
+        if k == 0 or not linear:
+            sources(data, state, source)
+            for i in range(2 * len(maps.drawn)):
+                last[i], v[i] = v[i], 2.0 * v[i] - last[i] if k > 1 else v[i]
+            if solve_voltages(network, begun.drawn[k], source, maps.load, v, STEPS) > STEPS:
+                return k
+            machine_rates(data, state, v, maps.p_ref, begun.v_ref, rates, p_e)
+            np.dot(maps.slopes, bent, sloped)
+            for i in range(n_seen):
+                new = changing[maps.moving[maps.seen[i]]] - sloped[i] - begun.by_drawn[k, i]
+                both[n + i] = 1.5 * new - 0.5 * before[i] if k else new
+                before[i] = new
         np.dot(maps.onward, both, after)
         for i in range(n):
             both[i] = after[i] + push[k, i] + held * maps.held[i]

@@ -101,6 +101,9 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             seed: of this episode and those after it; None: what follows from the seed before.
             options: `instance`, to be had instead of a draw.
 
+        Returns:
+            What is observed, as the class says, and `instance`.
+
         Raises:
             InputError: the instance is of another case.
         """
@@ -118,6 +121,12 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
 
     def step(self, action: NDArray[np.floating]) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Move the set-points for a second.
+
+        Args:
+            action: parts of the ramp limits, (n_gen,).
+
+        Returns:
+            What is observed, the reward, whether the episode is over, False, and more, as the class says.
 
         Raises:
             InputError: the action is no number for each generator, or the episode has ended.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong; the message names the source and the field.
+    """Something the user gave is wrong; the message names source, field and problem.
 
     The command line prints it as one line and exits with code 2.
     """

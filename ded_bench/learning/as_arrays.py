@@ -25,8 +25,8 @@ class SplitArrays:
     instances: tuple[Instance, ...]
     t: Array  # (n_t,), s
     load: Array  # injections at t, (n, n_t, n_load), pu
-    cost: Array  # of the generators, (n, n_gen)
-    cost_slack: Array  # (n,); 0 on an island
+    cost: Array  # of the generators, (n, n_gen), per pu and point of time
+    cost_slack: Array  # per pu and point of time, (n,); 0 on an island
     p_initial: Array  # (n, n_gen), pu
     omega_initial: Array  # (n, n_gen), rad/s
 
@@ -79,7 +79,7 @@ class CondensedMap:
     omega: Array  # of that trajectory, (n_t, n_gen), rad/s
     p_slack: Array  # (n_t,), pu
     d_omega: Array  # (n_t, n_gen, n_knots, n_gen), rad/s per pu
-    d_p_slack: Array  # (n_t, n_knots, n_gen)
+    d_p_slack: Array  # (n_t, n_knots, n_gen), pu per pu
 
 
 def linearise(

@@ -25,10 +25,11 @@ from ded_bench.problem.instance import Instance
 class CasadiModel:
     """Symbols and expressions (SX); limits of set-points and ramps are `p_min`, `p_max`, `ramp` of the case.
 
-    lossless: x are θ, then ω of the generators (rad, rad/s), z the angles of all other buses but the slack;
-    p is empty. detailed: x are the states of `plants.detailed.machine_arrays`, state after state, z the
-    voltages at ports, real and imaginary parts in turn (pu), p the exciters' references, what governors'
-    references are beyond set-points, and last what secondary control holds (pu).
+    lossless: `x` (n_x,) are θ, then ω of the generators (rad, rad/s), `z` (n_z,) the angles of all other
+    buses but the slack (rad); `p` (n_p,) is empty. detailed: `x` are the states of
+    `plants.detailed.machine_arrays`, state after state, `z` the voltages at ports, real and imaginary parts
+    in turn (pu), `p` the exciters' references, what governors' are beyond set-points, and last what
+    secondary control holds (pu).
     """
 
     case: Case
@@ -37,13 +38,13 @@ class CasadiModel:
     u: casadi.SX  # set-points, (n_gen,), pu
     p_load: casadi.SX  # load injections, (n_load,), pu
     p: casadi.SX  # constant, but for what secondary control holds
-    ode: casadi.SX
-    alg: casadi.SX
+    ode: casadi.SX  # dx/dt, (n_x,), in the units of x per s
+    alg: casadi.SX  # zero, (n_z,), pu
     omega: casadi.SX  # (n_gen,), rad/s, deviation from nominal
     p_gen: casadi.SX  # delivered, (n_gen,), pu
-    p_slack: casadi.SX  # pu; zero on an island
-    held: casadi.SX  # what secondary control holds from its next time on, the last of p, pu
-    start: Callable[[Instance], tuple[Array, Array, Array]]  # x, z and p at t = 0
+    p_slack: casadi.SX  # (1,), pu; zero on an island
+    held: casadi.SX  # what secondary control holds from its next time on, the last of p, (1,), pu
+    start: Callable[[Instance], tuple[Array, Array, Array]]  # x, z, p at t = 0, (n,) in their units
 
     @property
     def function(self) -> casadi.Function:
@@ -53,7 +54,7 @@ class CasadiModel:
         return casadi.Function("plant", given, answers, inputs, outputs)
 
     def monitored(self, regime: str) -> tuple[casadi.SX, Array, NDArray[np.bool_]]:
-        """Outputs y with |y| ≤ limit (rad/s), the limits, and which of them count at the end only.
+        """Outputs y (n_out,) with |y| ≤ limit (rad/s), the limits, and which of them count at the end only.
 
         Raises:
             InputError: the case has no such regime.

@@ -130,8 +130,8 @@ def cost_and_excess(
         regime: one of the case's.
 
     Returns:
-        `objective` (batch,) and `freq_violation_hz` (batch,) of `Score`; the second changes with the point
-        and the machine at which it is largest. For a mean over points use `simulated`.
+        `objective` (batch,), a cost, and `freq_violation_hz` (batch,), Hz, of `Score`; the second changes
+        with the point and machine at which it is largest. For a mean over points use `simulated`.
 
     Raises:
         InputError: unknown regime, or as for `simulated`.

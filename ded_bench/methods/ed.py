@@ -149,13 +149,13 @@ def slow_dispatch(case: Case, instance: Instance, points: Indices) -> Array:
     return within_ramps(case, instance, dispatch(case, instance, 1.0), points, PACE)
 
 
-def static_dispatch(case: Case, instance: Instance) -> Schedule:
-    """The static dispatch of every second, on an island as turbines are to deliver it.
+def static_dispatch(case: Case, instance: Instance, lead: bool = True) -> Schedule:
+    """The static dispatch of every second, on an island with `lead` as turbines are to deliver it.
 
     Where no powers within reach balance the loads, P_0 throughout.
     """
     try:
-        return dispatch(case, instance, 1.0, lead=case.slack is None)
+        return dispatch(case, instance, 1.0, lead and case.slack is None)
     except SimulationError:
         p_initial = instance.p_initial(case)
         return Schedule(np.array([0.0, instance.horizon_s]), np.stack([p_initial, p_initial]))
@@ -164,7 +164,8 @@ def static_dispatch(case: Case, instance: Instance) -> Schedule:
 def first_schedules(case: Case, instance: Instance, wanted: Array, points: Indices) -> Iterator[Array]:
     """Powers at the knots to try one after another, each of shape (n_knots, n_gen), pu; all start at P_0.
 
-    The wanted ones; every generator with its share of the load; P_0 throughout; and what lies in the middle.
+    The wanted ones; every generator with its share of the load; P_0 throughout; what lies in the middle; on
+    islands the static dispatch that no governor is led for, which all drawn instances can be served by.
 
     Args:
         case: the grid.
@@ -179,6 +180,8 @@ def first_schedules(case: Case, instance: Instance, wanted: Array, points: Indic
     yield constant
     yield (wanted + shared) / 2
     yield (constant + shared) / 2
+    if case.slack is None:
+        yield within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
 
 
 def within_ramps(case: Case, instance: Instance, plan: Schedule, points: Indices, pace: float = 1.0) -> Array:

@@ -34,7 +34,7 @@ class Solution:
     build_s: float | None = None
     setup_s: float | None = None
     solve_s: float | None = None
-    solver_objective: float | None = None
+    solver_objective: float | None = None  # the cost that it claims
     solver_version: str = ""
     error: str = ""
 

@@ -28,7 +28,7 @@ class Score:
     Islands have numbers about the mean frequency, weighted with inertia, and swings about it, too.
     """
 
-    objective: float  # Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points, delivered powers
+    objective: float  # cost Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points, delivered powers
     freq_violation_hz: float  # largest excess over any bound on frequencies
     ramp_violation: float  # max of (|P(t_k+1) - P(t_k)| - ε)_+, pu per step
     bound_violation: float  # max excess over limits of generators and transfers, pu

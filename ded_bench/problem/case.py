@@ -78,7 +78,8 @@ class Sampling(Extended):
 class Case(Fingerprinted, Extended):
     """What the records of all schemas share.
 
-    Generators are what a schedule gives set-points to; loads are named by their bus.
+    Generators are what a schedule gives set-points to; loads are named by their bus. Fields of all are `id`,
+    `f0_hz`, `machines` by generator, `ramp_pu_per_s`, `regimes`, `sampling` and `knots`.
     """
 
     if TYPE_CHECKING:  # each record declares its fields in the order of its file, as its fingerprint needs it
@@ -172,7 +173,7 @@ class Case(Fingerprinted, Extended):
     @property
     @abc.abstractmethod
     def inertia(self) -> Array:
-        """Weights of the generators in the mean frequency, shape (n_gen,)."""
+        """Weights of the generators in the mean frequency, (n_gen,), s² pu/rad, or s of machine models."""
 
     @property
     @abc.abstractmethod

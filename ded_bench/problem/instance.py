@@ -155,8 +155,8 @@ class Instance(Fingerprinted):
     seed: int | tuple[int, ...]
     horizon_s: Positive
     dt_s: Positive
-    cost: dict[Name, NonNegative]
-    load: dict[Name, Load]
+    cost: dict[Name, NonNegative]  # of what `Case.priced` names, per pu and point of time
+    load: dict[Name, Load]  # by bus
     initial: Initial
 
     @field_validator("seed", mode="after")
@@ -239,7 +239,7 @@ class Instance(Fingerprinted):
 
     @functools.cached_property
     def kinks(self) -> Array:
-        """Times at which a load may change its slope, beside 0 and the horizon, ascending, s."""
+        """Times at which a load may change its slope, beside 0 and the horizon, ascending, (n_kinks,), s."""
         inner = {t for load in self.load.values() for t in load.kinks if t < self.horizon_s}
         return np.array(sorted({0.0, self.horizon_s} | inner))
 
@@ -278,7 +278,7 @@ class Instance(Fingerprinted):
         return None if given is None else np.array([given[g] for g in case.generators])
 
     def cost_gen(self, case: Case) -> Array:
-        """Generator costs c_i, shape (n_gen,)."""
+        """Generator costs c_i per pu and point of time, shape (n_gen,)."""
         return np.array([self.cost[g] for g in case.generators])
 
     def cost_slack(self, case: Case) -> float:

@@ -166,10 +166,10 @@ class Trajectory:
     p_slack: Array  # (n,), pu
     case: Case
     states: Any = None  # of the plant that made it, for its own use
-    columns: Mapping[str, Array] = field(default_factory=dict)  # what only this plant has, by name
+    columns: Mapping[str, Array] = field(default_factory=dict)  # the plant's own by name, (n,), pu or rad
 
     def cost(self, cost_gen: Array, cost_slack: float) -> float:
-        """Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points (paper, objective)."""
+        """Cost Σ_k Σ_i c_i P_i(t_k) + c_s |P_s(t_k)| over all grid points (paper), of c_i (n_gen,)."""
         return float((self.p_gen @ cost_gen + cost_slack * np.abs(self.p_slack)).sum())
 
     def to_frame(self) -> pd.DataFrame:

@@ -11,7 +11,7 @@ from ded_bench import load_instances
 from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
 from ded_bench.methods.ded_slp import OPEN
-from ded_bench.methods.ed import slow_dispatch
+from ded_bench.methods.ed import first_schedules, slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.knots import case_knots
 from ded_bench.methods.radau_detailed import DetailedProgram, mesh
@@ -22,7 +22,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S, DetailedPlant
-from ded_bench.plants.plant import plant_of, simulate
+from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -156,6 +156,20 @@ def test_condensed_programs_have_the_optimum_of_those_with_states(
     elif way == "solve":
         kept = bounds.beyond(without.outputs)[points[1:]].max()
         assert kept < 1e-9
+
+
+def test_what_static_dispatch_serves_has_a_first_schedule() -> None:
+    """Near the limit of its voltages 68bus-agc-0070 carries neither led governors nor shares of the load."""
+    case = Case.load("68bus-agc")
+    near = next(one for one in load_instances("68bus-agc") if one.id == "68bus-agc-0070")
+    points, carried = case_knots(case, near), []
+    for powers in first_schedules(case, near, slow_dispatch(case, near, points), points):
+        try:
+            simulate(case, near, Schedule(near.grid[points], powers), exact=False)
+            carried.append(True)
+        except SimulationError:
+            carried.append(False)
+    assert carried == [False, False, False, False, False, True]
 
 
 def test_transfers_are_limits_of_programs(island: Case, instance: Instance) -> None:

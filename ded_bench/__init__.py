@@ -106,16 +106,10 @@ def solve(
     Raises:
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
-    from ded_bench.methods.solution import Settings
-    from ded_bench.results.folder import search_folders
-
     own = _case_of(instance, case)
     own.check_regimes([regime])
     instance.check_case(own)
-    chosen = settings or Settings()
-    if not chosen.search:
-        chosen = dataclasses.replace(chosen, search=search_folders(own))
-    return _prepared(own, method, regime, chosen)(instance)
+    return _prepared(own, method, regime, settings)(instance)
 
 
 def simulate(
@@ -211,30 +205,34 @@ def score(
 
 def _case_of(instance: Instance, case: Case | None) -> Case:
     from ded_bench.files.errors import InputError
-    from ded_bench.problem.case import SHIPPED_CASES
 
     if case is not None:
         return case
-    if not (SHIPPED_CASES / instance.case / "case.json").is_file():
+    if (shipped := _shipped(instance.case)) is None:
         raise InputError(f"instance {instance.id}", "case", f"{instance.case!r} is no shipped case: give it")
-    return _shipped(instance.case)
+    return shipped
 
 
 @functools.cache
-def _shipped(name: str) -> Case:
+def _shipped(name: str) -> Case | None:
     from ded_bench.problem.case import SHIPPED_CASES, Case
 
-    return Case.load(SHIPPED_CASES / name)
+    return Case.load(SHIPPED_CASES / name) if (SHIPPED_CASES / name / "case.json").is_file() else None
 
 
 @functools.lru_cache(maxsize=8)
-def _prepared(case: Case, method: str, regime: str, settings: Settings) -> Solver:
+def _prepared(case: Case, method: str, regime: str, settings: Settings | None) -> Solver:
     from threadpoolctl import ThreadpoolController, threadpool_limits
 
     from ded_bench.methods.registry import get_method
+    from ded_bench.methods.solution import Settings
+    from ded_bench.results.folder import search_folders
 
+    chosen = settings or Settings()
+    if not chosen.search:
+        chosen = dataclasses.replace(chosen, search=search_folders(case))
     with threadpool_limits(1):
-        solver = get_method(method).prepare(case, regime, settings)
+        solver = get_method(method).prepare(case, regime, chosen)
     libraries = ThreadpoolController()  # to find them takes milliseconds, a policy less than one
 
     def solve(instance: Instance) -> Solution:

@@ -11,9 +11,7 @@ import json
 from pathlib import Path
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
@@ -25,6 +23,12 @@ from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import ATTEMPTS, POLICY_SEED, VALIDATION_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.online.loop import History
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box, Dict
+except ModuleNotFoundError:
+    raise InputError("gymnasium", "", "environments need it: pip install 'ded-bench[gym]'") from None
 
 __all__ = ["DispatchEnv", "register"]
 

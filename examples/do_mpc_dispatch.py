@@ -2,7 +2,7 @@
 
 pip install do-mpc
 ded-bench solve --method do_mpc_dispatch:solve --regime TO --limit 2 --out results/mine
-ded-bench online --method do_mpc_dispatch:solve --regime TO --limit 1 --out results/mine
+ded-bench online --method do_mpc_dispatch:solve --regime TO --scenarios 1 --out results/mine
 """
 
 from functools import cache

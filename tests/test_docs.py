@@ -24,6 +24,7 @@ from ded_bench.problem.case import REPOSITORY
 
 REFERENCE = REPOSITORY / "results" / "9bus-reference"
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 LINKED = [*PAGES, *sorted((REPOSITORY / "studies").rglob("*.md"))]
 BLOCK = re.compile(
     r"(?:<!-- not tested: (?P<why>.*?) -->\n+)?^```(?P<kind>\S*)\n(?P<text>.*?)^```$", re.M | re.S
@@ -110,9 +111,9 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *EXAMPLES], ids=lambda page: page.name)
 def test_commands_and_options_exist(page: Path) -> None:
-    """Also in blocks that do not run and within sentences."""
+    """Also in blocks that do not run, within sentences and in what examples say of themselves."""
     commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
     text = re.sub(r"\\\n\s*", " ", page.read_text(encoding="utf-8"))
     for line in re.findall(r"ded-bench ([a-z][^\n`|]*)", text):

@@ -23,6 +23,7 @@ from ded_bench.run.online.judgement import judge_operation
 from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from tests.conftest import CASE_FILES
 from tests.detailed_cases import MIXED
+from tests.test_api import WITHOUT_TORCH
 
 #: Lossless, with ramp limits of its own and a feed-in; and an island with AGC and two machines at a bus.
 FOLDERS = {"fivemachine": CASE_FILES["fivemachine"].parent, "mixedisland": MIXED}
@@ -173,3 +174,9 @@ def test_gymnasium_is_not_imported_for_others(before: str, known: bool) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == [str(known)] * 2
+
+
+def test_without_gymnasium_it_says_what_to_install() -> None:
+    code = f"{WITHOUT_TORCH.replace('torch', 'gymnasium')}import ded_bench.gym"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1].endswith("environments need it: pip install 'ded-bench[gym]'")

@@ -85,7 +85,9 @@ def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path)
     package = tmp_path / "site" / "ded_bench" / "_reference_runs" / "9bus-reference"
     assert f"from {package / 'policies' / 'ded-dpc-TO.safetensors'}" in said
     assert f"from {package / 'koopman' / 'koopman.safetensors'}" in said
-    run(report)
+    first, *_, last = run(report).stdout.splitlines()
+    assert "methods and settings keep every limit" in first
+    assert last.endswith("; read results/9bus/report.html or results/9bus/report.md")
     assert (place / "results" / "9bus" / "report.html").is_file()
     summary = pd.read_csv(place / "results" / "9bus" / "tables" / "summary.csv").set_index("method")
     for method in ("ded-dpc", "ded-ko-knots"):

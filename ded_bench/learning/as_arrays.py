@@ -13,7 +13,7 @@ from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.benchmark import SplitName, select_split
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule, Trajectory
+from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.koopman import hat_functions
 
 
@@ -101,19 +101,7 @@ def linearise(
     """
     chosen = plant_of(case, plant)
     trajectory = simulate(case, instance, schedule, chosen)
-    return linearised_along(chosen, instance, schedule, trajectory, interval_s)
-
-
-def linearised_along(
-    plant: Plant, instance: Instance, schedule: Schedule, trajectory: Trajectory, interval_s: float
-) -> TimeVarying:
-    """As `linearise`, along a trajectory of the schedule."""
-    return plant.linearise_along(trajectory, _points(plant.case, instance, schedule, interval_s))
-
-
-def from_schedule(model: TimeVarying, instance: Instance, schedule: Schedule) -> Array:
-    """Powers at the model's knots by those at the schedule's rows, (n_model_knots, n_knots)."""
-    return hat_functions(instance.grid[model.points], schedule.t)
+    return chosen.linearise_along(trajectory, model_points(case, instance, schedule, interval_s))
 
 
 def condense(
@@ -133,24 +121,24 @@ def condense(
         InputError: as `simulate`.
     """
     model = linearise(case, instance, schedule, plant, interval_s)
-    hats, n_gen = from_schedule(model, instance, schedule), len(case.generators)
+    t, n_gen = instance.grid[model.points], len(case.generators)
+    hats = hat_functions(t, schedule.t)
     # Columns: the knot, then the generator, of which one is moved.
     moved = np.einsum("jk,gi->jgki", hats, np.eye(n_gen)).reshape(len(hats), n_gen, -1)
     states, shape = model.states(moved), (len(schedule.t), n_gen)
     at = np.append(np.arange(len(model.lengths)), len(model.lengths) - 1)  # the last point is of the last
-    d_omega = states[:, model.speed] if isinstance(model.speed, slice) else model.speed[at] @ states
     d_slack = np.array([model.slack[j] @ x for j, x in zip(at, states, strict=True)])
     return CondensedMap(
-        t=instance.grid[model.points],
+        t=t,
         p=schedule.p,
         omega=model.omega[model.points],
         p_slack=model.p_slack[model.points],
-        d_omega=d_omega.reshape(-1, n_gen, *shape),
+        d_omega=states[:, model.speed].reshape(-1, n_gen, *shape),
         d_p_slack=d_slack.reshape(-1, *shape),
     )
 
 
-def _points(case: Case, instance: Instance, schedule: Schedule, interval_s: float) -> Indices:
+def model_points(case: Case, instance: Instance, schedule: Schedule, interval_s: float) -> Indices:
     """Grid points of a model's knots, strictly increasing from the first to the last."""
     dt_s, last = instance.dt_s, instance.steps
     times = np.arange(0.0, instance.horizon_s, interval_s), schedule.t, control_times(case, instance)

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.learning.as_arrays import INTERVAL_S, from_schedule, linearised_along
+from ded_bench.learning.as_arrays import INTERVAL_S, model_points
 from ded_bench.plants.plant import Plant, SimulationError, in_threads, plant_of, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule, Trajectory
+from ded_bench.surrogates.koopman import hat_functions
 
 try:
     import torch
@@ -44,9 +45,9 @@ class _Runs:
             instance, run, p, *given = item
             if not isinstance(run, Trajectory):
                 return np.zeros_like(p)
-            schedule = Schedule(self.t, p)
-            model = linearised_along(self.plant, instance, schedule, run, self.interval_s)
-            return from_schedule(model, instance, schedule).T @ model.gradient(*given)
+            points = model_points(self.plant.case, instance, Schedule(self.t, p), self.interval_s)
+            model = self.plant.linearise_along(run, points)
+            return hat_functions(instance.grid[model.points], self.t).T @ model.gradient(*given)
 
         return in_threads(back, zip(self.instances, runs, power, *by, strict=True), self.threads)
 

@@ -59,9 +59,11 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
     """Return a solver of single instances.
 
     Raises:
-        InputError: the solver wants a lifted model, and this surrogate is none.
+        InputError: the case is an island; or the solver wants a lifted model, and this surrogate is none.
     """
     case.check_regimes([regime])
+    if case.slack is None:
+        raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
     solver = read_options(Options, settings.options).solver
     if solver != "piqp":
         if not isinstance(surrogate, Koopman):

@@ -31,11 +31,10 @@ class OutputRows:
 
     Args:
         model: a linear model along a trajectory.
-        speed: C of outputs, (n_intervals, n_out, n_state).
     """
 
-    def __init__(self, model: TimeVarying, speed: Array) -> None:
-        self._model, self._speed, self._n_out = model, speed, speed.shape[1]
+    def __init__(self, model: TimeVarying) -> None:
+        self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
         self._known: dict[int, tuple[Array, Array, Array]] = {}
 
@@ -64,7 +63,7 @@ class OutputRows:
         x, (start, end) = np.zeros((n, n_state)), np.zeros((2, n, n_gen))
         for i, (j, k, of) in enumerate(zip(interval.tolist(), point.tolist(), output.tolist(), strict=True)):
             if k == model.points[j]:
-                x[i] = self._speed[min(j, len(self._speed) - 1), of]
+                x[i] = model.output[of]
             else:
                 x[i], start[i], end[i] = (part[k - model.points[j] - 1, of] for part in self._inside(j))
         between = np.flatnonzero(point > model.points[interval])
@@ -82,7 +81,7 @@ class OutputRows:
         f, g, h = (part[j] for part in model.step)
         (n_state, n_gen), n = g.shape, length - 1
         x, (start, end) = np.empty((n, self._n_out, n_state)), np.empty((2, n, self._n_out, n_gen))
-        costate, on_start, on_slope = self._speed[j], 0.0, 0.0
+        costate, on_start, on_slope = model.output, 0.0, 0.0
         for k in range(n):
             on_slope = on_slope + on_start + costate @ h
             on_start = on_start + costate @ g

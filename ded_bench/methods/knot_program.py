@@ -130,7 +130,7 @@ class KnotProgram:
             form = self._columns.program(self._radius)
             low, high = self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
-            if isinstance(self.model.speed, slice) and not self.condensed:
+            if self.model.matrix is None and not self.condensed:
                 speed = self._columns.x[:, self.model.speed]
                 rows = self._frequency_rows(limits)
                 form.lower[speed], form.upper[speed] = least.reshape(speed.shape), most.reshape(speed.shape)
@@ -245,7 +245,7 @@ class KnotProgram:
         """How far outputs are beyond their bounds at all knots but the first, (n_intervals, n_out), rad/s."""
         u = np.zeros_like(self.model.p_gen)
         u[1:] = columns[self._columns.u]
-        change = (self._speed_at_knots @ self.model.states(u)[1:, :, None])[..., 0]
+        change = self.model.states(u)[1:] @ self.model.output.T
         return np.abs(self.model.omega[self.model.points[1:]] + change) - self.bounds.limit
 
     def near(self, outputs: Array, left_open: float = 0.0) -> set[Limit]:
@@ -345,22 +345,6 @@ class KnotProgram:
             limit, now = limit[pairs], now[pairs]
         return (-limit - now).ravel(), (limit - now).ravel()
 
-    @functools.cached_property
-    def _speed(self) -> Array:
-        """C of outputs in all intervals, (n_intervals, n_out, n_state)."""
-        speed = self.model.speed
-        if isinstance(speed, slice):
-            n_out = len(self.bounds.limit)
-            columns = np.zeros((self._n, n_out, self.model.slack.shape[1]))
-            columns[:, :, speed] = np.eye(n_out)
-            return columns
-        return speed
-
-    @property
-    def _speed_at_knots(self) -> Array:
-        """C of outputs at all knots but the first: a knot belongs to the interval after it."""
-        return np.concatenate([self._speed[1:], self._speed[-1:]])
-
     def _rows_held(self, limits: Indices) -> sp.csc_matrix:
         """Outputs at knots and between them whose limits have rows."""
         if self.condensed:  # the only columns are those of set-points
@@ -369,12 +353,13 @@ class KnotProgram:
 
     @functools.cached_property
     def _output_rows(self) -> OutputRows:
-        return OutputRows(self.model, self._speed)
+        return OutputRows(self.model)
 
     @functools.cached_property
     def _all_knots(self) -> sp.csc_matrix:
         row = np.arange(self._held.size).reshape(self._held.shape)
-        every = self._columns.matrix(row.size, [(row, self._columns.x, self._speed_at_knots)])
+        outputs = np.broadcast_to(self.model.output, (self._n, *self.model.output.shape))
+        every = self._columns.matrix(row.size, [(row, self._columns.x, outputs)])
         return every[np.flatnonzero(self._held)]
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:

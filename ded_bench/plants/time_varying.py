@@ -14,6 +14,7 @@ all intervals, around its own rollout under any powers.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -88,25 +89,27 @@ class TimeVarying:
     points: Indices  # (n_knots,): grid point of each knot
     step: Hold  # over one grid step, of each interval
     across: Hold  # over the whole of each interval, a reset at its start included
-    speed: slice | Array  # C: the entries δω of the state, or (n_intervals, n_gen, n_state)
+    speed: slice  # the entries δω of the state
     slack: Array  # (n_intervals, n_state): δP_s / δx
-    omega: Array  # (n_points, n_gen): of the trajectory, rad/s
+    omega: Array  # (n_points, n_gen): of the trajectory, rad/s; or outputs, (n_points, n_out)
     p_slack: Array  # (n_points,): of the trajectory, pu
     p_gen: Array  # (n_knots, n_gen): set-points of the trajectory, pu
     delivered: Delivered | None = None  # None: the set-points are delivered
     reset: Reset | None = None
+    matrix: Array | None = None  # (n_out, n_gen): outputs by ω; None: ω
 
     def monitored(self, matrix: Array) -> TimeVarying:
         """The same model with outputs y = matrix @ ω in the place of ω, matrix of shape (n_out, n_gen)."""
-        n_gen, n = matrix.shape[1], len(self.slack)
-        if np.array_equal(matrix, np.eye(n_gen)):
+        if np.array_equal(matrix, np.eye(matrix.shape[1])):
             return self
-        if isinstance(self.speed, slice):
-            speed = np.zeros((n, n_gen, self.slack.shape[1]))
-            speed[:, :, self.speed] = np.eye(n_gen)
-        else:
-            speed = self.speed
-        return replace(self, speed=matrix @ speed, omega=self.omega @ matrix.T)
+        return replace(self, matrix=matrix, omega=self.omega @ matrix.T)
+
+    @functools.cached_property
+    def output(self) -> Array:
+        """C: rows of outputs, (n_out, n_state)."""
+        rows = np.zeros((self.omega.shape[1], self.slack.shape[1]))
+        rows[:, self.speed] = np.eye(len(rows)) if self.matrix is None else self.matrix
+        return rows
 
     @property
     def lengths(self) -> Indices:
@@ -172,21 +175,9 @@ class TimeVarying:
 
     def _outputs(self, deviation: Array) -> tuple[Array, Array]:
         p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
-        if isinstance(self.speed, slice):
-            return self.omega + deviation[:, self.speed], self.p_slack + p_slack
-        change = np.empty_like(self.omega)
-        ends = [*self.points[1:-1], len(change)]  # the point at a knot belongs to the interval after it
-        for c, first, last in zip(self.speed, self.points, ends, strict=False):
-            change[first:last] = deviation[first:last] @ c.T
+        change = deviation[:, self.speed]
+        change = change if self.matrix is None else change @ self.matrix.T
         return self.omega + change, self.p_slack + p_slack
-
-    def _speed_rows(self, interval: Indices, generators: Indices) -> Array:
-        """Rows of C, shape (n_rows, n_state)."""
-        if not isinstance(self.speed, slice):
-            return np.asarray(self.speed[interval, generators])
-        rows = np.zeros((len(interval), self.slack.shape[1]))
-        rows[np.arange(len(interval)), self.speed.start + generators] = 1.0
-        return rows
 
     def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
         """δω at single grid points, as rows in the variables of the intervals that they lie in.
@@ -201,7 +192,7 @@ class TimeVarying:
 
         def add(r: int, costate: Array) -> None:
             here = np.flatnonzero(steps == r)
-            costate[place[here], slot[here]] += self._speed_rows(interval[here], generators[here])
+            costate[place[here], slot[here]] += self.output[generators[here]]
 
         rows = self._costates(int(slot.max(initial=-1)) + 1, add, chosen).take(place, slot)
         return rows._replace(interval=interval)
@@ -262,12 +253,9 @@ class TimeVarying:
         """
         length, owner = self.lengths, self._intervals
         on_state, on_input = by_p_slack[:, None] * self.slack[owner], by_p_gen.copy()
-        for j, k in enumerate(map(slice, self.points[:-1], [*self.points[1:-1], len(owner)])):
-            if isinstance(self.speed, slice):
-                on_state[k, self.speed] += by_omega[k]
-            else:
-                on_state[k] += by_omega[k] @ self.speed[j]
-            if self.delivered is not None:
+        on_state[:, self.speed] += by_omega if self.matrix is None else by_omega @ self.matrix
+        if self.delivered is not None:
+            for j, k in enumerate(map(slice, self.points[:-1], [*self.points[1:-1], len(owner)])):
                 on_state[k] += by_p_gen[k] @ self.delivered.c[j]
                 on_input[k] = by_p_gen[k] @ self.delivered.d[j]
 

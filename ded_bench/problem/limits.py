@@ -102,12 +102,6 @@ class IslandRegime(Record):
         return Bounds(np.vstack([mean, np.eye(n) - mean, mean]), 2 * np.pi * hz, at_end, kinds)
 
 
-def check_power_limits(p_min: float, p_max: float) -> None:
-    """Raise ValueError unless the lower one is below the upper one."""
-    if not p_min < p_max:
-        raise ValueError("p_min must be below p_max")
-
-
 class ScheduledMachine(Extended):
     """Power limits in pu and ramp limit of one machine."""
 
@@ -118,7 +112,8 @@ class ScheduledMachine(Extended):
 
     @model_validator(mode="after")
     def _ordered(self) -> ScheduledMachine:
-        check_power_limits(self.p_min, self.p_max)
+        if not self.p_min < self.p_max:
+            raise ValueError("p_min must be below p_max")
         return self
 
 

@@ -12,8 +12,8 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record
 from ded_bench.problem.case import Case, Sampling
 from ded_bench.problem.grid_files import unconnected
-from ded_bench.problem.limits import Regime, check_power_limits
-from ded_bench.problem.quantities import Array, Extended, Magnitude, Name, NonNegative, Number
+from ded_bench.problem.limits import Regime, ScheduledMachine
+from ded_bench.problem.quantities import Array, Magnitude, Name, NonNegative, Number
 
 
 class Bus(Record):
@@ -34,20 +34,15 @@ class Line(Record):
     x: Magnitude
 
 
-class Machine(Extended):
-    """Inertia m (s² pu/rad), damping d (s pu/rad), power limits in pu and ramp limit of one generator."""
+class Swing(Record):
+    """Inertia m (s² pu/rad) and damping d (s pu/rad) of one generator."""
 
     m: Magnitude
     d: NonNegative
-    p_nominal: Number
-    p_min: Number
-    p_max: Number
-    ramp_pu_per_s: Magnitude | None = None  # case/2; else the case's
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Machine:
-        check_power_limits(self.p_min, self.p_max)
-        return self
+
+class Machine(ScheduledMachine, Swing):
+    """Inertia and damping, power limits in pu and ramp limit of one generator."""
 
 
 class LosslessCase(Case):

@@ -138,7 +138,9 @@ def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
     assert "not allowed with" in refused(capsys, *SOLVE, *both, *chosen, *out)
     assert "--time-limit" in refused(capsys, *SOLVE, "--time-limit", "nan", *chosen, *out)
     assert "'XX'" in refused(capsys, "score", *chosen, "--schedule", schedule_file, "--regime", "XX")
-    assert "train-ko" in refused(capsys, "solve", "--method", "ded-ko", "--regime", "NO", *chosen, *out)
+    said = refused(capsys, "solve", "--method", "ded-ko-knots", "--regime", "NO", *chosen, *out)
+    assert "run `ded-bench train-ko --case" in said
+    assert "or use --model trajectory" in said
     assert "COMMAND" in refused(capsys)
     assert not (tmp_path / "out").exists()
 

@@ -205,9 +205,10 @@ def test_programs_along_trajectories_nearly_keep_bounds(
 
 @pytest.mark.parametrize("method", sorted(set(METHODS) - set(PLANNING)))
 def test_others_refuse_with_one_line(island: Case, instance: Instance, method: str) -> None:
-    with pytest.raises(InputError) as refusal:
-        get_method(method).prepare(island, "TO", Settings())(instance)
-    assert "\n" not in str(refusal.value)
+    for model in (None, "linear"):
+        with pytest.raises(InputError) as refusal:
+            get_method(method).prepare(island, "TO", Settings(model=model))(instance)
+        assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

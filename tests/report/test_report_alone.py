@@ -46,9 +46,10 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
 
 
 @pytest.mark.usefixtures("sketched")
-def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rows", [1, 2])
+def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path, rows: int) -> None:
     """The best feasible schedule is the yardstick, and the first kept schedule is drawn."""
-    instances = select_split(problem, "all").instances[:2]
+    instances = select_split(problem, "all").instances[:rows]
     tasks = make_tasks(threebus, instances, ["ed"], ["NO"], Settings())
     run(threebus, tasks, Results(tmp_path))
     said: list[str] = []

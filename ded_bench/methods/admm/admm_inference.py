@@ -20,6 +20,7 @@ import numpy as np
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
 from ded_bench.methods.admm.modal_kernels import (
     Array32,
+    Floats,
     MeanModes,
     Modes,
     mean_modes,
@@ -58,6 +59,8 @@ PRICE = 0.1
 DOUBLING = 0.05
 #: Relative excess beyond which the price stays as it is: at first a few schedules are far outside.
 STRAIGHT = 0.2
+#: Vectors of the processor take so many modes; what is left over, if more than so many, is filled up.
+VECTOR, LEFT_OVER = 8, 4
 
 
 class AdmmLimits(NamedTuple):
@@ -129,9 +132,21 @@ def limits_of(grid: ModalGrid, bound: float) -> AdmmLimits:
         mass=grid.mass,
         unit=unit,
         price=unit / ((len(grid.knots) - 1) * largest),
-        gain=grid.gain.astype(np.float32),
-        shape=grid.shape.astype(np.float32),
+        gain=filled_up(grid.gain),
+        shape=filled_up(grid.shape.T).T.copy(),
     )
+
+
+def filled_up(values: Floats) -> Array32:
+    """Values of modes, (..., n_modes), in single precision, with zeros for modes that there are not.
+
+    Loops over modes take vectors; one by one, seven that are left over would take longer than all vectors.
+    """
+    *shape, n = values.shape
+    more = -n % VECTOR if n % VECTOR > LEFT_OVER else 0
+    filled = np.zeros((*shape, n + more), np.float32)
+    filled[..., :n] = values
+    return filled
 
 
 def mean_modes_of(grid: ModalGrid, linear: ModalLinearisation) -> MeanModes:
@@ -148,9 +163,7 @@ class CompiledIterations:
         self._grid, self._limits, modes = grid, limits_of(grid, bound), grid.modes
         self.settings = settings_of(nodes, iterations)
         self.settings[:, :PENALTIES] *= self._limits.price
-        self._modes = modes._replace(
-            step=modes.step.astype(np.float32), damping=modes.damping.astype(np.float32)
-        )
+        self._modes = modes._replace(step=filled_up(modes.step), damping=filled_up(modes.damping))
 
     def __call__(self, start: Start, linear: ModalLinearisation, schedule: Array) -> Array:
         """Powers at the knots, from first ones, both (batch, n_knots, n_gen), pu."""
@@ -159,11 +172,11 @@ class CompiledIterations:
         nominal, changes = (part @ grid.shape.T for part in taken)
         given = AdmmProblems(
             cost=start.problems.cost / start.scale[:, None],
-            offset=linear.offset.astype(np.float32),
+            offset=filled_up(linear.offset),
             slack=linear.slack.astype(np.float32),
             slack_of_mode=(nominal + grid.between @ changes).astype(np.float32),
-            change=linear.change.astype(np.float32),
-            state=start.state.astype(np.float32),
+            change=filled_up(linear.change),
+            state=filled_up(start.state),
             mean=mean_modes_of(grid, linear),
         )
         iterate(powers, given, self._limits, self._modes, self.settings)
@@ -254,11 +267,12 @@ def _project_response(
     omega, p_slack = outcome
     speeds, slack = copies
     (n_points, n_gen), n, points = omega.shape, len(gradient), (len(omega) - 1) // (len(gradient) - 1)
+    n_modes = limits.gain.shape[1]
     relaxed, tight = np.float32(setting[6]), np.float32(limits.bound * (1.0 - setting[7]))
     weight = np.float32(setting[2] / (limits.bound**2 * points))
     per_weight = np.float32(1.0) / weight
-    on_omega, on_v = np.empty((n_points, n_gen), np.float32), np.empty((1, n_points, n_gen), np.float32)
-    on_q, on_speed = np.empty_like(on_v), np.empty_like(on_v)
+    on_omega, on_v = np.empty((n_points, n_gen), np.float32), np.empty((1, n_points, n_modes), np.float32)
+    on_q, on_speed = np.zeros_like(on_v), np.empty_like(on_v)
     heavy, other = setting[3] / (limits.unit**2 * points), np.float32(1.0) - relaxed
     price, per_heavy = given.cost[b, 0] / heavy / (n_points - 1), 1.0 / heavy
     for k in range(n_points):
@@ -277,11 +291,11 @@ def _project_response(
             on_q[0, k, m] = -force * given.slack_of_mode[b, k, m]
     np.dot(on_omega, limits.shape.T, on_speed[0])
     swing_adjoint(modes, given.change[b : b + 1], on_q, on_speed, on_v)
-    on_knots = np.zeros((n, n_gen), np.float32)
+    on_knots = np.zeros((n, n_modes), np.float32)
     for j in range(n - 1):
         for i in range(points):
             later = np.float32(i / points)
-            for m in range(n_gen):
+            for m in range(n_modes):
                 on_knots[j, m] += (np.float32(1.0) - later) * on_v[0, j * points + i, m]
                 on_knots[j + 1, m] += later * on_v[0, j * points + i, m]
     on_knots[n - 1] += on_v[0, n_points - 1]
@@ -338,14 +352,15 @@ def _respond(
 ) -> None:
     """What a schedule does: ω (n_points, n_gen) and P_s (n_points,); see `ModalGrid.respond`."""
     (n, n_gen), n_points = powers.shape, len(p_slack)
-    points, force = (n_points - 1) // (n - 1), np.empty((1, n_points, n_gen), np.float32)
+    n_modes, points = limits.gain.shape[1], (n_points - 1) // (n - 1)
+    force = np.empty((1, n_points, n_modes), np.float32)
     q, speed = np.empty_like(force), np.empty_like(force)
     at_knots = np.dot(powers.astype(np.float32), limits.gain)
     force[0] = given.offset[b]
     for j in range(n - 1):
         for i in range(points):
             later = np.float32(i / points)
-            for m in range(n_gen):
+            for m in range(n_modes):
                 here = at_knots[j, m] + later * (at_knots[j + 1, m] - at_knots[j, m])
                 force[0, j * points + i, m] += here
     force[0, n_points - 1] += at_knots[n - 1]

@@ -82,14 +82,15 @@ def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> 
     so that products add up rows.
 
     Args:
-        modes: the grid; its arrays and the others are all of one precision.
+        modes: the grid; its arrays and the others are all of one precision. Their last axis may have more
+            modes, whose values are zero.
         change: C linear between its points, (batch, n_stiffness, n_modes, n_modes), 1/s².
         v: inputs, (batch, n_points, n_modes).
         q: coordinates, (batch, n_points, n_modes); the first row is given.
         speed: their derivatives, likewise.
     """
     n, step, damping = v.shape[2], modes.step, modes.damping
-    kicked, kick, held = np.empty(n, v.dtype), np.empty(n, v.dtype), np.empty((n, n), v.dtype)
+    kicked, kick, held = np.empty(n, v.dtype), np.empty(n, v.dtype), np.empty(change.shape[2:], v.dtype)
     damped, shares = np.any(damping != 0.0), np.empty(2, v.dtype)
     for b in range(len(v)):
         for k in range(v.shape[1]):
@@ -133,18 +134,18 @@ def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Fl
     shares[1] = modes.half * min(later, 1.0)
     shares[0] = modes.half - shares[1]
     for j in range(len(held)):
-        for i in range(len(held)):
+        for i in range(held.shape[1]):
             held[j, i] = shares[0] * change[b, part, j, i] + shares[1] * change[b, part + 1, j, i]
 
 
 @inlined
 def _add_product(matrix: Floats, rows: Floats, b: int, k: int, found: Floats) -> None:
     """Add a symmetric matrix times one of the rows, four columns at a time."""
-    n = len(found)
+    n = len(matrix)
     whole = n - n % 4
     for j in range(0, whole, 4):
         one, two, three, four = rows[b, k, j], rows[b, k, j + 1], rows[b, k, j + 2], rows[b, k, j + 3]
-        for i in range(n):
+        for i in range(len(found)):
             found[i] += (
                 one * matrix[j, i]
                 + two * matrix[j + 1, i]
@@ -153,7 +154,7 @@ def _add_product(matrix: Floats, rows: Floats, b: int, k: int, found: Floats) ->
             )
     for j in range(whole, n):
         one = rows[b, k, j]
-        for i in range(n):
+        for i in range(len(found)):
             found[i] += one * matrix[j, i]
 
 
@@ -172,7 +173,11 @@ def swing_adjoint(modes: Modes, change: Floats, on_q: Floats, on_speed: Floats, 
     """
     n, step, damping = on_v.shape[2], modes.step, modes.damping
     by_q, by_speed, by_kicked = np.empty(n, on_v.dtype), np.empty(n, on_v.dtype), np.empty(n, on_v.dtype)
-    kick, loss, held = np.empty(n, on_v.dtype), np.zeros(n, on_v.dtype), np.empty((n, n), on_v.dtype)
+    kick, loss, held = (
+        np.empty(n, on_v.dtype),
+        np.zeros(n, on_v.dtype),
+        np.empty(change.shape[2:], on_v.dtype),
+    )
     both, shares, damped = np.empty((1, 1, n), on_v.dtype), np.empty(2, on_v.dtype), np.any(damping != 0.0)
     for b in range(len(on_v)):
         by_q[:] = 0.0  # of q and of the kicked speed at this point, from what follows

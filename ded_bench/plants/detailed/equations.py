@@ -1,6 +1,6 @@
 """The equations of the plant for simulation: machines with controls, and the network's voltages; compiled.
 
-The same equations stand symbolically in `symbolic`. Voltages are real and imaginary parts in turn, in a frame
+Those of a machine serve `symbolic`, too. Voltages are real and imaginary parts in turn, in a frame
 that turns with the inertia-weighted mean of the rotor angles, so that they change slowly.
 
 A machine is a constant admittance 1 / (j x) with a current source beside it, so that only the loads make the
@@ -14,13 +14,13 @@ then. W is renewed where it converges slowly.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.machine_arrays import MachineArrays
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, inlined
 from ded_bench.problem.quantities import Array
 
 #: The fixed point gives up after so many steps, Newton's method, which renews W in each, after so many.
@@ -145,6 +145,50 @@ def solve_afresh(network: CompiledNetwork, drawn: Array, source: Array, load: Lo
     return False
 
 
+def set_rates(
+    m: Any, s: Any, current: tuple[Any, Any], v: Any, references: tuple[Any, Any], p_e: Any, rates: Any
+) -> None:
+    """Set the rates of all states of a machine, in any algebra, or of several.
+
+    Args:
+        m: its constants.
+        s: its states, (N_STATES,).
+        current: into the network, d and q, pu.
+        v: size of its bus's voltage, pu.
+        references: of governor and exciter, pu.
+        p_e: power into the network, pu.
+        rates: receives the rates, (N_STATES,), 1/s.
+    """
+    (i_d, i_q), (p_ref, v_ref), w = current, references, s[at.SPEED]
+    i_fd = m.gd1 * i_d + m.gd2 * (s[at.E1Q] - s[at.E2D])
+    i_fd = s[at.E1Q] + (m.xd - m.xd1) * i_fd
+    i_1q = m.gq2 * (s[at.E1D] - s[at.E2Q]) - m.gq1 * i_q
+    i_1q = s[at.E1D] + (m.xq - m.xq1) * i_1q
+    after = m.ks * w - s[at.WASHOUT]
+    between = m.lead_a * (after - s[at.LEAD_A]) + s[at.LEAD_A]
+    v_s = m.lead_b * (between - s[at.LEAD_B]) + s[at.LEAD_B]
+    u = v_ref - v + v_s - m.dc * m.lead * (s[at.FIELD] - s[at.FEEDBACK])
+    static = m.gain * (m.lead * (u - s[at.EXCITER]) + s[at.EXCITER])
+    drive = m.dc * s[at.EXCITER] + (1.0 - m.dc) * static
+    rates[at.DELTA] = m.omega_0 * w
+    rates[at.SPEED] = m.inverse_m * (m.reheat * (s[at.GATE] - s[at.TURBINE]) + s[at.TURBINE] - p_e - m.d * w)
+    rates[at.E1Q] = m.rate_d1 * (s[at.FIELD] - i_fd)
+    rates[at.E1D] = -m.rate_q1 * i_1q
+    rates[at.E2D] = m.rate_d2 * (s[at.E1Q] - s[at.E2D] - (m.xd1 - m.xl) * i_d)
+    rates[at.E2Q] = m.rate_q2 * (s[at.E1D] - s[at.E2Q] + (m.xq1 - m.xl) * i_q)
+    rates[at.EXCITER] = m.rate_x * ((m.dc * m.gain + (1.0 - m.dc)) * u - s[at.EXCITER])
+    rates[at.FIELD] = m.rate_f * (drive - m.ke * s[at.FIELD])
+    rates[at.FEEDBACK] = m.rate_fb * (s[at.FIELD] - s[at.FEEDBACK])
+    rates[at.WASHOUT] = m.rate_w * after
+    rates[at.LEAD_A] = m.rate_a * (after - s[at.LEAD_A])
+    rates[at.LEAD_B] = m.rate_b * (between - s[at.LEAD_B])
+    rates[at.GATE] = m.rate_g * (p_ref - m.droop * w - s[at.GATE])
+    rates[at.TURBINE] = m.rate_h * (s[at.GATE] - s[at.TURBINE])
+
+
+_set_rates = inlined(set_rates)
+
+
 @compiled
 def machine_rates(
     data: MachineArrays, x: Array, v: Array, p_ref: Array, v_ref: Array, rates: Array, p_e: Array
@@ -162,7 +206,6 @@ def machine_rates(
     """
     turn = mean_angle(data, x)
     for i in range(x.shape[1]):
-        w = x[at.SPEED, i]
         e1q, e1d, e2d, e2q = x[at.E1Q, i], x[at.E1D, i], x[at.E2D, i], x[at.E2Q, i]
         re, im = v[2 * data[i].port], v[2 * data[i].port + 1]
         sin, cos = np.sin(x[at.DELTA, i] - turn), np.cos(x[at.DELTA, i] - turn)
@@ -170,32 +213,5 @@ def machine_rates(
         i_d = (data[i].gd1 * e1q + (1.0 - data[i].gd1) * e2d - v_q) / data[i].x
         i_q = (v_d - data[i].gq1 * e1d - (1.0 - data[i].gq1) * e2q) / data[i].x
         p_e[i] = v_d * i_d + v_q * i_q
-        p_m = data[i].reheat * (x[at.GATE, i] - x[at.TURBINE, i]) + x[at.TURBINE, i]
-        rates[at.DELTA, i] = data[i].omega_0 * w
-        rates[at.SPEED, i] = data[i].inverse_m * (p_m - p_e[i] - data[i].d * w)
-        i_fd = data[i].gd1 * i_d + data[i].gd2 * (e1q - e2d)
-        i_fd = e1q + (data[i].xd - data[i].xd1) * i_fd
-        i_1q = data[i].gq2 * (e1d - e2q) - data[i].gq1 * i_q
-        i_1q = e1d + (data[i].xq - data[i].xq1) * i_1q
-        rates[at.E1Q, i] = data[i].rate_d1 * (x[at.FIELD, i] - i_fd)
-        rates[at.E1D, i] = -data[i].rate_q1 * i_1q
-        rates[at.E2D, i] = data[i].rate_d2 * (e1q - e2d - (data[i].xd1 - data[i].xl) * i_d)
-        rates[at.E2Q, i] = data[i].rate_q2 * (e1d - e2q + (data[i].xq1 - data[i].xl) * i_q)
-        after = data[i].ks * w - x[at.WASHOUT, i]
-        between = data[i].lead_a * (after - x[at.LEAD_A, i]) + x[at.LEAD_A, i]
-        v_s = data[i].lead_b * (between - x[at.LEAD_B, i]) + x[at.LEAD_B, i]
-        rates[at.WASHOUT, i] = data[i].rate_w * after
-        rates[at.LEAD_A, i] = data[i].rate_a * (after - x[at.LEAD_A, i])
-        rates[at.LEAD_B, i] = data[i].rate_b * (between - x[at.LEAD_B, i])
-        u = v_ref[i] - np.sqrt(re * re + im * im) + v_s
-        if data[i].dc > 0.0:
-            u -= data[i].lead * (x[at.FIELD, i] - x[at.FEEDBACK, i])
-            rates[at.EXCITER, i] = data[i].rate_x * (data[i].gain * u - x[at.EXCITER, i])
-            rates[at.FIELD, i] = data[i].rate_f * (x[at.EXCITER, i] - data[i].ke * x[at.FIELD, i])
-        else:
-            into = data[i].gain * (data[i].lead * (u - x[at.EXCITER, i]) + x[at.EXCITER, i])
-            rates[at.EXCITER, i] = data[i].rate_x * (u - x[at.EXCITER, i])
-            rates[at.FIELD, i] = data[i].rate_f * (into - x[at.FIELD, i])
-        rates[at.FEEDBACK, i] = data[i].rate_fb * (x[at.FIELD, i] - x[at.FEEDBACK, i])
-        rates[at.GATE, i] = data[i].rate_g * (p_ref[i] - data[i].droop * w - x[at.GATE, i])
-        rates[at.TURBINE, i] = data[i].rate_h * (x[at.GATE, i] - x[at.TURBINE, i])
+        size = np.sqrt(re * re + im * im)
+        _set_rates(data[i], x[:, i], (i_d, i_q), size, (p_ref[i], v_ref[i]), p_e[i], rates[:, i])

@@ -1,6 +1,6 @@
 """The equations of the plant once, symbolically: machines, controls and network balance with their Jacobians.
 
-For linearisation, collocation (in Pyomo) and tests; the compiled ones for simulation are in `equations`.
+For linearisation, collocation (in Pyomo) and tests; `equations` has rates, and all compiled for simulation.
 Sources: the models GENROU, GENCLS, SEXS, IEEEX1, ST2CUT and TGOV1 as power-system simulators have them
 (P. W. Sauer, M. A. Pai, Power System Dynamics and Stability; IEEE Std 421.5).
 """
@@ -14,6 +14,7 @@ import casadi
 import numpy as np
 
 from ded_bench.plants.detailed import machine_arrays as at
+from ded_bench.plants.detailed.equations import set_rates
 from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.plants.detailed.power_flow import PortNetwork
 
@@ -93,9 +94,9 @@ def plant_equations(
     psi_q = data.gq1 * s[at.E1D] + (1 - data.gq1) * s[at.E2Q]
     i_d, i_q = (psi_d - v_q) / data.x, (v_d - psi_q) / data.x
     size = functions.sqrt(v_d**2 + v_q**2)
-    rates, p_m = _rates(data, s, (i_d, i_q), size, (p_ref, v_ref))
-    p_e = v_d * i_d + v_q * i_q
-    rates[at.SPEED] = data.inverse_m * (p_m - p_e - data.d * s[at.SPEED])
+    p_e, p_m = v_d * i_d + v_q * i_q, data.reheat * (s[at.GATE] - s[at.TURBINE]) + s[at.TURBINE]
+    rates: list[Any] = [None] * at.N_STATES
+    set_rates(data, s, (i_d, i_q), size, (p_ref, v_ref), p_e, rates)
     # Out of dq: the current's frame is turned by delta - pi/2.
     i_re, i_im = i_d * sin + i_q * cos, i_q * sin - i_d * cos
     y, q, square = network.admittance, network.q_drawn, v_re**2 + v_im**2
@@ -104,40 +105,3 @@ def plant_equations(
     balance_re = into @ i_re - (drawn * v_re + q * v_im) / square - (g @ v_re - b @ v_im)
     balance_im = into @ i_im - (drawn * v_im - q * v_re) / square - (g @ v_im + b @ v_re)
     return Equations(rates, (balance_re, balance_im), p_e, p_m)
-
-
-def _rates(
-    data: MachineArrays,
-    s: Sequence[Any],
-    current: tuple[Any, Any],
-    v: Any,
-    references: tuple[Any, Any],
-) -> tuple[list[Any], Any]:
-    """Rates of all states but the speeds, turbines' powers."""
-    (i_d, i_q), (p_ref, v_ref) = current, references
-    w = s[at.SPEED]
-    after = data.ks * w - s[at.WASHOUT]
-    lead = data.lead_a * (after - s[at.LEAD_A]) + s[at.LEAD_A]
-    v_s = data.lead_b * (lead - s[at.LEAD_B]) + s[at.LEAD_B]
-    feedback = data.dc * data.lead * (s[at.FIELD] - s[at.FEEDBACK])
-    u = v_ref - v - feedback + v_s
-    static = data.gain * (data.lead * (u - s[at.EXCITER]) + s[at.EXCITER])
-    drive = data.dc * s[at.EXCITER] + (1 - data.dc) * static
-    i_fd = s[at.E1Q] + (data.xd - data.xd1) * (data.gd1 * i_d - data.gd2 * (s[at.E2D] - s[at.E1Q]))
-    i_1q = s[at.E1D] + (data.xq - data.xq1) * (-data.gq1 * i_q + data.gq2 * (s[at.E1D] - s[at.E2Q]))
-    p_m = data.reheat * (s[at.GATE] - s[at.TURBINE]) + s[at.TURBINE]
-    rates: list[Any] = [None] * at.N_STATES
-    rates[at.DELTA] = data.omega_0 * w
-    rates[at.E1Q] = data.rate_d1 * (s[at.FIELD] - i_fd)
-    rates[at.E1D] = -data.rate_q1 * i_1q
-    rates[at.E2D] = data.rate_d2 * (s[at.E1Q] - s[at.E2D] - (data.xd1 - data.xl) * i_d)
-    rates[at.E2Q] = data.rate_q2 * (s[at.E1D] - s[at.E2Q] + (data.xq1 - data.xl) * i_q)
-    rates[at.EXCITER] = data.rate_x * ((data.dc * data.gain + 1 - data.dc) * u - s[at.EXCITER])
-    rates[at.FIELD] = data.rate_f * (drive - data.ke * s[at.FIELD])
-    rates[at.FEEDBACK] = data.rate_fb * (s[at.FIELD] - s[at.FEEDBACK])
-    rates[at.WASHOUT] = data.rate_w * after
-    rates[at.LEAD_A] = data.rate_a * (after - s[at.LEAD_A])
-    rates[at.LEAD_B] = data.rate_b * (lead - s[at.LEAD_B])
-    rates[at.GATE] = data.rate_g * (p_ref - data.droop * w - s[at.GATE])
-    rates[at.TURBINE] = data.rate_h * (s[at.GATE] - s[at.TURBINE])
-    return rates, p_m

@@ -194,7 +194,7 @@ def representative(sources: Sources, regime: str) -> pd.DataFrame:
     rows = rows.assign(gap_percent=rows["gap_percent"].fillna(0.0))
     kept = titled(where(rows, map(sources.has_schedule, rows["key"])))
     reference = kept[kept["method"] == sources.reference.method]
-    gaps = rows["gap_percent"].groupby(rows["method"])
+    gaps = rows.groupby("method")["gap_percent"]
     trained = {name for name, method in METHODS.items() if method.trainer}
     distance = gaps.agg(lambda gap: gap.abs().mean())
     for method in sorted(distance.index, key=lambda name: (name not in trained, distance[name], name)):

@@ -107,6 +107,15 @@ def test_linear_algebra_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(found[0]) == {1}
 
 
+def test_threads_share_the_cores_with_no_linear_algebra() -> None:
+    def threads(_: int) -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    with threadpool_limits(2):
+        assert plant.in_threads(threads, range(4)) == [{1}] * 4
+        assert threads(0) == {2}
+
+
 def test_everything_promised_is_there() -> None:
     for name in ded_bench.__all__:
         assert getattr(ded_bench, name).__name__ == name

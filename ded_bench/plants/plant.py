@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.time_varying import Indices, TimeVarying
@@ -240,7 +241,7 @@ def in_threads(
 ) -> list[Answer | InputError | SimulationError]:
     """What a function makes of each item, in their order, in threads; an item that fails becomes its error.
 
-    Compiled plants let other threads work meanwhile.
+    Compiled plants let other threads work meanwhile; linear algebra has no threads beside these.
 
     Args:
         function: of one item; what it raises beside the two errors is raised here.
@@ -254,5 +255,5 @@ def in_threads(
         except (InputError, SimulationError) as error:
             return error
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+    with threadpool_limits(1), ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         return list(pool.map(answer, items))

@@ -16,7 +16,7 @@ import numpy as np
 import pyomo.environ as pyo
 from numpy.typing import NDArray
 
-from ded_bench.methods.knots import is_reachable
+from ded_bench.methods.knots import is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.radau_detailed import DetailedProgram, mesh
 from ded_bench.methods.radau_program import POINTS, RadauProgram
@@ -33,9 +33,9 @@ VERSION = 1
 #: Longest mean element where none is given, s and in periods of the fastest mode (validation draws).
 LONGEST_S, LONGEST_PERIODS = 0.1, 0.125
 #: Memory that IPOPT takes for an entry of `program_bytes`. Measured as the peak of a
-#: process that solves one instance in TO, less what imports take: 21 bytes on 39bus (0.7 GiB in all), 13 on
-#: 68bus (1.4 GiB); on 9bus and two-area over 90, but 0.3 GiB in all. Larger grids are extrapolated.
-BYTES_PER_ENTRY = 20
+#: process that solves one instance, less what imports take: 16 bytes on 39bus (0.7 GiB in all), 11 on
+#: 68bus (1.3 GiB); on 9bus 93 and on two-area 56, but 0.3 GiB in all. Larger grids are extrapolated.
+BYTES_PER_ENTRY = 17
 #: Longest element on the detailed plant, s, and the memory of its Pyomo model and IPOPT (two-area-agc).
 DETAILED_S, BYTES_PER_DETAILED_ENTRY = 1.0, 300
 #: Part of the cost that IPOPT's last barrier may be worth at a bound: on two-area-agc about 1e-5 in all.
@@ -68,10 +68,10 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         if refusal := too_large(needed, f"the program of {elements} elements", "`ded-slp` takes less"):
             return refusal
         ends = element_ends(instance, elements)
-        program = _program(case, elements)
-        numbers = program.numbers(instance, regime, ends)
+        program = _program(case, elements, settings.time_limit_s)
+        arguments = program.arguments(instance, regime, ends)
         build_s = time.perf_counter() - started
-        outcome, x = program.program.solve(numbers, settings.time_limit_s)
+        outcome, x = program.solve(arguments)
         return answer(outcome, build_s, lambda: None if x is None else program.schedule(x, instance, ends))
 
     return solve
@@ -102,8 +102,8 @@ def _on_detailed(
 
 
 @functools.lru_cache(maxsize=1)
-def _program(case: Case, elements: int) -> RadauProgram:
-    return RadauProgram(case, elements)
+def _program(case: Case, elements: int, limit_s: float | None) -> RadauProgram:
+    return RadauProgram(case, elements, limit_s)
 
 
 def program_bytes(case: Case, elements: int) -> int:
@@ -123,13 +123,8 @@ def default_element(case: Case) -> float:
 def element_count(case: Case, instance: Instance, length_s: float) -> int:
     """Number of elements of about a given length; for loads that ramp once it depends on the horizon only."""
     pieces = 2 * len(case.loads) + 1  # a load ramp starts and ends: what lies between needs an element
-    pieces = max(pieces, len(_kinks(instance)) - 1)
+    pieces = max(pieces, len(knot_points(instance.kinks, instance.dt_s)) - 1)
     return min(max(round(instance.horizon_s / length_s), pieces), instance.steps)
-
-
-def _kinks(instance: Instance) -> list[int]:
-    """Grid indices k of the kinks of the loads, rounded, with the first and the last point of the grid."""
-    return sorted({round(t / instance.dt_s) for t in instance.kinks})
 
 
 def element_ends(instance: Instance, elements: int) -> NDArray[np.int_]:
@@ -138,7 +133,7 @@ def element_ends(instance: Instance, elements: int) -> NDArray[np.int_]:
     Every kink of a load is an end, rounded to the grid; between kinks the elements are of nearly equal
     length, and the longest is as short as can be.
     """
-    pieces = list(itertools.pairwise(_kinks(instance)))
+    pieces = list(itertools.pairwise(knot_points(instance.kinks, instance.dt_s).tolist()))
     counts = [1] * len(pieces)
     for _ in range(elements - len(pieces)):
         lengths = [(b - a) / count for (a, b), count in zip(pieces, counts, strict=True)]

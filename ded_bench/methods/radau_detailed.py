@@ -7,8 +7,7 @@ rotor angles there. The program stands for itself: it knows no linearisation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pyomo.dae as dae
@@ -16,8 +15,8 @@ import pyomo.environ as pyo
 
 from ded_bench.methods.ded import eliminated
 from ded_bench.methods.ed import first_schedules, static_dispatch
-from ded_bench.methods.knots import case_knots, divided, power_limits, transfer_room
-from ded_bench.methods.radau_program import POINTS, WEIGHTS, lagrange
+from ded_bench.methods.knots import case_knots, divided, knot_points, power_limits, transfer_room
+from ded_bench.methods.radau_program import POINTS, element_points, interpolated, lagrange, point_weights
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedState
@@ -36,26 +35,12 @@ BETWEEN = tuple(i / 10 for i in range(1, 10))
 PYOMO = Functions(*(np.frompyfunc(function, 1, 1) for function in (pyo.sin, pyo.cos, pyo.sqrt)))
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(NamedTuple):
     """Where an instance's program has points: 0, then three in every element, the last at its end."""
 
     knots: Indices  # grid points of the set-points' knots, (n_knots,)
     acts: Indices  # grid points at which secondary control acts
     ends: Indices  # grid points of the element ends, (elements + 1,)
-
-    @property
-    def places(self) -> Array:
-        """The points in steps of the grid, (n_points,)."""
-        inside = self.ends[:-1, None] + np.outer(np.diff(self.ends), POINTS)
-        return np.append(0.0, inside)
-
-    @property
-    def weights(self) -> Array:
-        """How much each point counts in the sum over the grid points: half of the ends, and all between."""
-        weights = np.append(0.5, np.outer(np.diff(self.ends), WEIGHTS))
-        weights[-1] += 0.5
-        return weights
 
 
 def mesh(plant: DetailedPlant, instance: Instance, state: DetailedState, longest_s: float) -> Mesh:
@@ -63,8 +48,7 @@ def mesh(plant: DetailedPlant, instance: Instance, state: DetailedState, longest
     knots = case_knots(plant.case, instance)
     control = plant.control(state, instance.dt_s)
     acts = np.arange(control.first, instance.steps, control.period)
-    kinks = [round(t / instance.dt_s) for load in instance.load.values() for t in load.kinks]
-    bends = np.unique([*knots, *acts, *(k for k in kinks if k < instance.steps)])
+    bends = np.unique([*knots, *acts, *knot_points(instance.kinks, instance.dt_s)])
     parts = np.ceil(np.diff(bends) * instance.dt_s / longest_s - 1e-9).astype(int)
     parts = np.clip(parts, 1, np.diff(bends))
     return Mesh(knots, acts, np.append(divided(bends, parts), instance.steps))
@@ -81,7 +65,7 @@ class DetailedProgram:
         self, plant: DetailedPlant, instance: Instance, regime: str, state: DetailedState, mesh: Mesh
     ) -> None:
         self.case, self.system, self.instance = plant.case, plant.system, instance
-        self._state, self._mesh = state, mesh
+        self._state, self._mesh, self._places = state, mesh, element_points(mesh.ends)
         data = self.system.data
         self._moving = self.system.moving
         self._scale = np.where(
@@ -107,30 +91,29 @@ class DetailedProgram:
     def _follow_plant(self) -> None:
         """States, voltages and secondary control follow the plant; what turbines deliver is paid."""
         m, mesh, state, case, instance = self.model, self._mesh, self._state, self.case, self.instance
-        data, weights, places = self.system.data, self._mesh.weights, self._mesh.places
+        data, weight, places = self.system.data, point_weights(mesh.ends), self._places
         for variable, value in zip(self._x[0], self._scale * state.x.flat[self._moving], strict=True):
             variable.fix(value)
         m.held[0].fix(state.held)
-        drawn = self.system.p_drawn(instance.p_load(case))
-        drawn = np.stack([np.interp(places, np.arange(len(drawn)), column) for column in drawn.T], axis=1)
+        drawn = interpolated(self.system.p_drawn(instance.p_load(case)), places)
         period = np.searchsorted(mesh.acts, places)  # what acts at an element's end is felt after it
         m.follows, m.balanced, m.secondary = (pyo.ConstraintList() for _ in range(3))
         cost_gen, cost_slack = instance.cost_gen(case), instance.cost_slack(case)
         m.p_slack = pyo.Var(m.t, [0, 1], bounds=(0, None), initialize=0.0)  # up and down
-        total = weights[0] * float(self.system.turbines(state.x)[self.system.scheduled] @ cost_gen)
+        total = weight[0] * float(self.system.turbines(state.x)[self.system.scheduled] @ cost_gen)
         times, slow = list(m.t), self._slowness()
         for k in range(1, len(places)):
             found = self._equations(k, drawn[k], self._held[period[k]])
             rates = np.stack(found.rates).ravel()[self._moving] * self._scale
-            for index, rate, weight in zip(self._moving.tolist(), rates, slow, strict=True):
-                m.follows.add(weight * self._slopes[index, times[k]] == weight * rate)
+            for index, rate, scale in zip(self._moving.tolist(), rates, slow, strict=True):
+                m.follows.add(scale * self._slopes[index, times[k]] == scale * rate)
             for off in np.concatenate(found.balance):
                 m.balanced.add(off == 0.0)
-            total += weights[k] * (cost_gen @ found.p_m[self.system.scheduled])
+            total += weight[k] * (cost_gen @ found.p_m[self.system.scheduled])
             if case.slack is not None:
                 up, down = m.p_slack[times[k], 0], m.p_slack[times[k], 1]
                 m.balanced.add(up - down == found.p_e[self.system.network.balancing])
-                total += weights[k] * cost_slack * (up + down)
+                total += weight[k] * cost_slack * (up + down)
         gain = 0.0 if case.agc is None else case.agc.k
         for j, act in enumerate(mesh.acts, 1):
             angles = self._states(int(np.searchsorted(places, act)))[DELTA]
@@ -153,7 +136,7 @@ class DetailedProgram:
 
     def _equations(self, k: int, drawn: Array, held: Any) -> Equations:
         """The plant's equations at a point."""
-        place, knots, system = self._mesh.places[k], self._mesh.knots, self.system
+        place, knots, system = self._places[k], self._mesh.knots, self.system
         j = max(int(np.searchsorted(knots, place)) - 1, 0)
         part = (place - knots[j]) / (knots[j + 1] - knots[j])
         p_ref = self._state.offset + np.array([share * held for share in self.system.shares], dtype=object)
@@ -220,8 +203,7 @@ class DetailedProgram:
             break
         x = x.reshape(len(x), -1)[:, self._moving] * self._scale
         for variables, values in ((self._x[1:], x), (self._v[1:], v)):
-            for column, course in zip(variables.T, values.T, strict=True):
-                _assign(column, np.interp(mesh.places[1:], np.arange(len(course)), course))
+            _assign(variables.ravel(), interpolated(values, self._places[1:]).ravel())
         _assign(self._p_set[1:].ravel(), p_set[1:].ravel())
         _assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
 

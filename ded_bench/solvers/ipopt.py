@@ -76,7 +76,7 @@ class CasadiIpopt:
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
         arguments = {"x0": start, "lbx": lower, "ubx": upper, **self._rows}
-        outcome, x = run_ipopt(solver, arguments, 0.0, setup)
+        outcome, x = run_ipopt(solver, arguments, setup)
         if x is not None:
             assign(self._columns, x)
         return outcome
@@ -91,7 +91,7 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
     solver = make_ipopt({"x": x, "f": casadi.dot(form.cost, x), "g": g}, LINEAR_OPTIONS, limit, {})
     arguments = {"x0": np.zeros(n), "lbx": form.lower, "ubx": form.upper}
     rows = {"lbg": np.append(form.right, form.low), "ubg": np.append(form.right, form.high)}
-    said, found = run_ipopt(solver, arguments | rows, 0.0, 0.0)
+    said, found = run_ipopt(solver, arguments | rows, 0.0)
     return FormAnswer(
         said.status, np.zeros(n) if found is None else found, said.iterations or 0, said.version, said.message
     )
@@ -108,9 +108,9 @@ def make_ipopt(
 
 
 def run_ipopt(
-    solver: casadi.Function, arguments: dict[str, Array], constant: float, setup_s: float
+    solver: casadi.Function, arguments: dict[str, Array], setup_s: float
 ) -> tuple[Outcome, Array | None]:
-    """What IPOPT reports, and x if there is one; `constant` is what its objective leaves out."""
+    """What IPOPT reports, and x if there is one."""
     started, error = time.perf_counter(), ""
     try:
         result = solver(**arguments)
@@ -122,6 +122,6 @@ def run_ipopt(
     status = Status.FAILED if error else _IPOPT_STATUS.get(message, Status.FAILED)
     x = objective = None
     if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
-        x, objective = result["x"].full().ravel(), float(result["f"]) + constant
+        x, objective = result["x"].full().ravel(), float(result["f"])
     said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
     return Outcome(status, x is not None, *said), x

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
+import casadi
 import numpy as np
 import pytest
 
 from ded_bench.methods.ded_radau import default_element, element_count, element_ends, prepare
-from ded_bench.methods.radau_program import (
-    POINTS,
-    WEIGHTS,
-    RadauProgram,
-)
+from ded_bench.methods.radau_program import POINTS, WEIGHTS, RadauProgram
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import simulate
@@ -94,14 +89,14 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
     errors, gaps = [], []
     for elements in (coarsest, 2 * coarsest, 4 * coarsest):
         ends = element_ends(instance, elements)
-        arrays = RadauProgram(case, elements)
-        numbers = arrays.numbers(instance, "NO", ends)
-        lower, upper = numbers.lower.copy(), numbers.upper.copy()
-        lower[arrays.p_gen] = upper[arrays.p_gen] = schedule.at(instance.grid[ends])
-        lower[arrays.omega], upper[arrays.omega] = -np.inf, np.inf
-        outcome, x = arrays.program.solve(dataclasses.replace(numbers, lower=lower, upper=upper))
+        program = RadauProgram(case, elements)
+        arguments = program.arguments(instance, "NO", ends)
+        lower, upper = arguments["lbx"], arguments["ubx"]
+        lower[program.p_gen] = upper[program.p_gen] = schedule.at(instance.grid[ends])
+        lower[program.omega], upper[program.omega] = -np.inf, np.inf
+        outcome, x = program.solve(arguments)
         assert outcome.status == Status.OPTIMAL
-        errors.append(np.abs(x[arrays.omega[:, -1]] - truth.omega[ends[1:]]).max())
+        errors.append(np.abs(x[program.omega[:, -1]] - truth.omega[ends[1:]]).max())
         cost = truth.p_gen @ instance.cost_gen(case)
         cost = cost + instance.cost_slack(case) * np.abs(truth.p_slack)
         gaps.append(abs(outcome.objective / cost.sum() - 1))
@@ -110,6 +105,29 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
     assert errors[2] < 1e-7
     # The sum over the grid is not quite the integral: dt²/12 of the slope's change, and no more.
     assert gaps[-1] < 1e-6
+
+
+def test_derivatives_of_all_elements_are_casadis(case: Case) -> None:
+    """Put together from one element's, they are what CasADi finds by differentiating the whole."""
+    instance = short(case, 0)
+    ends = element_ends(instance, 20)
+    program = RadauProgram(case, len(ends) - 1)
+    given = program.arguments(instance, "TO", ends)
+    rng = np.random.default_rng(0)
+    at, weights = given["x0"] + rng.normal(0, 0.1, given["x0"].shape), rng.normal(size=given["lbg"].shape)
+    rows, slopes, curvature = (
+        program._solver.get_function(name) for name in ("nlp_g", "nlp_jac_g", "nlp_hess_l")
+    )
+    x = casadi.MX.sym("x", len(at))
+    g = rows(x, given["p"])
+    whole = casadi.Function(
+        "whole", [x], [casadi.jacobian(g, x), casadi.hessian(casadi.dot(weights, g), x)[0]]
+    )
+    jacobian, hessian = (matrix.full() for matrix in whole(at))
+    np.testing.assert_allclose(slopes(at, given["p"])[1].full(), jacobian, rtol=1e-12, atol=1e-12)
+    found = curvature(at, given["p"], 1.0, weights).full()
+    np.testing.assert_allclose(found, np.triu(hessian), rtol=1e-12, atol=1e-11)
+    assert np.abs(hessian).max() > 0.1
 
 
 def test_limits_hold_on_the_true_system(case: Case) -> None:
@@ -135,7 +153,7 @@ def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_inst
         again = solve(instance)
         ends = element_ends(instance, len(again.schedule.t) - 1)
         fresh = RadauProgram(case, len(ends) - 1)
-        outcome, x = fresh.program.solve(fresh.numbers(instance, "TO", ends))
+        outcome, x = fresh.solve(fresh.arguments(instance, "TO", ends))
         assert again.status == outcome.status == Status.OPTIMAL
         assert again.solver_objective == pytest.approx(outcome.objective, rel=1e-12)
         np.testing.assert_allclose(again.schedule.p, fresh.schedule(x, instance, ends).p, atol=1e-12)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyomo.dae as dae
@@ -21,7 +21,7 @@ from ded_bench.methods.euler_program import EulerPrograms
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.plants.lossless.network import Network
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.schedule import Schedule
@@ -32,6 +32,8 @@ from ded_bench.solvers.status import Status
 
 #: Raised when answers change.
 VERSION = 1
+#: An array of Pyomo's variables or expressions.
+Expressions: TypeAlias = "np.ndarray[Any, Any]"
 #: One solution of the linear system per iteration, refined only where its residual asks for it: the
 #: iterates are the same, without a tenth of the time.
 _IPOPT_OPTIONS = {"min_refinement_steps": 0}
@@ -67,7 +69,7 @@ def _solve(case: Case, regime: str, time_limit_s: float | None, instance: Instan
     set_instance(model, case, instance, regime)
     build_s = time.perf_counter() - started
     outcome = _compiled(case, instance.steps, instance.dt_s).solve(time_limit_s)
-    return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
+    return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
 
 def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: Instance) -> Solution:
@@ -118,31 +120,19 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     What instances differ in - costs, loads, initial values, the regime's bound - are variables
     that `set_instance` fixes by their bounds.
     """
-    network, ramp = Network(case), dict(zip(case.generators, case.ramp.tolist(), strict=True))
-    m = pyo.ConcreteModel()
+    network, m = Network(case), pyo.ConcreteModel()
     m.t = dae.ContinuousSet(bounds=(0, steps * dt))
-    m.gen = pyo.Set(initialize=case.generators, ordered=True)
     m.algebraic = pyo.Set(initialize=[network.case.buses[i].id for i in network.algebraic], ordered=True)
-    m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
-
-    # Data, fixed by bounds.
-    m.cost = pyo.Var(m.gen, initialize=0.5)
-    m.cost_slack = pyo.Var(initialize=0.5)
-    m.p_load = pyo.Var(m.load_bus, m.t, initialize=0.0)
 
     # Variables; angles in rad, frequencies in rad/s, powers in pu.
+    add_powers(m, case, m.t)
     m.theta = pyo.Var(m.gen, m.t, initialize=0.0)
     m.omega = pyo.Var(m.gen, m.t, initialize=0.0)
     m.dtheta = dae.DerivativeVar(m.theta, wrt=m.t, initialize=0.0)
     m.domega = dae.DerivativeVar(m.omega, wrt=m.t, initialize=0.0)
     m.angle = pyo.Var(m.algebraic, m.t, initialize=0.0)
-    m.p_gen = pyo.Var(m.gen, m.t, bounds=lambda m, g, t: (case.machines[g].p_min, case.machines[g].p_max))
-    m.p_slack_up = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
-    m.p_slack_down = pyo.Var(m.t, bounds=(0, None), initialize=0.0)
     pyo.TransformationFactory("dae.finite_difference").apply_to(m, nfe=steps, wrt=m.t, scheme="BACKWARD")
     theta_rate, omega_rate = eliminated(m, m.dtheta), eliminated(m, m.domega)
-    times = list(m.t)
-    m.step = pyo.RangeSet(1, steps)
 
     # Constraints.
     injection = injections(m, case, network)
@@ -166,17 +156,37 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     def eq_slack(m: Any, t: float) -> Any:
         return m.p_slack_up[t] - m.p_slack_down[t] == injection(network.case.slack, t)
 
+    add_ramps_and_cost(m, case, list(m.t), dt)
+    return m
+
+
+def add_powers(m: pyo.ConcreteModel, case: Case, points: Any) -> None:
+    """Declare what any program over all points has: powers, pu, and data that `set_powers` fixes."""
+    m.known = {}  # variables by time, see `_over_time`
+    m.gen = pyo.Set(initialize=case.generators, ordered=True)
+    m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
+    m.cost, m.cost_slack = pyo.Var(m.gen, initialize=0.5), pyo.Var(initialize=0.5)
+    m.p_load = pyo.Var(m.load_bus, points, initialize=0.0)
+    m.p_gen = pyo.Var(m.gen, points, bounds=lambda m, g, t: (case.machines[g].p_min, case.machines[g].p_max))
+    m.p_slack_up = pyo.Var(points, bounds=(0, None), initialize=0.0)
+    m.p_slack_down = pyo.Var(points, bounds=(0, None), initialize=0.0)
+
+
+def add_ramps_and_cost(m: pyo.ConcreteModel, case: Case, points: Sequence[Any], dt: float) -> None:
+    """Declare the paper's limits of ramps, and its objective."""
+    m.step = pyo.RangeSet(1, len(points) - 1)
+    ramp = dict(zip(case.generators, case.ramp.tolist(), strict=True))
+
     @m.Constraint(m.gen, m.step)
     def ineq_ramp(m: Any, g: str, k: int) -> Any:
-        rate = (m.p_gen[g, times[k]] - m.p_gen[g, times[k - 1]]) / dt
+        rate = (m.p_gen[g, points[k]] - m.p_gen[g, points[k - 1]]) / dt
         return pyo.inequality(-ramp[g], rate, ramp[g])
 
     @m.Objective()
     def cost_total(m: Any) -> Any:
-        generation = sum(m.cost[g] * m.p_gen[g, t] for g in m.gen for t in times)
-        return generation + sum(m.cost_slack * (m.p_slack_up[t] + m.p_slack_down[t]) for t in times)
-
-    return m
+        generation = pyo.quicksum(m.cost[g] * m.p_gen[g, t] for g in m.gen for t in points)
+        slack = pyo.quicksum(m.cost_slack * (m.p_slack_up[t] + m.p_slack_down[t]) for t in points)
+        return generation + slack
 
 
 def eliminated(m: pyo.ConcreteModel, derivative: dae.DerivativeVar) -> dict[Any, Any]:
@@ -225,52 +235,49 @@ def set_instance(m: pyo.ConcreteModel, case: Case, instance: Instance, regime: s
     The initial point is the state at t = 0 held for the whole horizon.
     """
     network = Network(case)
-    angles = network.initial_angles(instance)
-    p_initial, omega_initial = instance.p_initial(case), instance.omega_initial(case)
-    bound, along = case.omega_bound(regime), _along_time(m)
-    for g in case.generators:
-        fix(m.cost[g], instance.cost[g])
-    fix(m.cost_slack, instance.cost_slack(case))
-    p_load = instance.p_load(case)
-    for variables, column in zip(along["p_load"], p_load.T.tolist(), strict=True):
-        for variable, value in zip(variables, column, strict=True):
+    angles, bound = network.initial_angles(instance), case.omega_bound(regime)
+    set_powers(m, case, instance, float(network.injections(angles)[network.slack]))
+    theta, omega, angle = (_over_time(m, name) for name in ("theta", "omega", "angle"))
+    if omega[-1, 0].ub != bound:  # the model was set to another regime before, or to none
+        for variable in omega.flat:
+            variable.setlb(-bound)
+            variable.setub(bound)
+    of_generators, others = angles[network.generators], angles[network.algebraic]
+    for variables, values in ((theta, of_generators), (omega, np.zeros_like(of_generators)), (angle, others)):
+        assign(variables.ravel(), np.broadcast_to(values, variables.shape).ravel())
+    for variables, values in ((theta, of_generators), (omega, instance.omega_initial(case))):
+        for variable, value in zip(variables[0], values.tolist(), strict=True):
             fix(variable, value)
-    for variables in along["omega"]:
-        if variables[-1].ub != bound:  # the model was set to another regime before
-            for variable in variables:
-                variable.setlb(-bound)
-                variable.setub(bound)
-    p_slack = float(network.injections(angles)[network.slack])
-    start = {
-        "theta": angles[network.generators],
-        "omega": np.zeros(len(case.generators)),
-        "p_gen": p_initial,
-        "angle": angles[network.algebraic],
-        "p_slack_up": [max(p_slack, 0.0)],
-        "p_slack_down": [max(-p_slack, 0.0)],
-    }
-    for name, values in start.items():
-        for variables, value in zip(along[name], values, strict=True):
-            assign(variables, np.full(len(variables), value))
-    for j, g in enumerate(case.generators):
-        fix(m.p_gen[g, 0], float(p_initial[j]))
-        fix(m.omega[g, 0], float(omega_initial[j]))
-        fix(m.theta[g, 0], float(angles[network.generators[j]]))
 
 
-@functools.lru_cache(maxsize=1)
-def _along_time(m: pyo.ConcreteModel) -> dict[str, list[list[Any]]]:
-    """The variables of every bus in the order of time: to look one up takes longer than to set it."""
-    times, buses = list(m.t), {"p_load": m.load_bus, "angle": m.algebraic}
-    along = {
-        name: [[m.component(name)[bus, t] for t in times] for bus in buses.get(name, m.gen)]
-        for name in ("p_load", "theta", "omega", "p_gen", "angle")
-    }
-    slack = {name: [[m.component(name)[t] for t in times]] for name in ("p_slack_up", "p_slack_down")}
-    return along | slack
+def set_powers(m: pyo.ConcreteModel, case: Case, instance: Instance, p_slack: float) -> None:
+    """Fix costs, loads and P_0; powers start as they are at t = 0, pu."""
+    fix(m.cost_slack, instance.cost_slack(case))
+    p_initial, p_gen = instance.p_initial(case), _over_time(m, "p_gen")
+    up, down = _over_time(m, "p_slack_up"), _over_time(m, "p_slack_down")
+    for variables, start in ((p_gen, p_initial), (up, max(p_slack, 0.0)), (down, max(-p_slack, 0.0))):
+        assign(variables.ravel(), np.broadcast_to(start, variables.shape).ravel())
+    for variables, values in (
+        (np.array(list(m.cost.values())), instance.cost_gen(case)),
+        (_over_time(m, "p_load"), instance.p_load(case)),
+        (p_gen[0], p_initial),
+    ):
+        for variable, value in zip(variables.flat, values.ravel().tolist(), strict=True):
+            fix(variable, value)
 
 
-def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:
+def _over_time(m: pyo.ConcreteModel, name: str) -> Expressions:
+    """A variable of every point, (n_points, n_index); to look it up takes longer than to set it."""
+    if name not in m.known:
+        m.known[name] = by_time(m.component(name), m.p_slack_up)
+    return np.asarray(m.known[name])
+
+
+def by_time(variable: pyo.Var, times: Any) -> Expressions:
+    """The variables of an indexed one, (n_times, n_index)."""
+    return np.array(list(variable.values()), dtype=object).reshape(-1, len(times)).T
+
+
+def schedule_of(m: pyo.ConcreteModel, instance: Instance) -> Schedule:
     """Read the generator powers of a solved model as a schedule on the instance's grid."""
-    values: Array = np.array([[v.value for v in variables] for variables in _along_time(m)["p_gen"]])
-    return Schedule(t=instance.grid, p=values.T)
+    return Schedule(t=instance.grid, p=np.vectorize(pyo.value, otypes=[float])(_over_time(m, "p_gen")))

@@ -16,13 +16,13 @@ import numpy as np
 import pyomo.environ as pyo
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods.ded import add_powers, add_ramps_and_cost, schedule_of, set_powers
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import SOLVERS, OnArrays, fix, reset
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
@@ -122,7 +122,7 @@ def _pyomo_solver(
         set_instance(model, case, koopman, instance, regime)
         build_s = time.perf_counter() - started
         outcome = _compiled(program, solver).solve(time_limit_s)
-        return answer(outcome, build_s, lambda: schedule_of(model, case, instance))
+        return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
     return solve
 
@@ -156,29 +156,20 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
     """
     n_gen, n_psi = len(case.generators), len(koopman.k)
     m = pyo.ConcreteModel()
-    m.point = pyo.RangeSet(0, steps)
-    m.step = pyo.RangeSet(1, steps)
-    m.gen = pyo.Set(initialize=case.generators, ordered=True)
-    m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
-    m.observable = pyo.RangeSet(0, n_psi - 1)
-
-    # Data, fixed by bounds.
-    m.cost = pyo.Var(m.gen)
-    m.cost_slack = pyo.Var()
-    m.p_load = pyo.Var(m.load_bus, m.point)
+    m.point, m.observable = pyo.RangeSet(0, steps), pyo.RangeSet(0, n_psi - 1)
 
     # Variables; frequencies in rad/s, powers in pu. ψ = (ω, P_s, N).
+    add_powers(m, case, m.point)
     m.psi = pyo.Var(m.observable, m.point)
-    m.p_gen = pyo.Var(m.gen, m.point)
-    m.p_slack_up = pyo.Var(m.point, bounds=(0, None))
-    m.p_slack_down = pyo.Var(m.point, bounds=(0, None))
 
     # Constraints.
     inputs = [(m.p_gen, g) for g in case.generators] + [(m.p_load, bus) for bus in case.loads]
     before = (np.eye(n_psi) - koopman.k) @ koopman.b - koopman.g
 
-    @m.Constraint(m.observable, m.step)
+    @m.Constraint(m.observable, m.point)
     def eq_dynamics(m: Any, i: int, k: int) -> Any:
+        if k == 0:
+            return pyo.Constraint.Skip  # the initial state is given
         terms = [koopman.k[i, j] * m.psi[j, k - 1] for j in m.observable if koopman.k[i, j]]
         for j, (p, bus) in enumerate(inputs):
             terms += [before[i, j] * p[bus, k - 1]] if before[i, j] else []
@@ -189,50 +180,17 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
     def eq_slack(m: Any, k: int) -> Any:
         return m.p_slack_up[k] - m.p_slack_down[k] == m.psi[n_gen, k]
 
-    ramp = dict(zip(case.generators, case.ramp.tolist(), strict=True))
-
-    @m.Constraint(m.gen, m.step)
-    def ineq_ramp(m: Any, g: str, k: int) -> Any:
-        rate = (m.p_gen[g, k] - m.p_gen[g, k - 1]) / koopman.dt_s
-        return pyo.inequality(-ramp[g], rate, ramp[g])
-
-    @m.Objective()
-    def cost_total(m: Any) -> Any:
-        generation = pyo.quicksum(m.cost[g] * m.p_gen[g, k] for g in m.gen for k in m.point)
-        slack = pyo.quicksum(m.cost_slack * (m.p_slack_up[k] + m.p_slack_down[k]) for k in m.point)
-        return generation + slack
-
+    add_ramps_and_cost(m, case, list(m.point), koopman.dt_s)
     return m
 
 
 def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
-    """Give a built model the data of one instance and reset its initial point (cold start).
-
-    The initial point is ψ_0 and P_0 over the whole horizon.
-    """
+    """Give a built model the data of one instance: solvers of linear programs need no first values."""
     psi = koopman.initial(Network(case), [instance])[0].tolist()
-    bound = case.omega_bound(regime)
-    n_gen = len(case.generators)
-    fix(m.cost_slack, instance.cost_slack(case))
-    for bus, column in zip(case.loads, instance.p_load(case).T.tolist(), strict=True):
-        for k, value in enumerate(column):
-            fix(m.p_load[bus, k], value)
-    for i, value in enumerate(psi):
+    bound, n_gen = case.omega_bound(regime), len(case.generators)
+    set_powers(m, case, instance, psi[n_gen])
+    for (i, _), variable in m.psi.items():
         limit = bound if i < n_gen else None
-        for k in m.point:
-            reset(m.psi[i, k], value, None if limit is None else -limit, limit)
+        reset(variable, psi[i], None if limit is None else -limit, limit)
+    for i, value in enumerate(psi):
         fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies
-    for g, value in zip(case.generators, instance.p_initial(case).tolist(), strict=True):
-        fix(m.cost[g], instance.cost[g])
-        for k in m.point:
-            reset(m.p_gen[g, k], value, case.machines[g].p_min, case.machines[g].p_max)
-        fix(m.p_gen[g, 0], value)
-    for k in m.point:
-        m.p_slack_up[k].set_value(max(psi[n_gen], 0.0), skip_validation=True)
-        m.p_slack_down[k].set_value(max(-psi[n_gen], 0.0), skip_validation=True)
-
-
-def schedule_of(m: pyo.ConcreteModel, case: Case, instance: Instance) -> Schedule:
-    """Read the generator powers of a solved model, shape (n_points, n_gen), pu."""
-    values: Array = np.array([[m.p_gen[g, k].value for g in case.generators] for k in m.point])
-    return Schedule(t=instance.grid, p=values)

@@ -7,13 +7,13 @@ rotor angles there. The program stands for itself: it knows no linearisation.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyomo.dae as dae
 import pyomo.environ as pyo
 
-from ded_bench.methods.ded import eliminated
+from ded_bench.methods.ded import Expressions, by_time, eliminated
 from ded_bench.methods.ed import first_schedules, static_dispatch
 from ded_bench.methods.knots import case_knots, divided, knot_points, power_limits, transfer_room
 from ded_bench.methods.radau_program import POINTS, element_points, interpolated, lagrange, point_weights
@@ -26,9 +26,8 @@ from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.linear_program import assign
 
-#: An array of Pyomo's variables or expressions.
-Expressions: TypeAlias = "np.ndarray[Any, Any]"
 #: Where else in an element frequencies are bounded, as fractions of it.
 BETWEEN = tuple(i / 10 for i in range(1, 10))
 #: The equations' elementary functions for arrays of Pyomo's expressions.
@@ -79,10 +78,10 @@ class DetailedProgram:
         scheme = {"wrt": m.t, "nfe": len(mesh.ends) - 1, "ncp": len(POINTS), "scheme": "LAGRANGE-RADAU"}
         pyo.TransformationFactory("dae.collocation").apply_to(m, **scheme)
         self._slopes = eliminated(m, m.x_rate)
-        self._x, self._v = _by_time(m.x, m.t), _by_time(m.v, m.t)  # (n_points, n_moving or 2 n_port)
+        self._x, self._v = by_time(m.x, m.t), by_time(m.v, m.t)  # (n_points, n_moving or 2 n_port)
         m.gen, m.knot = pyo.RangeSet(0, len(self.case.generators) - 1), pyo.RangeSet(0, len(mesh.knots) - 1)
         m.p_set, m.held = pyo.Var(m.gen, m.knot), pyo.Var(pyo.RangeSet(0, len(mesh.acts)))
-        self._p_set, self._held = _by_time(m.p_set, m.knot), np.array(list(m.held.values()))
+        self._p_set, self._held = by_time(m.p_set, m.knot), np.array(list(m.held.values()))
         self._speed = np.searchsorted(self._moving, SPEED * len(data) + self.system.scheduled)
         self._follow_plant()
         self._limit_powers()
@@ -203,22 +202,12 @@ class DetailedProgram:
             break
         x = x.reshape(len(x), -1)[:, self._moving] * self._scale
         for variables, values in ((self._x[1:], x), (self._v[1:], v)):
-            _assign(variables.ravel(), interpolated(values, self._places[1:]).ravel())
-        _assign(self._p_set[1:].ravel(), p_set[1:].ravel())
-        _assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
+            assign(variables.ravel(), interpolated(values, self._places[1:]).ravel())
+        assign(self._p_set[1:].ravel(), p_set[1:].ravel())
+        assign(self._held[1:], held[np.minimum(mesh.acts, len(held) - 1)])
 
     def schedule(self) -> Schedule:
         """The set-points of the solved model; IPOPT keeps bounds to 1e-8 only, so they are put back."""
         p = np.array([[variable.value for variable in row] for row in self._p_set])
         p[1:] = np.clip(p[1:], *power_limits(self.case, self.instance, np.diff(self._mesh.knots)))
         return Schedule(self.instance.grid[self._mesh.knots], p)
-
-
-def _by_time(variable: pyo.Var, times: Any) -> Expressions:
-    """The variables of an indexed one, (n_times, n_index)."""
-    return np.array(list(variable.values()), dtype=object).reshape(-1, len(times)).T
-
-
-def _assign(variables: Expressions, values: Array) -> None:
-    for variable, value in zip(variables, values.tolist(), strict=True):
-        variable.set_value(value, skip_validation=True)

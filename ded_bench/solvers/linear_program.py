@@ -6,7 +6,7 @@ may multiply others in the objective, so that costs, too, can change from one so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -164,7 +164,7 @@ def bounds(columns: Sequence[Any]) -> Array:
     return np.where(np.isnan(both), [[-np.inf], [np.inf]], both)
 
 
-def assign(columns: Sequence[Any], values: Array) -> None:
+def assign(columns: Iterable[Any], values: Array) -> None:
     """Set the values of Pyomo variables."""
     for variable, value in zip(columns, values.tolist(), strict=True):
         variable.set_value(value, skip_validation=True)

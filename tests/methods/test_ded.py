@@ -95,7 +95,7 @@ def test_the_model_is_backward_euler_of_the_true_system(case: Case) -> None:
                 model.omega[g, t].setlb(None if t else model.omega[g, t].lb)
                 model.omega[g, t].setub(None if t else model.omega[g, t].ub)
         assert CasadiIpopt(model).solve().status == Status.OPTIMAL
-        truth = simulate(case, instance, schedule_of(model, case, instance))
+        truth = simulate(case, instance, schedule_of(model, instance))
         omega = np.array([[pyo.value(model.omega[g, t]) for g in case.generators] for t in model.t])
         errors.append(np.abs(omega - truth.omega).max())
         assert solution.schedule.t[-1] == pytest.approx(HORIZON)

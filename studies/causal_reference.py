@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from ded_bench import Case
-from ded_bench.methods.reserve import Reserve
+from ded_bench.methods.reserve import steady_speeds
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array
 from ded_bench.problem.sampling import LOAD_RANGE, sample_scenario
@@ -47,12 +47,16 @@ def due(case: Case, scenario: Scenario, t: float) -> Array:
 
 
 def cost(
-    case: Case, reserve: Reserve, scenario: Scenario, load: Array, surprises: list[tuple[int, float]]
+    case: Case,
+    grid: tuple[Array, Array],
+    scenario: Scenario,
+    load: Array,
+    surprises: list[tuple[int, float]],
 ) -> float:
     """Least cost of an instant's dispatch with room for surprises: load, and how far it may move, pu."""
     n = len(case.generators)
     prices = np.array([scenario.cost[bus] for bus in case.generators])
-    bound = case.omega_bound(REGIME)
+    bound, (by_load, compliance) = case.omega_bound(REGIME), grid
     steepest = np.abs(case.load_rate).max(axis=0)
     objective = [prices, [scenario.cost[case.slack]]]
     rows, right, limits = [], [], [*zip(case.p_min, case.p_max, strict=True), (0.0, None)]
@@ -65,10 +69,10 @@ def cost(
     for number, (bus, moved) in enumerate(surprises):
         at = slice(n + 1 + n * number, n + 1 + n * (number + 1))
         lasts = abs(moved) / steepest[bus]
-        alone = -reserve.speeds[bus] * moved / steepest[bus]  # what the load alone does to angles
+        alone = by_load[bus] * moved  # what the load alone does to angles
         for sign in (1.0, -1.0):
             block = np.zeros((2 * n, width))
-            block[:n, at] = sign * reserve.compliance
+            block[:n, at] = sign * compliance
             block[n:, :n], block[n:, at] = sign * np.eye(n), sign * np.eye(n)
             rows.append(block)
             ends = case.p_max if sign > 0 else -case.p_min
@@ -84,8 +88,8 @@ def cost(
 def main(name: str, count: str) -> None:
     """Print means over scenarios with 95 % confidence intervals."""
     case = Case.load(name)
-    reserve, longest = Reserve.of(case, 0.0), case.sampling.duration_s[1]
-    speeds = np.abs(reserve.speeds[: len(case.loads)]).max(axis=1)
+    grid, longest = steady_speeds(case), case.sampling.duration_s[1]
+    speeds = np.abs(case.load_rate).max(axis=0) * np.abs(grid[0]).max(axis=1)
     fast = np.flatnonzero(speeds > case.omega_bound(REGIME))
     increases = []
     for index in range(int(count)):
@@ -101,10 +105,10 @@ def main(name: str, count: str) -> None:
                 for sign in (1.0, -1.0)
             ]
             may = due(case, scenario, t)
-            plain = cost(case, reserve, scenario, load, [])
+            plain = cost(case, grid, scenario, load, [])
             now = [move for move in moves if may[move[0]]]
-            known = cost(case, reserve, scenario, load, now) if now else plain
-            total += plain, known, cost(case, reserve, scenario, load, moves) if moves else plain
+            known = cost(case, grid, scenario, load, now) if now else plain
+            total += plain, known, cost(case, grid, scenario, load, moves) if moves else plain
         increases.append(100 * (total[1:] / total[0] - 1))
     mean, half = np.mean(increases, axis=0), 1.96 * np.std(increases, axis=0, ddof=1) / np.sqrt(int(count))
     print(f"{name}, {count} scenarios, loads of which a ramp is too fast: {[case.loads[i] for i in fast]}")

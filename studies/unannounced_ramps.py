@@ -7,7 +7,7 @@ has them. Each goes from 20 s before the ramp to 12 s after it, and starts at re
     ded-bench scenarios --case two-area --seed 77 --count 60 --out drawn
     python studies/unannounced_ramps.py drawn stretches
     ded-bench online --case two-area --regime TO --scenario stretches/*.json \
-      --method ded-rti --set reserve=on --period 0.1 --latency 0.05
+      --method ded-rti --period 0.1 --latency 0.05
 """
 
 import json
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ded_bench import Case
-from ded_bench.methods.reserve import Reserve
+from ded_bench.methods.reserve import steady_speeds
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.scenario import Scenario
 
@@ -31,13 +31,13 @@ def dispatch(case, scenario, t):
     return merit_order(case, cost, np.array([scenario.cost[case.slack]]), loads)[0]
 
 
-def is_too_fast(case, reserve, scenario, load, ramp):
+def is_too_fast(case, grid, scenario, load, ramp):
     """Whether neither rest nor the generators' room keeps all machines within the bound during a ramp."""
-    steepest = np.abs(case.load_rate[:, load]).max()
-    speed = -reserve.speeds[load] * ramp.rate / steepest  # a load that falls is followed downwards
+    by_load, compliance = grid
+    speed = by_load[load] * ramp.rate  # a load that falls is followed downwards
     power = dispatch(case, scenario, ramp.start)
     room = case.p_max - power if ramp.rate < 0 else power - case.p_min
-    followed = reserve.compliance @ np.minimum(room / ramp.duration, case.ramp)
+    followed = compliance @ np.minimum(room / ramp.duration, case.ramp)
     bound = case.omega_bound("TO")
     return np.abs(speed).max() >= SLOWEST * bound and (np.abs(speed) - followed > bound).any()
 
@@ -70,13 +70,13 @@ def cut(case, scenario, ramp, name):
 
 def stretches(case, scenarios):
     """All stretches of several scenarios, as the data of files."""
-    reserve, found = Reserve.of(case, 0.0), []
+    grid, found = steady_speeds(case), []
     for scenario in scenarios:
         for number, bus in enumerate(case.loads):
             for ramp in scenario.load[bus].ramps:
                 inside = ramp.start > BEFORE_S + 1.0 and ramp.end < scenario.duration_s
                 surprising = ramp.announced_start is None and ramp.duration > SHORTEST_S
-                if inside and surprising and is_too_fast(case, reserve, scenario, number, ramp):
+                if inside and surprising and is_too_fast(case, grid, scenario, number, ramp):
                     found.append(cut(case, scenario, ramp, f"{case.id}-r{len(found):04d}"))
     return found
 

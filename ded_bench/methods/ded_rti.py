@@ -8,10 +8,11 @@ Schlöder, 2005): the surrogate's model is taken along the plan in force, and on
   nearly all multipliers of the limits. No infeasible program is tried first.
 * Limits get rows at once where the plan in force comes near them; where the answer comes near others,
   another program follows.
-* Knots keep their places, and plans a margin below the bound.
-* What is not measured, on islands, comes from a simulation of the plan in force (`state_estimate`).
-* With `reserve`, generators keep room to follow ramps that nobody announced.
-* With `surprises`, plans know when ramps may begin, keep room for them then, and are made when there is news.
+* Beside a slack plans know when ramps may begin, keep margins and room for them then, and are made when
+  there is news (`surprises`). Knots keep their places.
+* On islands, what is not measured comes from a simulation of the plan in force (`state_estimate`). There a
+  margin of half the bound costs half a per cent and makes peaks of the mean no lower
+  (studies/hidden_states.md), so that there is none.
 
 A single instance, outside of operation, is answered without a margin by two such steps: what the first
 makes of the static dispatch is the plan in force of the second. The first counts as set-up, so that build
@@ -26,15 +27,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import knots_in_operation, knots_on_clock, receding_knots
-from ded_bench.methods.options import option, read_options
-from ded_bench.methods.reserve import LIMIT, Reserve
+from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surprises import Surprises
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, Plan, solve_on_surrogate
-from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -44,42 +42,19 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 
+Options = NoOptions
 #: Raised when answers change.
 VERSION = 3
-#: Part of the bound that plans leave free beside a slack. On an island it costs half a per cent and makes
-#: peaks of the mean under announcements no lower (studies/hidden_states.md).
-MARGIN = 0.5
-#: With `surprises`, plans are made for so many seconds, and their ends stay. On drawn scenarios of two-area,
+#: Beside a slack, plans are made for so many seconds, and their ends stay. On drawn scenarios of two-area,
 #: plans of 60 s cost as much.
 NEAR_S = 30.0
-
-
-@dataclass(frozen=True)
-class Options:
-    """How plans are made."""
-
-    margin: float | None = option(
-        None,
-        "part of the bound that plans leave free; none: half, on islands nothing",
-        lowest=0.0,
-        highest=0.99,
-        in_operation=True,
-    )
-    reserve: bool = option(False, "room to follow ramps that nobody announced")
-    surprises: bool = option(
-        False, "room and margins where ramps may begin, plans when there is news", in_operation=True
-    )
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
     case.check_regimes([regime])
     surrogate = find_surrogate(case, settings.model or TRAJECTORY, settings.search)
-    options = read_options(Options, settings.options)
-    for name in ("reserve", "surprises"):
-        if getattr(options, name) and case.slack is None:
-            raise InputError("--set", name, f"needs a slack, which the island {case.id} has not")
-    return RealTimeSolver(case, surrogate, regime, options, settings.time_limit_s)
+    return RealTimeSolver(case, surrogate, regime, settings.time_limit_s)
 
 
 @dataclass(frozen=True)
@@ -89,7 +64,6 @@ class RealTimeSolver:
     case: Case
     surrogate: Surrogate
     regime: str
-    options: Options = Options()
     time_limit_s: float | None = None  # of a step
 
     def __call__(self, instance: Instance) -> Solution:
@@ -97,11 +71,11 @@ class RealTimeSolver:
         bounds = self.case.bounds(self.regime)
         if self.case.slack is None:  # condensed programs leave open what they may
             bounds = bounds.tightened(part=SOFT_TOLERANCE)
-        first = self._step(bounds, instance, receding_knots(self.case, instance, None), None)
+        first = self._step(bounds, instance, receding_knots(self.case, instance, None), Plan(None))
         if first.schedule is None:
             return first
         knots = receding_knots(self.case, instance, first.schedule)
-        second = self._step(bounds, instance, knots, first.schedule)
+        second = self._step(bounds, instance, knots, Plan(first.schedule))
         return dataclasses.replace(second, setup_s=(first.build_s or 0.0) + (first.solve_s or 0.0))
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
@@ -111,19 +85,15 @@ class RealTimeSolver:
             instance: what to solve.
             last: its schedule, if it has one, is the plan to correct; its time is the instance's.
         """
-        case, in_force = self.case, None if last is None else last.schedule
-        if self.options.surprises:
+        in_force = None if last is None else last.schedule
+        if self.case.slack is not None:
             return self._when_there_is_news(instance, in_force)
-        margin = self.options.margin
-        part = (MARGIN if case.slack is not None else 0.0) if margin is None else margin
-        bounds, knots = (
-            case.bounds(self.regime).tightened(part=part),
-            knots_in_operation(case, instance, in_force),
-        )
+        bounds = self.case.bounds(self.regime)
+        knots = knots_in_operation(self.case, instance, in_force)
         if self._estimate is None:
-            return self._step(bounds, instance, knots, in_force)
+            return self._step(bounds, instance, knots, Plan(in_force))
         state = self._estimate.initial(instance, in_force)
-        solution = self._step(bounds, instance, knots, in_force, state)
+        solution = self._step(bounds, instance, knots, Plan(in_force, state=state))
         self._estimate.keep(instance, state, solution.schedule)
         return solution
 
@@ -139,7 +109,7 @@ class RealTimeSolver:
         near = expected.until(NEAR_S)
         knots = knots_on_clock(case, near, surprises.now_s)
         margin, room = surprises.margin(near.grid), surprises.room(near.grid[knots[1:]])
-        solution = self._corrected(case.bounds(self.regime), near, knots, Plan(in_force, room, margin=margin))
+        solution = self._step(case.bounds(self.regime), near, knots, Plan(in_force, room, margin=margin))
         if (plan := solution.schedule) is not None:
             longer = Schedule(np.append(plan.t, instance.horizon_s), np.vstack([plan.p, plan.p[-1:]]))
             solution = dataclasses.replace(solution, schedule=longer)
@@ -157,24 +127,7 @@ class RealTimeSolver:
             return None
         return StateEstimate(self.surrogate.plant)
 
-    @functools.cached_property
-    def _reserve(self) -> Reserve | None:
-        if not self.options.reserve:
-            return None
-        return Reserve.of(self.case, LIMIT * self.case.omega_bound(self.regime))
-
-    def _step(
-        self,
-        bounds: Bounds,
-        instance: Instance,
-        knots: Indices,
-        last: Schedule | None,
-        state: PlantState = None,
-    ) -> Solution:
-        room = None if self._reserve is None else self._reserve.room(instance.grid[knots[1:]])
-        return self._corrected(bounds, instance, knots, Plan(last, room, state))
-
-    def _corrected(self, bounds: Bounds, instance: Instance, knots: Indices, plan: Plan) -> Solution:
+    def _step(self, bounds: Bounds, instance: Instance, knots: Indices, plan: Plan) -> Solution:
         solution = solve_on_surrogate(
             self.case, self.surrogate, instance, bounds, knots, self.time_limit_s, plan=plan
         )

@@ -1,9 +1,9 @@
-"""Reserve: room for generators to follow the steepest ramp of a load that nobody announced.
+"""Room for generators to follow a ramp of a load that nobody announced.
 
 A load that ramps turns the machines around it. Generators near it can follow the load; where all of them
-stand at a limit, as a static dispatch has them, none can, and no plan is fast enough. So at every knot, for
-both directions of each ramp, a response is asked for: ramps δ of the generators that go on as long as the
-load's, stay within their limits, and leave every machine a steady speed within `limit`,
+stand at a limit, as a static dispatch has them, none can, and no plan is fast enough. So at a knot at which a
+ramp may begin a response is asked for: ramps δ of the generators that go on as long as the load's, stay
+within their limits, and leave every machine a steady speed within `limit`,
 
     |K (δ - T λ)| <= limit + e,    p_min <= P + τ δ <= p_max,    |δ| <= ramp,    e >= 0
 
@@ -29,53 +29,18 @@ from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
 
-#: Steady speed that a ramp may leave, as a part of the bound: a ramp that begins at once swings a machine to
-#: twice its steady speed. This and the price were chosen on scenarios drawn for it (docs/online.md).
-LIMIT = 0.5
-#: What a shortage as large as that costs, in pu of generation at the mean cost of all machines.
-PRICE = 1.0
-#: Knots so far ahead keep reserve, s: plans are made anew long before.
-AHEAD_S = 20.0
 
+def steady_speeds(case: Case) -> tuple[Array, Array]:
+    """How fast machines of a lossless grid turn while a load or a power ramps.
 
-@dataclass(frozen=True, eq=False)
-class Reserve:
-    """The ramps that plans of one case must be able to follow."""
-
-    case: Case
-    speeds: Array  # steady speeds under each ramp if nobody follows, (n_ramps, n_gen), rad/s
-    compliance: Array  # K, (n_gen, n_gen), rad/pu
-    limit: float  # rad/s
-    duration_s: float  # τ
-    price: float = PRICE
-    ahead_s: float = AHEAD_S
-
-    @staticmethod
-    def of(case: Case, limit: float) -> Reserve:
-        """The steepest ramps of a case, up and down, that turn a machine too fast if nobody follows.
-
-        Args:
-            case: gives the loads' ranges (`sampling`).
-            limit: of steady speeds, rad/s.
-        """
-        network = Network(case)
-        linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
-        compliance = np.asarray(np.linalg.inv(linear.stiffness), dtype=np.float64)
-        speeds = (compliance @ linear.share * np.abs(case.load_rate).max(axis=0)).T
-        fast = speeds[np.abs(speeds).max(axis=1) > limit]
-        duration = float(np.mean(case.sampling.duration_s))
-        return Reserve(case, np.concatenate([fast, -fast]), compliance, limit, duration)
-
-    def room(self, times: Array) -> Room:
-        """Room for every ramp at all knots of the next `ahead_s`.
-
-        Args:
-            times: of all knots but the first, (n_knots,), s.
-        """
-        n_knots, count = int(np.searchsorted(times, self.ahead_s - 1e-9)), len(self.speeds)
-        ones = np.ones(n_knots * count)
-        rows = np.repeat(np.arange(n_knots), count), np.tile(self.speeds, (n_knots, 1))
-        return Room(self.case, self.compliance, *rows, self.duration_s * ones, ones, self.limit, self.price)
+    Returns:
+        Speeds -K T under ramps of 1 pu/s of each load's injection if nobody follows, (n_load, n_gen), rad/s;
+        and the compliance K, (n_gen, n_gen), rad/pu.
+    """
+    network = Network(case)
+    linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
+    compliance = np.asarray(np.linalg.inv(linear.stiffness), dtype=np.float64)
+    return -(compliance @ linear.share).T, compliance
 
 
 @dataclass(frozen=True, eq=False)

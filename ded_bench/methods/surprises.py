@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.methods.reserve import Reserve, Room
+from ded_bench.methods.reserve import Room, steady_speeds
 from ded_bench.methods.state_estimate import passed_s
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
+from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import RATE_ERROR, START_ERROR_S
 from ded_bench.problem.schedule import Schedule
 
@@ -32,7 +33,10 @@ WAIT_S = 0.5
 ALWAYS, UNCERTAIN = 0.1, 0.5
 #: Room for surprises: knots so far ahead, s; what may be left of the bound; how far a sudden ramp swings
 #: machines, in steady speeds, and how long, s; how long a ramp lasts, s; the price of a shortage.
-AHEAD_S, LIMIT, SWING, SWING_S, LASTS_S, PRICE = 6.0, 0.85, 3.0, 2.0, 16.0, 5.0
+AHEAD_S, LIMIT, SWING, SWING_S, LASTS_S, PRICE = 15.0, 0.85, 3.0, 2.0, 16.0, 5.0
+#: A sudden ramp asks for room if so many times its steady speed, the swing without damping, is beyond the
+#: bound; another, if its steady speed is.
+OVERSHOOT = 2.0
 
 
 class Surprises:
@@ -45,7 +49,8 @@ class Surprises:
 
     def __init__(self, case: Case, bound: float) -> None:
         self._case, self._bound = case, bound
-        self._all = Reserve.of(case, 0.0)
+        #: Steady speeds by loads' ramps, and the compliance; None where no network tells.
+        self._speeds = steady_speeds(case) if isinstance(case, LosslessCase) else None
         self._steepest = np.abs(case.load_rate).max(axis=0)
         #: Slower changes are no ramps, pu/s.
         self._slow = 0.5 * float(np.abs(case.load_rate).min())
@@ -133,21 +138,21 @@ class Surprises:
             t: times of the knots, (n_knots,), s.
         """
         found = [one for j in np.flatnonzero(t <= AHEAD_S) for one in self._at(int(j), float(t[j]))]
-        if not found:
+        if not found or self._speeds is None:
             return None
-        alone = self._all.speeds / np.append(-self._steepest, self._steepest)[:, None]
-        speeds = np.array([alone[load] * rate for _, load, rate, _ in found])
-        swing = np.array([SWING if is_sudden else 1.0 for *_, is_sudden in found])
-        asks = swing * np.abs(speeds).max(axis=1) > LIMIT * self._bound
+        by_load, compliance = self._speeds
+        speeds = np.array([rate * by_load[load] for _, load, rate, _ in found])
+        is_sudden = np.array([one[-1] for one in found])
+        asks = np.where(is_sudden, OVERSHOOT, 1.0) * np.abs(speeds).max(axis=1) > self._bound
         if not asks.any():
             return None
         return Room(
             self._case,
-            self._all.compliance,
+            compliance,
             knot=np.array([j for j, *_ in found])[asks],
             speeds=speeds[asks],
-            lasts_s=np.where(swing > 1.0, SWING_S, LASTS_S)[asks],
-            swing=swing[asks],
+            lasts_s=np.where(is_sudden, SWING_S, LASTS_S)[asks],
+            swing=np.where(is_sudden, SWING, 1.0)[asks],
             limit=LIMIT * self._bound,
             price=PRICE,
         )

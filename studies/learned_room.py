@@ -16,19 +16,17 @@ from concurrent.futures import ProcessPoolExecutor
 
 import cma
 import numpy as np
+from drawn_operation import DURATION_S, operated
 from threadpoolctl import threadpool_limits
 
-from ded_bench import Case, Schedule, Settings, Solution, Status
+from ded_bench import Case
 from ded_bench.methods import surprises
-from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array
-from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
-from ded_bench.run.online.judgement import judge_operation
-from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
+from ded_bench.run.online.loop import LoopOptions
 
-SEED, DURATION_S, REGIME = 4_500_000, 60.0, "TO"
+SEED = 4_500_000
 #: What is learned, and the largest value of each; the search begins at those of `methods/surprises.py`.
 LEARNED = {"ALWAYS": 0.5, "UNCERTAIN": 0.8, "LIMIT": 1.0, "PRICE": 40.0}
 #: Candidates, scenarios of a generation, first standard deviation of the logits.
@@ -37,20 +35,11 @@ CANDIDATES, SCENARIOS, SIGMA = 6, 6, 0.5
 PRICE = 20.0
 
 
-def operated(case: Case, index: int, values: dict[str, float], options: LoopOptions) -> tuple[float, float]:
+def judged(case: Case, index: int, values: dict[str, float], options: LoopOptions) -> tuple[float, float]:
     """Cost of a drawn scenario, and its largest excess over the bound, mHz."""
-    for name, value in values.items():
-        setattr(surprises, name, value)
-    solver = get_method("ded-rti").prepare(case, REGIME, Settings())
-
-    def ask(instance: Instance, last: Schedule | None) -> Planned:
-        return Planned(
-            solver.solve(instance, None if last is None else Solution(Status.FEASIBLE, last)).schedule
-        )
-
     scenario = sample_scenario(case, SEED, index, servable, DURATION_S)
-    judged = judge_operation(case, scenario, run_loop(case, scenario, ask, options).trajectory, REGIME)
-    return judged.objective, 1e3 * judged.max_excess_hz
+    found = operated(case, scenario, options, values)
+    return found.objective, max(1e3 * found.excess_hz, 0.0)
 
 
 def values_of(logits: Array) -> dict[str, float]:
@@ -77,7 +66,7 @@ def main() -> None:
             candidates = search.ask()
             drawn = range(generation * SCENARIOS, (generation + 1) * SCENARIOS)
             calls = [
-                [pool.submit(operated, case, index, values_of(one), options) for index in drawn]
+                [pool.submit(judged, case, index, values_of(one), options) for index in drawn]
                 for one in candidates
             ]
             found = np.array([[call.result() for call in row] for row in calls])

@@ -19,34 +19,24 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
+from drawn_operation import DURATION_S, operated
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
-from ded_bench import Case, Schedule, Settings, Solution, Status
-from ded_bench.methods.registry import get_method
+from ded_bench import Case
 from ded_bench.plants.plant import servable
-from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
-from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
+from ded_bench.run.online.loop import LoopOptions
 
 #: Seeds of scenarios to calibrate with, and to check.
 CALIBRATE, CHECK = 4_200_003, 4_200_004
-DURATION_S, REGIME = 60.0, "TO"
 ALPHA, DELTA, STRICT_HZ = 0.05, 0.01, 1e-6
 
 
 def excess_hz(case: Case, seed: int, index: int, options: LoopOptions) -> float:
     """Largest excess of one scenario over the bound, negative within it, Hz."""
-    solver = get_method("ded-rti").prepare(case, REGIME, Settings())
-
-    def ask(instance: Instance, last: Schedule | None) -> Planned:
-        return Planned(
-            solver.solve(instance, None if last is None else Solution(Status.FEASIBLE, last)).schedule
-        )
-
     scenario = sample_scenario(case, seed, index, servable, DURATION_S)
-    omega = run_loop(case, scenario, ask, options).trajectory.omega[1:]  # where it begins is given
-    return float((np.abs(omega).max() - case.omega_bound(REGIME)) / (2 * np.pi))
+    return operated(case, scenario, options, {}).excess_hz
 
 
 def main() -> None:

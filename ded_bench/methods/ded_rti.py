@@ -45,9 +45,8 @@ from ded_bench.surrogates.koopman import Koopman
 Options = NoOptions
 #: Raised when answers change.
 VERSION = 3
-#: Beside a slack, plans are made for so many seconds, and their ends stay. On drawn scenarios of two-area,
-#: plans of 60 s cost as much.
-NEAR_S = 30.0
+#: Beside a slack, plans are made for so many seconds, and their ends stay (studies/surprises.md).
+NEAR_S = 20.0
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:

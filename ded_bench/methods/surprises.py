@@ -30,10 +30,10 @@ LOOK_S = 0.25
 #: No plan counts on a ramp that has not begun sooner than so many seconds from now.
 WAIT_S = 0.5
 #: Parts of the bound that plans leave free: always, and where a ramp's start is uncertain.
-ALWAYS, UNCERTAIN = 0.1, 0.5
-#: Room for surprises: knots so far ahead, s; what may be left of the bound; how far a sudden ramp swings
+ALWAYS, UNCERTAIN = 0.3, 0.5
+#: Room for surprises at knots so far ahead, s; what may be left of the bound; how far a sudden ramp swings
 #: machines, in steady speeds, and how long, s; how long a ramp lasts, s; the price of a shortage.
-AHEAD_S, LIMIT, SWING, SWING_S, LASTS_S, PRICE = 15.0, 0.85, 3.0, 2.0, 16.0, 5.0
+AHEAD_S, LIMIT, SWING, SWING_S, LASTS_S, PRICE = 15.0, 0.85, 3.0, 3.0, 16.0, 5.0
 #: A sudden ramp asks for room if so many times its steady speed, the swing without damping, is beyond the
 #: bound; another, if its steady speed is.
 OVERSHOOT = 2.0

@@ -27,7 +27,7 @@ PIECE = 20
 
 
 class OutputRows:
-    """Rows of one model; those of an interval are found once, when one is asked for.
+    """Rows of one model; each is found once, when it is asked for.
 
     Args:
         model: a linear model along a trajectory.
@@ -36,7 +36,6 @@ class OutputRows:
     def __init__(self, model: TimeVarying) -> None:
         self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
-        self._known: dict[int, tuple[Array, Array, Array]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -59,36 +58,11 @@ class OutputRows:
         """Rows in the variables of intervals; a knot's are those of the interval after it."""
         (point, output), model = np.divmod(places, self._n_out), self._model
         interval = np.searchsorted(model.points, point, side="right") - 1
-        (n_state, n_gen), n = model.step.g.shape[1:], len(places)
-        x, (start, end) = np.zeros((n, n_state)), np.zeros((2, n, n_gen))
-        for i, (j, k, of) in enumerate(zip(interval.tolist(), point.tolist(), output.tolist(), strict=True)):
-            if k == model.points[j]:
-                x[i] = model.output[of]
-            else:
-                x[i], start[i], end[i] = (part[k - model.points[j] - 1, of] for part in self._inside(j))
         between = np.flatnonzero(point > model.points[interval])
-        x[between] = model.before_reset(x[between], interval[between])
+        inside = model.frequency_rows(output[between], point[between])
+        x, (start, end) = model.output[output], np.zeros((2, len(places), model.p_gen.shape[1]))
+        x[between], start[between], end[between] = inside.x, inside.start, inside.end
         return LocalRows(interval, x, start, end)
-
-    def _inside(self, j: int) -> tuple[Array, Array, Array]:
-        """Outputs at all points inside of an interval, (n_points, n_out, any), after a reset at its start.
-
-        C times the map from its start, from grid point to grid point.
-        """
-        if j in self._known:
-            return self._known[j]
-        model, length = self._model, int(self._model.lengths[j])
-        f, g, h = (part[j] for part in model.step)
-        (n_state, n_gen), n = g.shape, length - 1
-        x, (start, end) = np.empty((n, self._n_out, n_state)), np.empty((2, n, self._n_out, n_gen))
-        costate, on_start, on_slope = model.output, 0.0, 0.0
-        for k in range(n):
-            on_slope = on_slope + on_start + costate @ h
-            on_start = on_start + costate @ g
-            costate = costate @ f
-            x[k], start[k], end[k] = costate, on_start - on_slope / length, on_slope / length
-        self._known[j] = x, start, end
-        return x, start, end
 
 
 class BasisByPlaces(NamedTuple):

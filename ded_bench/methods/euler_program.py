@@ -88,7 +88,7 @@ class EulerPrograms:
         now[-1, -2:] = 1.0, -1.0
         step, shift = sp.eye(steps, format="csr"), sp.eye(steps, k=-1, format="csr")
         self._constant = sp.csr_matrix(sp.kron(step, now) + sp.kron(shift, before))
-        self._ramps = sp.csc_matrix(sp.kron((step - shift) / dt, sp.eye(*now[:n_gen].shape, k=2 * n_gen)))
+        self._ramps = sp.csc_matrix(sp.kron((step - shift) / dt, sp.eye(n_gen, now.shape[1], k=2 * n_gen)))
         endless, limit = np.full(n_gen, np.inf), np.full(n_gen, case.omega_bound(regime))
         self._lower = np.tile(np.concatenate([-endless, -limit, case.p_min, np.zeros(2)]), steps)
         self._upper = np.tile(np.concatenate([endless, limit, case.p_max, np.full(2, np.inf)]), steps)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -117,34 +117,24 @@ def _pyomo_solver(
         if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
             return refusal
         started = time.perf_counter()
-        program = _Program(case, koopman.fingerprint, instance.steps, koopman)
-        model = _built(program)
+        program = case, koopman, instance.steps
+        model = _built(*program)
         set_instance(model, case, koopman, instance, regime)
         build_s = time.perf_counter() - started
-        outcome = _compiled(program, solver).solve(time_limit_s)
+        outcome = _compiled(*program, solver).solve(time_limit_s)
         return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
     return solve
 
 
-@dataclass(frozen=True)
-class _Program:
-    """What a built model depends on; Koopman models are equal if their fingerprints are."""
-
-    case: Case
-    fingerprint: str
-    steps: int
-    koopman: Koopman = field(compare=False)
+@functools.lru_cache(maxsize=1)
+def _built(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
+    return build_ded_ko(case, koopman, steps)
 
 
 @functools.lru_cache(maxsize=1)
-def _built(program: _Program) -> pyo.ConcreteModel:
-    return build_ded_ko(program.case, program.koopman, program.steps)
-
-
-@functools.lru_cache(maxsize=1)
-def _compiled(program: _Program, solver: str) -> OnArrays:
-    return OnArrays(_built(program), solver)
+def _compiled(case: Case, koopman: Koopman, steps: int, solver: str) -> OnArrays:
+    return OnArrays(_built(case, koopman, steps), solver)
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:

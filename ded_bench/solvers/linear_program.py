@@ -68,6 +68,11 @@ class FreeForm:
         )
         return wider, place, new
 
+    def all_rows(self) -> tuple[sp.csc_matrix, Array, Array]:
+        """A, low and high of low <= A x <= high, equalities first."""
+        rows = sp.csc_matrix(sp.vstack([self.equal, self.between]))
+        return rows, np.append(self.right, self.low), np.append(self.right, self.high)
+
     def with_rows(self, between: sp.csc_matrix, low: Array, high: Array) -> FreeForm:
         """The program with more rows low <= between x <= high."""
         rows = sp.csc_matrix(sp.vstack([self.between, between]))

@@ -166,6 +166,13 @@ class Koopman:
         arrays = [self.k, self.b, self.g, self.lift, *(a for layer in self.mlp for a in layer)]
         return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
+    def __eq__(self, other: object) -> bool:
+        """Equal arrays: models are keys of what is made once for each."""
+        return isinstance(other, Koopman) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
     def save(self, path: Path) -> None:
         """Write arrays and header (see `files.arrays`)."""
         arrays = {"k": self.k, "b": self.b, "g": self.g, "lift": self.lift}

@@ -8,6 +8,7 @@ the arrays of the same program directly (see `knot_program`: every grid point is
 from __future__ import annotations
 
 import functools
+import itertools
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +24,7 @@ from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.compile import SOLVERS, OnArrays, fix, reset
+from ded_bench.solvers.compile import SOLVERS, OnArrays, fix
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
@@ -179,8 +180,8 @@ def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: I
     psi = koopman.initial(Network(case), [instance])[0].tolist()
     bound, n_gen = case.omega_bound(regime), len(case.generators)
     set_powers(m, case, instance, psi[n_gen])
-    for (i, _), variable in m.psi.items():
-        limit = bound if i < n_gen else None
-        reset(variable, psi[i], None if limit is None else -limit, limit)
+    for i, k in itertools.product(range(n_gen), m.point):
+        m.psi[i, k].setlb(-bound)
+        m.psi[i, k].setub(bound)
     for i, value in enumerate(psi):
         fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies

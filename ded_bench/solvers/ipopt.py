@@ -122,4 +122,4 @@ def run_ipopt(
     if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
         x, objective = result["x"].full().ravel(), float(result["f"])
     said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
-    return Outcome(status, x is not None, *said), x
+    return Outcome(status, *said), x

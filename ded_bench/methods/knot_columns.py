@@ -27,7 +27,7 @@ PIECE = 20
 
 
 class OutputRows:
-    """Rows of one model; each is found once, when it is asked for.
+    """Rows of one model; those of an interval are found once, when one is asked for.
 
     Args:
         model: a linear model along a trajectory.
@@ -36,6 +36,7 @@ class OutputRows:
     def __init__(self, model: TimeVarying) -> None:
         self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
+        self._known: dict[int, list[Array]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -58,11 +59,30 @@ class OutputRows:
         """Rows in the variables of intervals; a knot's are those of the interval after it."""
         (point, output), model = np.divmod(places, self._n_out), self._model
         interval = np.searchsorted(model.points, point, side="right") - 1
-        between = np.flatnonzero(point > model.points[interval])
-        inside = model.frequency_rows(output[between], point[between])
-        x, (start, end) = model.output[output], np.zeros((2, len(places), model.p_gen.shape[1]))
-        x[between], start[between], end[between] = inside.x, inside.start, inside.end
-        return LocalRows(interval, x, start, end)
+        steps, (n_state, n_gen) = point - model.points[interval], model.step.g.shape[1:]
+        rows = np.zeros((len(places), n_state + 2 * n_gen))
+        rows[:, :n_state] = model.output[output]
+        for j in np.unique(interval[steps > 0]).tolist():
+            for bit, power in enumerate(self._powers(j)):
+                chosen = (interval == j) & (steps >> bit & 1 == 1)
+                rows[chosen] = rows[chosen] @ power
+        x, start, end = np.split(rows, [n_state, n_state + n_gen], axis=1)
+        between = steps > 0
+        x[between] = model.before_reset(x[between], interval[between])
+        end[between] /= model.lengths[interval[between], None]
+        return LocalRows(interval, x, start - end, end)
+
+    def _powers(self, j: int) -> list[Array]:
+        """A, A², A⁴ and so on of the map A from grid point to grid point of (x, u, Δu) in an interval."""
+        if j not in self._known:
+            n_state, n_gen = self._model.step.g.shape[1:]
+            a = np.eye(n_state + 2 * n_gen)
+            a[:n_state] = np.hstack([part[j] for part in self._model.step])
+            a[n_state:-n_gen, -n_gen:] = np.eye(n_gen)
+            powers = self._known[j] = [a]
+            while 2 ** len(powers) < self._model.lengths[j]:
+                powers.append(powers[-1] @ powers[-1])
+        return self._known[j]
 
 
 class BasisByPlaces(NamedTuple):

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 
-
 Indices = NDArray[np.intp]
 
 

@@ -199,24 +199,18 @@ def read_linear(model: pyo.ConcreteModel) -> LinearProgram:
     repn = generate_standard_repn(objective.expr, quadratic=True)
     if repn.nonlinear_expr is not None:
         raise ValueError("the objective is not linear in the free variables")
-    pairs = [(column(one), column(other)) for one, other in repn.quadratic_vars]
+    pairs = np.array([(column(one), column(other)) for one, other in repn.quadratic_vars], dtype=int)
     places = [column(variable) for variable in repn.linear_vars]
     n = len(columns)
     linear = np.zeros(n)
     np.add.at(linear, places, repn.linear_coefs)
+    half = sp.csr_matrix((repn.quadratic_coefs, pairs.reshape(-1, 2).T), shape=(n, n))
     return LinearProgram(
         columns=tuple(columns),
         a=sp.csc_matrix((values, (rows, cols)), shape=(len(lower), n)),
         row_lower=np.array(lower),
         row_upper=np.array(upper),
         linear=linear,
-        bilinear=_symmetric(pairs, repn.quadratic_coefs, n),
+        bilinear=sp.csr_matrix(half + half.T),
         constant=float(repn.constant),
     )
-
-
-def _symmetric(pairs: Sequence[tuple[int, int]], coefficients: Sequence[float], n: int) -> sp.csr_matrix:
-    """Σ q_ij x_i x_j as the symmetric Q of ½ xᵀ Q x (a square x_i² counts twice, as it should)."""
-    i = [one for one, _ in pairs] + [other for _, other in pairs]
-    j = [other for _, other in pairs] + [one for one, _ in pairs]
-    return sp.csr_matrix(([*coefficients, *coefficients], (i, j)), shape=(n, n))

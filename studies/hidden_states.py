@@ -1,4 +1,4 @@
-"""What knowing the states that nobody measures is worth to plans in operation, and what a margin is.
+"""What knowing the states that nobody measures is worth to plans in operation.
 
 Scenarios are drawn, none of them committed. `ded-rti` plans every second, blind or with its estimate of
 fluxes, exciters and valves (`methods/state_estimate.py`); static dispatch every second stands beside it.
@@ -57,7 +57,6 @@ def main(name: str, regime: str, count: str, duration_s: str) -> None:
         ("`ed`", "ed", "", True),
         ("`ded-rti`, blind", "ded-rti", "", False),
         ("`ded-rti`", "ded-rti", "", True),
-        ("`ded-rti`, `margin=0.5`", "ded-rti", "margin=0.5", True),
     ]
     print(COLUMNS + "\n| --- | --- |" + " ---: |" * 5)
     for forecast in ("perfect", "announced"):

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sp
 from threadpoolctl import threadpool_limits
 
 from ded_bench.files.errors import InputError
@@ -63,8 +62,7 @@ def export_programs(
     told: list[tuple[float, float, str]] = []
 
     def keep(form: FreeForm, answer: FormAnswer) -> None:
-        a = sp.csc_matrix(sp.vstack([form.equal, form.between]))
-        low, high = (np.append(form.right, ends) for ends in (form.low, form.high))
+        a, low, high = form.all_rows()
         matrix = {"l": low, "u": high, "data": a.data, "indices": a.indices, "indptr": a.indptr}
         columns = {"c": form.cost, "lb": form.lower, "ub": form.upper, "x": answer.x}
         arrays.update({f"{len(told)}_{name}": np.array(of) for name, of in (columns | matrix).items()})

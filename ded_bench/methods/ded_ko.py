@@ -8,8 +8,9 @@ the arrays of the same program directly (see `knot_program`: every grid point is
 from __future__ import annotations
 
 import functools
+import itertools
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.compile import SOLVERS, OnArrays, fix, reset
+from ded_bench.solvers.compile import SOLVERS, OnArrays, fix
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
@@ -117,34 +118,24 @@ def _pyomo_solver(
         if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
             return refusal
         started = time.perf_counter()
-        program = _Program(case, koopman.fingerprint, instance.steps, koopman)
-        model = _built(program)
+        program = case, koopman, instance.steps
+        model = _built(*program)
         set_instance(model, case, koopman, instance, regime)
         build_s = time.perf_counter() - started
-        outcome = _compiled(program, solver).solve(time_limit_s)
+        outcome = _compiled(*program, solver).solve(time_limit_s)
         return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
     return solve
 
 
-@dataclass(frozen=True)
-class _Program:
-    """What a built model depends on; Koopman models are equal if their fingerprints are."""
-
-    case: Case
-    fingerprint: str
-    steps: int
-    koopman: Koopman = field(compare=False)
+@functools.lru_cache(maxsize=1)
+def _built(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
+    return build_ded_ko(case, koopman, steps)
 
 
 @functools.lru_cache(maxsize=1)
-def _built(program: _Program) -> pyo.ConcreteModel:
-    return build_ded_ko(program.case, program.koopman, program.steps)
-
-
-@functools.lru_cache(maxsize=1)
-def _compiled(program: _Program, solver: str) -> OnArrays:
-    return OnArrays(_built(program), solver)
+def _compiled(case: Case, koopman: Koopman, steps: int, solver: str) -> OnArrays:
+    return OnArrays(_built(case, koopman, steps), solver)
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
@@ -189,8 +180,8 @@ def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: I
     psi = koopman.initial(Network(case), [instance])[0].tolist()
     bound, n_gen = case.omega_bound(regime), len(case.generators)
     set_powers(m, case, instance, psi[n_gen])
-    for (i, _), variable in m.psi.items():
-        limit = bound if i < n_gen else None
-        reset(variable, psi[i], None if limit is None else -limit, limit)
+    for i, k in itertools.product(range(n_gen), m.point):
+        m.psi[i, k].setlb(-bound)
+        m.psi[i, k].setub(bound)
     for i, value in enumerate(psi):
         fix(m.psi[i, 0], value)  # x_0 is given, wherever it lies

@@ -22,7 +22,7 @@ from ded_bench.methods.radau_detailed import DetailedProgram, mesh
 from ded_bench.methods.radau_program import POINTS, RadauProgram
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant
-from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.ipopt import CasadiIpopt
@@ -115,8 +115,7 @@ def program_bytes(case: Case, elements: int) -> int:
 
 def default_element(case: Case) -> float:
     """Mean length of an element by the fastest mode of the linearisation at the nominal point, s."""
-    network = Network(case)
-    modes = network.linearise(network.power_flow(case.p_nominal, case.load_nominal)).modes()
+    modes = plant_of(case, "lossless").nominal().modes
     return min(LONGEST_S, LONGEST_PERIODS * 2 * np.pi / float(np.abs(modes.imag).max()))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ded_bench.methods.ed import first_schedules, static_dispatch
 from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
-from ded_bench.methods.knots import case_knots, control_times, is_reachable, knot_points
+from ded_bench.methods.knots import case_knots, is_reachable
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
@@ -83,7 +83,7 @@ class SlpSolver:
     def _solution(self, instance: Instance, near: Schedule | None, soft: bool) -> Solution:
         started = time.perf_counter()
         deadline = started + (np.inf if self.time_limit_s is None else self.time_limit_s)
-        points = self._knots(instance)
+        points = case_knots(self.case, instance, self.options.knot_s)
         bounds = self.case.bounds(self.regime)
         parts = _OnPlant(self.case, instance, bounds, points, deadline, soft, near is not None)
         if is_reachable(self.case, instance, points):
@@ -105,14 +105,6 @@ class SlpSolver:
             solver_version=end.answer.version if end.answer is not None else "",
             error="" if is_given else end.message if status == Status.FAILED else status.sentence,
         )
-
-    def _knots(self, instance: Instance) -> Indices:
-        """Grid points of the knots."""
-        if self.options.knot_s is None:
-            return case_knots(self.case, instance)
-        count = round(instance.horizon_s / self.options.knot_s) + 1
-        times = np.linspace(0.0, instance.horizon_s, count), control_times(self.case, instance)
-        return knot_points(np.concatenate(times), instance.dt_s)
 
 
 @dataclass(frozen=True, eq=False)

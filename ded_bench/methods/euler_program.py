@@ -79,34 +79,16 @@ class EulerPrograms:
 
     def __init__(self, case: Case, regime: str, steps: int, dt: float) -> None:
         self._case, self._network, self._steps, self._dt = case, Network(case), steps, dt
-        n_gen = len(case.generators)
-        column = np.arange(steps * (3 * n_gen + 2)).reshape(steps, -1)
-        theta, omega, p_gen = (column[:, i * n_gen : (i + 1) * n_gen] for i in range(3))
-        row = np.arange(steps * (2 * n_gen + 1)).reshape(steps, -1)
-        eq_angle, eq_swing, served = row[:, :n_gen], row[:, n_gen:-1], row[:, n_gen:]
-        one, m_dt = np.ones((steps, n_gen)), self._network.m / dt
-        constant = [
-            (eq_angle, theta, one / dt),
-            (eq_angle[1:], theta[:-1], -one[1:] / dt),
-            (eq_angle, omega, -one),
-            (eq_swing, omega, one * (m_dt + self._network.d)),
-            (eq_swing[1:], omega[:-1], -one[1:] * m_dt),
-            (eq_swing, p_gen, -one),
-            (row[:, -1], column[:, -2], one[:, 0]),
-            (row[:, -1], column[:, -1], -one[:, 0]),
-        ]
-        # Every program has new slopes of f for the angle of every generator.
-        shape = (steps, n_gen + 1, n_gen)
-        slopes = (np.broadcast_to(served[:, :, None], shape), np.broadcast_to(theta[:, None], shape))
-        self._rows, self._columns = (
-            np.concatenate([*(part[i].ravel() for part in constant), slopes[i].ravel()]) for i in (0, 1)
-        )
-        self._constant = np.concatenate([part[2].ravel() for part in constant])
-        self._sign = np.append(np.ones(n_gen), -1.0)
-        self._theta, self._p_gen, self._row, self._shape = theta, p_gen, row, (row.size, column.size)
-        difference = sp.eye(steps, format="csr") - sp.eye(steps, k=-1, format="csr")
-        pick = sp.csr_matrix((one.ravel(), (np.arange(one.size), p_gen.ravel())), (one.size, column.size))
-        self._ramps = sp.csc_matrix(sp.kron(difference / dt, sp.eye(n_gen)) @ pick)
+        n_gen, m_dt = len(case.generators), self._network.m / dt
+        now = np.zeros((2 * n_gen + 1, 3 * n_gen + 2))  # of one step
+        before = np.zeros_like(now)
+        theta, omega, power = (np.arange(i * n_gen, (i + 1) * n_gen) for i in range(3))
+        now[theta, theta], now[theta, omega], before[theta, theta] = 1 / dt, -1.0, -1 / dt
+        now[omega, omega], now[omega, power], before[omega, omega] = m_dt + self._network.d, -1.0, -m_dt
+        now[-1, -2:] = 1.0, -1.0
+        step, shift = sp.eye(steps, format="csr"), sp.eye(steps, k=-1, format="csr")
+        self._constant = sp.csr_matrix(sp.kron(step, now) + sp.kron(shift, before))
+        self._ramps = sp.csc_matrix(sp.kron((step - shift) / dt, sp.eye(n_gen, now.shape[1], k=2 * n_gen)))
         endless, limit = np.full(n_gen, np.inf), np.full(n_gen, case.omega_bound(regime))
         self._lower = np.tile(np.concatenate([-endless, -limit, case.p_min, np.zeros(2)]), steps)
         self._upper = np.tile(np.concatenate([endless, limit, case.p_max, np.full(2, np.inf)]), steps)
@@ -127,7 +109,7 @@ class EulerPrograms:
 
         def solve(along: Injections, _: int) -> Attempt[tuple[Injections, Array]]:
             found = solve_form(self._program(instance, along))
-            theta = np.vstack([initial, found.x[self._theta]])
+            theta = np.vstack([initial, found.x.reshape(self._steps, -1)[:, : len(initial)]])
             said = found.iterations, found.version, found.message
             return Attempt(found.status, theta, (along, found.x), *said)
 
@@ -139,7 +121,8 @@ class EulerPrograms:
         end = sequence(Parts(follow, solve, is_met, MAX_PROGRAMS, tries=1), [still], deadline)
         schedule, objective = None, None
         if end.status == Status.OPTIMAL and end.answer and end.answer.solution and end.followed:
-            power = np.vstack([instance.p_initial(self._case), end.answer.solution[1][self._p_gen]])
+            columns = end.answer.solution[1].reshape(self._steps, -1)
+            power = np.vstack([instance.p_initial(self._case), columns[:, 2 * len(initial) : -2]])
             schedule = Schedule(t=instance.grid, p=power)
             p_slack = np.abs(end.followed.f[:, -1])
             cost = power @ instance.cost_gen(self._case) + instance.cost_slack(self._case) * p_slack
@@ -158,11 +141,14 @@ class EulerPrograms:
     def _program(self, instance: Instance, along: Injections) -> FreeForm:
         """The linear program around a trajectory of angles."""
         case, dt, n_gen, theta = self._case, self._dt, len(self._case.generators), along.at
-        values = np.concatenate([self._constant, (along.slope[1:] * self._sign[:, None]).ravel()])
-        equal = sp.csc_matrix((values, (self._rows, self._columns)), shape=self._shape)
+        sign = np.append(np.ones(n_gen), -1.0)  # of f in the equations
+        slopes = np.zeros((self._steps, 2 * n_gen + 1, 3 * n_gen + 2))
+        slopes[:, n_gen:, :n_gen] = along.slope[1:] * sign[:, None]
+        block = np.arange(self._steps + 1)
+        equal = sp.csc_matrix(self._constant + sp.bsr_matrix((slopes, block[:-1], block)).tocsr())
         offset = np.einsum("nij,nj->ni", along.slope[1:], theta[1:]) - along.f[1:]
-        right = np.zeros(self._row.shape)
-        right[:, n_gen:] = offset * self._sign
+        right = np.zeros(slopes.shape[:2])
+        right[:, n_gen:] = offset * sign
         right[0, :n_gen] += theta[0] / dt
         right[0, n_gen:-1] += self._network.m / dt * instance.omega_initial(case)
         limit = np.tile(case.ramp, (self._steps, 1))

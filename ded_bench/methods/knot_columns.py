@@ -36,7 +36,7 @@ class OutputRows:
     def __init__(self, model: TimeVarying) -> None:
         self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
-        self._known: dict[int, tuple[Array, Array, Array]] = {}
+        self._known: dict[int, list[Array]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -59,36 +59,30 @@ class OutputRows:
         """Rows in the variables of intervals; a knot's are those of the interval after it."""
         (point, output), model = np.divmod(places, self._n_out), self._model
         interval = np.searchsorted(model.points, point, side="right") - 1
-        (n_state, n_gen), n = model.step.g.shape[1:], len(places)
-        x, (start, end) = np.zeros((n, n_state)), np.zeros((2, n, n_gen))
-        for i, (j, k, of) in enumerate(zip(interval.tolist(), point.tolist(), output.tolist(), strict=True)):
-            if k == model.points[j]:
-                x[i] = model.output[of]
-            else:
-                x[i], start[i], end[i] = (part[k - model.points[j] - 1, of] for part in self._inside(j))
-        between = np.flatnonzero(point > model.points[interval])
+        steps, (n_state, n_gen) = point - model.points[interval], model.step.g.shape[1:]
+        rows = np.zeros((len(places), n_state + 2 * n_gen))
+        rows[:, :n_state] = model.output[output]
+        for j in np.unique(interval[steps > 0]).tolist():
+            for bit, power in enumerate(self._powers(j)):
+                chosen = (interval == j) & (steps >> bit & 1 == 1)
+                rows[chosen] = rows[chosen] @ power
+        x, start, end = np.split(rows, [n_state, n_state + n_gen], axis=1)
+        between = steps > 0
         x[between] = model.before_reset(x[between], interval[between])
-        return LocalRows(interval, x, start, end)
+        end[between] /= model.lengths[interval[between], None]
+        return LocalRows(interval, x, start - end, end)
 
-    def _inside(self, j: int) -> tuple[Array, Array, Array]:
-        """Outputs at all points inside of an interval, (n_points, n_out, any), after a reset at its start.
-
-        C times the map from its start, from grid point to grid point.
-        """
-        if j in self._known:
-            return self._known[j]
-        model, length = self._model, int(self._model.lengths[j])
-        f, g, h = (part[j] for part in model.step)
-        (n_state, n_gen), n = g.shape, length - 1
-        x, (start, end) = np.empty((n, self._n_out, n_state)), np.empty((2, n, self._n_out, n_gen))
-        costate, on_start, on_slope = model.output, 0.0, 0.0
-        for k in range(n):
-            on_slope = on_slope + on_start + costate @ h
-            on_start = on_start + costate @ g
-            costate = costate @ f
-            x[k], start[k], end[k] = costate, on_start - on_slope / length, on_slope / length
-        self._known[j] = x, start, end
-        return x, start, end
+    def _powers(self, j: int) -> list[Array]:
+        """A, A², A⁴ and so on of the map A from grid point to grid point of (x, u, Δu) in an interval."""
+        if j not in self._known:
+            n_state, n_gen = self._model.step.g.shape[1:]
+            a = np.eye(n_state + 2 * n_gen)
+            a[:n_state] = np.hstack([part[j] for part in self._model.step])
+            a[n_state:-n_gen, -n_gen:] = np.eye(n_gen)
+            powers = self._known[j] = [a]
+            while 2 ** len(powers) < self._model.lengths[j]:
+                powers.append(powers[-1] @ powers[-1])
+        return self._known[j]
 
 
 class BasisByPlaces(NamedTuple):

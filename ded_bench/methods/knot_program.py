@@ -37,7 +37,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.solvers.highs import solve_form as solve_by_highs
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm, moved_columns
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, with_empty_columns
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 
@@ -323,8 +323,7 @@ class KnotProgram:
             after, none + price * max(self._all_costs, 1.0), none, none + np.inf
         )
         of_limit = new[own] if by_interval else np.full(len(own), new[0])
-        outputs = self._rows_held(limits)
-        outputs = moved_columns(outputs, place, len(form.cost))
+        outputs = with_empty_columns(self._rows_held(limits), after)
         one = np.ones(len(own)), (np.arange(len(own)), of_limit)
         widening = sp.csc_matrix(one, outputs.shape)
         ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])

@@ -42,10 +42,12 @@ def knot_points(times: Array, dt_s: float) -> Indices:
     return np.unique(np.rint(times / dt_s).astype(int))
 
 
-def case_knots(case: Case, instance: Instance) -> Indices:
-    """Grid points of the case's knots, and of times of secondary control."""
-    times = [case.knot_times(instance.horizon_s), control_times(case, instance)]
-    return knot_points(np.concatenate(times), instance.dt_s)
+def case_knots(case: Case, instance: Instance, distance_s: float | None = None) -> Indices:
+    """Grid points of the case's knots, or of those at a distance, and of times of secondary control."""
+    horizon_s, times = instance.horizon_s, case.knot_times(instance.horizon_s)
+    if distance_s is not None:
+        times = np.linspace(0.0, horizon_s, round(horizon_s / distance_s) + 1)
+    return knot_points(np.concatenate([times, control_times(case, instance)]), instance.dt_s)
 
 
 def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Indices:

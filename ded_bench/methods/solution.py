@@ -92,16 +92,17 @@ Solver = Callable[[Instance], Solution]
 
 def answer(outcome: Outcome, build_s: float, schedule: Callable[[], Schedule | None]) -> Solution:
     """A solver's outcome as the method's answer; the schedule is read only if there is one."""
+    has_values = outcome.objective is not None
     return Solution(
         status=outcome.status,
-        schedule=schedule() if outcome.has_values else None,
+        schedule=schedule() if has_values else None,
         iterations=outcome.iterations,
         build_s=build_s,
         setup_s=outcome.setup_s,
         solve_s=outcome.solve_s,
         solver_objective=outcome.objective,
         solver_version=outcome.version,
-        error="" if outcome.has_values else outcome.message,
+        error="" if has_values else outcome.message,
     )
 
 

@@ -140,24 +140,21 @@ class TimeVarying:
         Args:
             u: δP at the knots, shape (n_knots, n_gen), pu.
         """
+        from ded_bench.plants.march import march  # and with it Numba
+
         x, length = self.states(u), self.lengths
         slope = np.diff(u, axis=0) / length[:, None]
         state, force = x[:-1], (self.step.g @ u[:-1, :, None] + self.step.h @ slope[:, :, None])[..., 0]
         growth = (self.step.g @ slope[:, :, None])[..., 0]
         deviation = np.zeros((len(self.omega), x.shape[1]))
         deviation[self.points] = x
-        interval = np.arange(len(length))
         if self.reset is not None:
             state = state.copy()
             state[self.reset.intervals] = state[self.reset.intervals] @ self.reset.f.T
-        for r in range(1, int(length.max())):
-            if not (length[interval] > r).all():
-                some = length[interval] > r
-                interval, state, force, growth = interval[some], state[some], force[some], growth[some]
-            f = self.step.f if len(interval) == len(length) else self.step.f[interval]
-            state = (f @ state[:, :, None])[..., 0] + force
-            force = force + growth
-            deviation[self.points[interval] + r] = state
+        which, f = np.arange(len(length)), self.step.f
+        if f.strides[0] == 0:  # the same map in all intervals
+            which, f = np.zeros_like(which), f[:1]
+        march(np.ascontiguousarray(f), which, state, force, growth, self.points, deviation)
         return self._outputs(deviation)
 
     def before_reset(self, rows: Array, intervals: Indices) -> Array:

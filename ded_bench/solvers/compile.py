@@ -57,22 +57,16 @@ class OnArrays:
             version, message = f"{answer.version}, {other.version}", f"{answer.message}, {other.message}"
             answer = dataclasses.replace(other, version=version, message=message)
         elapsed, objective = time.perf_counter() - started, None
-        has_values = answer.status in (Status.OPTIMAL, Status.FEASIBLE)
-        if has_values:
+        if answer.status in (Status.OPTIMAL, Status.FEASIBLE):
             now.values[now.free] = answer.x
             assign(self._program.columns, now.values)
             objective = float(now.form.cost @ answer.x) + now.constant
         said = answer.iterations, setup, elapsed, objective, answer.version, answer.message
-        return Outcome(answer.status, has_values, *said)
+        return Outcome(answer.status, *said)
 
 
 def fix(variable: pyo.Var, value: float) -> None:
     """Make a variable data: fixed by equal bounds."""
-    reset(variable, value, value, value)
-
-
-def reset(variable: pyo.Var, value: float, lower: float | None = None, upper: float | None = None) -> None:
-    """Set a variable's value and bounds."""
-    variable.setlb(lower)
-    variable.setub(upper)
+    variable.setlb(value)
+    variable.setub(value)
     variable.set_value(value, skip_validation=True)

@@ -6,7 +6,6 @@ from typing import Any
 
 import highspy
 import numpy as np
-import scipy.sparse as sp
 
 from ded_bench.solvers.linear_program import Basis, FormAnswer, FreeForm, told
 from ded_bench.solvers.status import Status
@@ -36,11 +35,11 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, start: Basis | None
     highs = highspy.Highs()  # type: ignore[no-untyped-call]
     for name, value in (_OPTIONS | {"time_limit": float(time_limit_s)}).items():
         highs.setOptionValue(name, value)
-    rows = sp.csc_matrix(sp.vstack([form.equal, form.between]))
+    rows, *ends = form.all_rows()
     program = highspy.HighsLp()
     program.num_row_, program.num_col_ = rows.shape
     program.col_cost_, program.col_lower_, program.col_upper_ = form.cost, form.lower, form.upper
-    program.row_lower_, program.row_upper_ = (np.append(form.right, ends) for ends in (form.low, form.high))
+    program.row_lower_, program.row_upper_ = ends
     program.a_matrix_.format_ = highspy.MatrixFormat.kColwise
     program.a_matrix_.start_, program.a_matrix_.index_ = rows.indptr, rows.indices
     program.a_matrix_.value_ = rows.data

@@ -12,7 +12,6 @@ from typing import Any
 import casadi
 import numpy as np
 import pyomo.environ as pyo
-import scipy.sparse as sp
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.problem.case import Array
@@ -84,14 +83,13 @@ class CasadiIpopt:
 
 def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
     """Solve a linear program; a time limit in s may be infinite."""
-    a, n = sp.csc_matrix(sp.vstack([form.equal, form.between])), len(form.cost)
+    (a, low, high), n = form.all_rows(), len(form.cost)
     x, pattern = casadi.MX.sym("x", n), casadi.Sparsity(*a.shape, a.indptr.tolist(), a.indices.tolist())
     g = casadi.mtimes(casadi.DM(pattern, a.data), x)
     limit = time_limit_s if np.isfinite(time_limit_s) else None
     solver = make_ipopt({"x": x, "f": casadi.dot(form.cost, x), "g": g}, LINEAR_OPTIONS, limit, {})
-    arguments = {"x0": np.zeros(n), "lbx": form.lower, "ubx": form.upper}
-    rows = {"lbg": np.append(form.right, form.low), "ubg": np.append(form.right, form.high)}
-    said, found = run_ipopt(solver, arguments | rows, 0.0)
+    arguments = {"x0": np.zeros(n), "lbx": form.lower, "ubx": form.upper, "lbg": low, "ubg": high}
+    said, found = run_ipopt(solver, arguments, 0.0)
     return FormAnswer(
         said.status, np.zeros(n) if found is None else found, said.iterations or 0, said.version, said.message
     )
@@ -124,4 +122,4 @@ def run_ipopt(
     if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
         x, objective = result["x"].full().ravel(), float(result["f"])
     said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
-    return Outcome(status, x is not None, *said), x
+    return Outcome(status, *said), x

@@ -47,26 +47,21 @@ class FreeForm:
         Returns:
             The program; where the columns that were there stand now, and where the new ones.
         """
-        n, n_new = len(self.cost), len(after)
-        place = np.arange(n) + np.searchsorted(after, np.arange(n))
-        new = after + 1 + np.arange(n_new)
-
-        def joined(own: Array, added: Array) -> Array:
-            values = np.empty(n + n_new)
-            values[place], values[new] = own, added
-            return values
-
-        wider = FreeForm(
-            cost=joined(self.cost, cost),
-            equal=moved_columns(self.equal, place, n + n_new),
-            right=self.right,
-            between=moved_columns(self.between, place, n + n_new),
-            low=self.low,
-            high=self.high,
-            lower=joined(self.lower, lower),
-            upper=joined(self.upper, upper),
+        wider = replace(
+            self,
+            cost=np.insert(self.cost, after + 1, cost),
+            equal=with_empty_columns(self.equal, after),
+            between=with_empty_columns(self.between, after),
+            lower=np.insert(self.lower, after + 1, lower),
+            upper=np.insert(self.upper, after + 1, upper),
         )
-        return wider, place, new
+        own = np.arange(len(self.cost))
+        return wider, own + np.searchsorted(after, own), after + 1 + np.arange(len(after))
+
+    def all_rows(self) -> tuple[sp.csc_matrix, Array, Array]:
+        """A, low and high of low <= A x <= high, equalities first."""
+        rows = sp.csc_matrix(sp.vstack([self.equal, self.between]))
+        return rows, np.append(self.right, self.low), np.append(self.right, self.high)
 
     def with_rows(self, between: sp.csc_matrix, low: Array, high: Array) -> FreeForm:
         """The program with more rows low <= between x <= high."""
@@ -74,11 +69,10 @@ class FreeForm:
         return replace(self, between=rows, low=np.append(self.low, low), high=np.append(self.high, high))
 
 
-def moved_columns(matrix: sp.csc_matrix, place: Indices, n_columns: int) -> sp.csc_matrix:
-    """A matrix whose columns stand at these places among `n_columns`; the others are empty."""
-    counts = np.zeros(n_columns + 1, dtype=matrix.indptr.dtype)
-    counts[place + 1] = np.diff(matrix.indptr)
-    return sp.csc_matrix((matrix.data, matrix.indices, np.cumsum(counts)), (matrix.shape[0], n_columns))
+def with_empty_columns(matrix: sp.csc_matrix, after: Indices) -> sp.csc_matrix:
+    """A matrix with an empty column after each of these."""
+    starts = np.insert(matrix.indptr, after + 1, matrix.indptr[after + 1])
+    return sp.csc_matrix((matrix.data, matrix.indices, starts), (matrix.shape[0], len(starts) - 1))
 
 
 class Basis(NamedTuple):
@@ -205,24 +199,18 @@ def read_linear(model: pyo.ConcreteModel) -> LinearProgram:
     repn = generate_standard_repn(objective.expr, quadratic=True)
     if repn.nonlinear_expr is not None:
         raise ValueError("the objective is not linear in the free variables")
-    pairs = [(column(one), column(other)) for one, other in repn.quadratic_vars]
+    pairs = np.array([(column(one), column(other)) for one, other in repn.quadratic_vars], dtype=int)
     places = [column(variable) for variable in repn.linear_vars]
     n = len(columns)
     linear = np.zeros(n)
     np.add.at(linear, places, repn.linear_coefs)
+    half = sp.csr_matrix((repn.quadratic_coefs, pairs.reshape(-1, 2).T), shape=(n, n))
     return LinearProgram(
         columns=tuple(columns),
         a=sp.csc_matrix((values, (rows, cols)), shape=(len(lower), n)),
         row_lower=np.array(lower),
         row_upper=np.array(upper),
         linear=linear,
-        bilinear=_symmetric(pairs, repn.quadratic_coefs, n),
+        bilinear=sp.csr_matrix(half + half.T),
         constant=float(repn.constant),
     )
-
-
-def _symmetric(pairs: Sequence[tuple[int, int]], coefficients: Sequence[float], n: int) -> sp.csr_matrix:
-    """Σ q_ij x_i x_j as the symmetric Q of ½ xᵀ Q x (a square x_i² counts twice, as it should)."""
-    i = [one for one, _ in pairs] + [other for _, other in pairs]
-    j = [other for _, other in pairs] + [one for one, _ in pairs]
-    return sp.csr_matrix(([*coefficients, *coefficients], (i, j)), shape=(n, n))

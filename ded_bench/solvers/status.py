@@ -36,10 +36,9 @@ class Status(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solver reports; values are in the Pyomo model if `has_values`."""
+    """What a solver reports; values are in the Pyomo model if there is an objective."""
 
     status: Status
-    has_values: bool
     iterations: int | None
     setup_s: float
     solve_s: float

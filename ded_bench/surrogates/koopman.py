@@ -34,8 +34,6 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 SCHEMA = "ded-bench/koopman/1"
-#: Numbers in a block of steps of the rollout; larger blocks cost more products than they save turns.
-BLOCK = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +164,13 @@ class Koopman:
         arrays = [self.k, self.b, self.g, self.lift, *(a for layer in self.mlp for a in layer)]
         return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
+    def __eq__(self, other: object) -> bool:
+        """Equal arrays: models are keys of what is made once for each."""
+        return isinstance(other, Koopman) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
     def save(self, path: Path) -> None:
         """Write arrays and header (see `files.arrays`)."""
         arrays = {"k": self.k, "b": self.b, "g": self.g, "lift": self.lift}
@@ -229,7 +234,7 @@ class Koopman:
 
 
 def linear_recurrence(k: Array, start: Array, increments: Array) -> Array:
-    """All x_i of x_{i+1} = K x_i + u_i, computed a block of steps at a time.
+    """All x_i of x_{i+1} = K x_i + u_i: pairs of steps are one step with K², and so on.
 
     Args:
         k: K, shape (n, n).
@@ -238,32 +243,17 @@ def linear_recurrence(k: Array, start: Array, increments: Array) -> Array:
 
     Returns:
         Shape (n_steps + 1, ..., n).
-
-    Within a block, x is one matrix product of its u's (a block Toeplitz matrix of the powers of K),
-    so that the loop in Python has hundreds of turns fewer than there are steps.
     """
-    n, n_steps = len(k), len(increments)
-    length = max(1, min(BLOCK // n, n_steps))
-    powers = [np.eye(n)]
-    for _ in range(length):
-        powers.append(powers[-1] @ k.T)
-    inside = np.zeros((length, n, length, n))
-    for i in range(length):
-        for j in range(i, length):
-            inside[i, :, j] = powers[j - i]
-    blocks = -(-n_steps // length)
-    before = start.reshape(-1, n)
-    batch = len(before)
-    u = np.zeros((blocks * length, batch, n))
-    u[:n_steps] = increments.reshape(n_steps, batch, n)
-    u = np.moveaxis(u.reshape(blocks, length, batch, n), 1, 2).reshape(blocks, batch, length * n)
-    x = (u @ inside.reshape(length * n, length * n)).reshape(blocks, batch, length, n)
-    carry = np.concatenate(powers[1:], axis=1)
-    for block in x:
-        block += (before @ carry).reshape(batch, length, n)
-        before = block[:, -1]
-    x = np.moveaxis(x, 2, 1).reshape(blocks * length, *start.shape)
-    return np.concatenate([start[None], x[:n_steps]])
+    n_steps = len(increments)
+    if n_steps < 2:
+        return np.concatenate([start[None], start @ k.T + increments])
+    if n_steps % 2:
+        increments = np.append(increments, np.zeros_like(increments[:1]), axis=0)
+    first, second = increments[::2], increments[1::2]
+    x = np.empty((len(increments) + 1, *start.shape))
+    x[::2] = linear_recurrence(k @ k, start, first @ k.T + second)
+    x[1::2] = x[:-1:2] @ k.T + first
+    return x[: n_steps + 1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,7 +104,7 @@ def test_linear_model_is_exact_to_second_order(case: Case, quiet_instance) -> No
 
 
 def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
-    """Whole blocks of steps, a part of one, a single step; one ψ_0 for all and one for each."""
+    """Even and odd numbers of steps, one, none; one ψ_0 for all and one for each."""
     model = linear_model(case)
     rng = np.random.default_rng(1)
     n, n_in = model.b.shape

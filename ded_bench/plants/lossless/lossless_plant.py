@@ -117,7 +117,7 @@ class LosslessPlant:
         """
         network, n_gen = self.network, len(self.case.generators)
         middle = trajectory.states[(points[:-1] + points[1:]) // 2]
-        stiffness = np.stack([network.linearise(theta).stiffness for theta in middle])
+        stiffness = network.linearise(middle).stiffness
         dt_s = float(trajectory.t[1] - trajectory.t[0])
         step = _one_step(stiffness / network.m[:, None], network.d / network.m, 1.0 / network.m, dt_s)
         slack = -stiffness.sum(axis=1)

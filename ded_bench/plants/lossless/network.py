@@ -28,7 +28,7 @@ MISMATCH, RESOLUTION = 1e-12, 4 * np.finfo(float).eps
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The swing DAE linearised at an equilibrium, with load angles eliminated.
+    """The swing DAE linearised at equilibria (leading dimensions), with load angles eliminated.
 
     M dω/dt = -D ω + δP_gen - δf, with δf = stiffness @ δθ + share @ δP_load; the slack delivers
     δP_s = -Σ δf - Σ δP_load.
@@ -160,17 +160,18 @@ class Network:
         return self.solve_loads(angles, wanted)[0]
 
     def linearise(self, theta: Array) -> Linearisation:
-        """Linearise at the angles of an equilibrium, shape (n_bus,)."""
+        """Linearise at the angles of equilibria, shape (..., n_bus)."""
         weights = self.coupling * np.cos(theta @ self.incidence.T)
-        full = self.incidence.T @ (weights[:, None] * self.incidence)
-        gen, alg = self.generators, self.algebraic
+        full = self.incidence.T @ (weights[..., None] * self.incidence)
+        gen, alg = self.generators[:, None], self.algebraic
         to_load = np.zeros((len(alg), len(self.loads)))
         to_load[np.searchsorted(alg, self.loads), np.arange(len(self.loads))] = 1.0
-        inverse = np.linalg.inv(full[np.ix_(alg, alg)])
-        share = full[np.ix_(gen, alg)] @ inverse @ to_load
-        stiffness = full[np.ix_(gen, gen)] - full[np.ix_(gen, alg)] @ inverse @ full[np.ix_(alg, gen)]
-        slack_share = (full[[self.slack]][:, alg] @ inverse @ to_load)[0]
-        return Linearisation(0.5 * (stiffness + stiffness.T), share, slack_share, self.m, self.d)
+        inverse = np.linalg.inv(full[..., alg[:, None], alg])
+        share = full[..., gen, alg] @ inverse @ to_load
+        stiffness = full[..., gen, gen.T] - full[..., gen, alg] @ inverse @ full[..., alg[:, None], gen.T]
+        slack_share = (full[..., [[self.slack]], alg] @ inverse @ to_load)[..., 0, :]
+        symmetric = 0.5 * (stiffness + stiffness.swapaxes(-1, -2))
+        return Linearisation(symmetric, share, slack_share, self.m, self.d)
 
     def _newton(self, theta: Array, wanted: Array, grid: CompiledGrid) -> tuple[Array, Array]:
         from ded_bench.plants.lossless.algebraic import solve_angles  # here only, as in `grid`

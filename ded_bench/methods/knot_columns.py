@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ded_bench.methods.knots import divided, knot_weights, power_limits, transfer_room
-from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
+from ded_bench.plants.time_varying import Hold, Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import Basis, FreeForm
@@ -36,7 +36,7 @@ class OutputRows:
     def __init__(self, model: TimeVarying) -> None:
         self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
-        self._known: dict[int, list[Array]] = {}
+        self._known: dict[int, list[Hold]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -59,29 +59,26 @@ class OutputRows:
         """Rows in the variables of intervals; a knot's are those of the interval after it."""
         (point, output), model = np.divmod(places, self._n_out), self._model
         interval = np.searchsorted(model.points, point, side="right") - 1
-        steps, (n_state, n_gen) = point - model.points[interval], model.step.g.shape[1:]
-        rows = np.zeros((len(places), n_state + 2 * n_gen))
-        rows[:, :n_state] = model.output[output]
+        steps, x = point - model.points[interval], model.output[output]
+        on_start, on_slope = np.zeros((2, len(places), model.p_gen.shape[1]))
         for j in np.unique(interval[steps > 0]).tolist():
             for bit, power in enumerate(self._powers(j)):
                 chosen = (interval == j) & (steps >> bit & 1 == 1)
-                rows[chosen] = rows[chosen] @ power
-        x, start, end = np.split(rows, [n_state, n_state + n_gen], axis=1)
+                f, g, h = (x[chosen] @ part[0] for part in power)
+                on_slope[chosen] += 2**bit * on_start[chosen] + h
+                on_start[chosen] += g
+                x[chosen] = f
         between = steps > 0
         x[between] = model.before_reset(x[between], interval[between])
-        end[between] /= model.lengths[interval[between], None]
-        return LocalRows(interval, x, start - end, end)
+        on_slope[between] /= model.lengths[interval[between], None]
+        return LocalRows(interval, x, on_start - on_slope, on_slope)
 
-    def _powers(self, j: int) -> list[Array]:
-        """A, A², A⁴ and so on of the map A from grid point to grid point of (x, u, Δu) in an interval."""
+    def _powers(self, j: int) -> list[Hold]:
+        """The map of an interval over one grid step, two, four and so on."""
         if j not in self._known:
-            n_state, n_gen = self._model.step.g.shape[1:]
-            a = np.eye(n_state + 2 * n_gen)
-            a[:n_state] = np.hstack([part[j] for part in self._model.step])
-            a[n_state:-n_gen, -n_gen:] = np.eye(n_gen)
-            powers = self._known[j] = [a]
+            powers = self._known[j] = [self._model.step.take(np.array([j]))]
             while 2 ** len(powers) < self._model.lengths[j]:
-                powers.append(powers[-1] @ powers[-1])
+                powers.append(powers[-1].then(powers[-1], 2 ** (len(powers) - 1)))
         return self._known[j]
 
 

@@ -49,7 +49,9 @@ def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     frame = _predicted(results, case)
     lasting = frame["plans"] * frame[["period_s", "latency_s"]].max(axis=1)
     minutes = (lasting / 60).groupby(frame["scenario"]).transform("max").round()
-    frame["minutes"] = minutes.where(minutes > 0, minutes[minutes > 0].min())  # nobody came to the end
+    alike = minutes.groupby(frame["scenario"].str.rstrip("0123456789")).transform("max")
+    minutes = minutes.where(minutes > 0, alike)  # nobody came to the end
+    frame["minutes"] = minutes.where(minutes > 0, minutes[minutes > 0].min())
     frame = frame[frame["cps1"].notna() | frame["objective"].isna()].reset_index(drop=True)
     place = ["regime", "scenario", "forecast"]
     practice = frame[(frame["method"] == PRACTICE[0]) & (frame["settings"] == PRACTICE[1])]

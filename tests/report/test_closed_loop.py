@@ -7,6 +7,7 @@ import dataclasses
 import pandas as pd
 import pytest
 
+from ded_bench.analysis.online_summary import practice_rows
 from ded_bench.methods import ed
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Case
@@ -87,6 +88,15 @@ def test_an_island_s_report_sets_plans_beside_practice(tmp_path):
     assert static["over_practice_percent"] == pytest.approx(100 * (other.objective / one.objective - 1))
     assert static["mean_peak_mhz"] == pytest.approx(1e3 * other.mean_freq_max_hz)
     assert (tmp_path / "island" / "figures" / "online_scenario.png").is_file()
+
+
+def test_a_scenario_that_nobody_brought_to_its_end_lasts_as_long_as_its_like(tmp_path):
+    results, known = OnlineResults(tmp_path), STATIC | {"period_s": 60.0, "latency_s": 0.0, "case": "g"}
+    for name, plans in (("g-s0000", 5), ("g-h0000", 60), ("g-h0001", 0), ("other", 0)):
+        score = {"objective": 1.0, "cps1": 100.0} if plans else {"error": "the system cannot follow"}
+        results.table.add([OnlineRow(**known | {"scenario": name, "plans": plans} | score)])
+    frame = practice_rows(results, "g").set_index("scenario")
+    assert frame["minutes"].to_dict() == {"g-s0000": 5, "g-h0000": 60, "g-h0001": 60, "other": 5}
 
 
 def test_the_overview_sets_grids_side_by_side(tmp_path):

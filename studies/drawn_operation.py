@@ -68,15 +68,21 @@ def _one(
     return index, 100 * (found.objective / best - 1), found
 
 
-def main() -> None:
-    """Operate them all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+def arguments(text: str | None) -> argparse.ArgumentParser:
+    """What scripts that operate drawn scenarios of a case take."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("case")
-    parser.add_argument("--count", type=int, default=10)
-    parser.add_argument("--duration", type=float, default=DURATION_S)
     parser.add_argument("--period", type=float, default=0.1)
     parser.add_argument("--latency", type=float, default=0.05)
     parser.add_argument("--workers", type=int, default=1)
+    return parser
+
+
+def main() -> None:
+    """Operate them all."""
+    parser = arguments(__doc__)
+    parser.add_argument("--count", type=int, default=10)
+    parser.add_argument("--duration", type=float, default=DURATION_S)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE")
     a = parser.parse_args()
     case, options = Case.load(a.case), LoopOptions(period_s=a.period, latency_s=a.latency)

@@ -11,12 +11,11 @@ Prints each generation's mean; the last one is what was learned.
 
 from __future__ import annotations
 
-import argparse
 from concurrent.futures import ProcessPoolExecutor
 
 import cma
 import numpy as np
-from drawn_operation import DURATION_S, operated
+from drawn_operation import DURATION_S, arguments, operated
 from threadpoolctl import threadpool_limits
 
 from ded_bench import Case
@@ -49,12 +48,8 @@ def values_of(logits: Array) -> dict[str, float]:
 
 def main() -> None:
     """Search, and print each generation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("case")
+    parser = arguments(__doc__)
     parser.add_argument("--generations", type=int, default=8)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--period", type=float, default=0.1)
-    parser.add_argument("--latency", type=float, default=0.05)
     a = parser.parse_args()
     case, options = Case.load(a.case), LoopOptions(period_s=a.period, latency_s=a.latency)
     parts = np.array([getattr(surprises, name) / most for name, most in LEARNED.items()])

@@ -12,14 +12,13 @@ Rows are kept as they come; what is there is not made again.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
-from drawn_operation import DURATION_S, operated
+from drawn_operation import DURATION_S, arguments, operated
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
@@ -41,14 +40,10 @@ def excess_hz(case: Case, seed: int, index: int, options: LoopOptions) -> float:
 
 def main() -> None:
     """Operate what is missing, and print what is promised and what came."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("case")
+    parser = arguments(__doc__)
     parser.add_argument("rows", type=Path)
     parser.add_argument("--calibrate", type=int, default=50)
     parser.add_argument("--check", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--period", type=float, default=0.1)
-    parser.add_argument("--latency", type=float, default=0.05)
     a = parser.parse_args()
     case, options = Case.load(a.case), LoopOptions(period_s=a.period, latency_s=a.latency)
     found: dict[tuple[int, int], float] = {}

@@ -1,4 +1,4 @@
-"""What would it be worth to know ramps better? `ded-ko-knots` on 9bus with other announcements.
+"""What would it be worth to know ramps better? `ded-rti` on 9bus with other announcements.
 
     python studies/better_announcements.py --notice 0,1.5,3
     ded-bench scenarios --seed 4242 --out drawn
@@ -25,7 +25,7 @@ from ded_bench.run.online import loop
 from ded_bench.run.online.judgement import Judgement, judge_operation
 from ded_bench.run.online.loop import Planner
 
-REGIME, METHOD, LATENCY_S = "TO", "ded-ko-knots", 0.03
+REGIME, METHOD, LATENCY_S = "TO", "ded-rti", 0.03
 
 
 class Announcements:
@@ -54,7 +54,7 @@ class Announcements:
 
 def operate(case: Case, scenario: Scenario, options: loop.LoopOptions) -> Judgement:
     """Judge what the controller makes of a scenario."""
-    settings = Settings("receding=on,margin=0.0625", search=search_folders(case))
+    settings = Settings(search=search_folders(case))
     outcome = loop.run_loop(case, scenario, Planner(case, REGIME, METHOD, settings), options)
     return judge_operation(case, scenario, outcome.trajectory, REGIME)
 

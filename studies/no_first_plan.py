@@ -1,4 +1,4 @@
-"""The closed loop without a plan at t = 0: powers stay until the first answer of `ded-ko-knots` is due.
+"""The closed loop without a plan at t = 0: powers stay until the first answer of `ded-rti` is due.
 
 `ded-bench online` gives every method a first plan in time. What that is worth shows with a method that throws
 its first answer away. Run it from the folder that holds this file, or with that folder on PYTHONPATH:
@@ -26,6 +26,6 @@ class NoFirstPlan:
 
 
 def prepare(case, regime, settings):
-    """`ded-ko-knots` with knots that keep their places."""
-    chosen = Settings("receding=on,margin=0.0625", search=search_folders(case))
-    return NoFirstPlan(case, get_method("ded-ko-knots").prepare(case, regime, chosen))
+    """`ded-rti`, but for its first plan."""
+    chosen = Settings(search=search_folders(case))
+    return NoFirstPlan(case, get_method("ded-rti").prepare(case, regime, chosen))

@@ -5,34 +5,24 @@ the static dispatch of every second, followed slowly, and linearised once; unlik
 the answer.
 
 In operation a frequency limit may be out of reach: a load has begun to ramp that nobody announced. Then
-every interval between knots has a frequency excess of its own, and the sum of all is the least one. Two
-options matter there alone: knots may keep their places in time, and plans a margin below the bound.
+every interval between knots has a frequency excess of its own, and the sum of all is the least one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ded_bench.methods.knots import case_knots, receding_knots
-from ded_bench.methods.options import option, read_options
+from ded_bench.methods.knots import case_knots
+from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import solve_on_surrogate
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.surrogates.find import Surrogate, find_surrogate
 
+Options = NoOptions
 #: Raised when answers change.
 VERSION = 1
-
-
-@dataclass(frozen=True)
-class Options:
-    """How plans are made in operation."""
-
-    receding: bool = option(False, "knots keep their places from plan to plan", in_operation=True)
-    margin: float = option(
-        0.0, "part of the bound that plans leave free", lowest=0.0, highest=0.99, in_operation=True
-    )
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
@@ -44,7 +34,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
 def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances."""
     case.check_regimes([regime])
-    return KnotSolver(case, surrogate, regime, read_options(Options, settings.options), settings.time_limit_s)
+    return KnotSolver(case, surrogate, regime, settings.time_limit_s)
 
 
 @dataclass(frozen=True)
@@ -54,24 +44,23 @@ class KnotSolver:
     case: Case
     surrogate: Surrogate
     regime: str
-    options: Options = Options()
     time_limit_s: float | None = None
 
     def __call__(self, instance: Instance) -> Solution:
-        """Solve with the case's knots and bound."""
-        points, bounds = case_knots(self.case, instance), self.case.bounds(self.regime)
-        return solve_on_surrogate(self.case, self.surrogate, instance, bounds, points, self.time_limit_s)
+        """Solve one instance; `Infeasible` comes without a schedule."""
+        return self._solution(instance, soft=False)
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
 
         Args:
             instance: what to solve.
-            last: its schedule, if it has one, gives receding knots; its time is the instance's.
+            last: of no meaning here.
         """
-        plan = last.schedule if last is not None and self.options.receding else None
-        points = receding_knots(self.case, instance, plan)
-        bounds = self.case.bounds(self.regime).tightened(part=self.options.margin)
+        return self._solution(instance, soft=True)
+
+    def _solution(self, instance: Instance, soft: bool) -> Solution:
+        points, bounds = case_knots(self.case, instance), self.case.bounds(self.regime)
         return solve_on_surrogate(
-            self.case, self.surrogate, instance, bounds, points, self.time_limit_s, soft=True
+            self.case, self.surrogate, instance, bounds, points, self.time_limit_s, soft
         )

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ded_bench.methods.knots import knots_in_operation, knots_on_clock, receding_knots
+from ded_bench.methods.knots import case_knots, knots_in_operation, knots_on_clock
 from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
@@ -71,10 +71,10 @@ class RealTimeSolver:
         bounds = self.case.bounds(self.regime)
         if self.case.slack is None:  # condensed programs leave open what they may
             bounds = bounds.tightened(part=SOFT_TOLERANCE)
-        first = self._step(bounds, instance, receding_knots(self.case, instance, None), Plan(None))
+        knots = case_knots(self.case, instance)
+        first = self._step(bounds, instance, knots, Plan(None))
         if first.schedule is None:
             return first
-        knots = receding_knots(self.case, instance, first.schedule)
         second = self._step(bounds, instance, knots, Plan(first.schedule))
         return dataclasses.replace(second, setup_s=(first.build_s or 0.0) + (first.solve_s or 0.0))
 
@@ -89,7 +89,7 @@ class RealTimeSolver:
         if self.case.slack is not None:
             return self._when_there_is_news(instance, in_force)
         bounds = self.case.bounds(self.regime)
-        knots = knots_in_operation(self.case, instance, in_force)
+        knots = knots_in_operation(self.case, instance)
         if self._estimate is None:
             return self._step(bounds, instance, knots, Plan(in_force))
         state = self._estimate.initial(instance, in_force)

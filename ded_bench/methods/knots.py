@@ -9,7 +9,6 @@ import numpy as np
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 
 #: In operation under secondary control, knots are as close as the case's so far ahead, s: on three drawn
 #: scenarios of two-area-agc and 39bus-agc 3 s let one peak pass the bound by 0.3 mHz, and from 6 to 10 s
@@ -50,38 +49,13 @@ def case_knots(case: Case, instance: Instance, distance_s: float | None = None) 
     return knot_points(np.concatenate([times, control_times(case, instance)]), instance.dt_s)
 
 
-def receding_knots(case: Case, instance: Instance, last: Schedule | None) -> Indices:
-    """Grid points of knots: those of the plan in force that lie ahead, and more at the end.
-
-    If every plan had its first knot as long after its own start, what the last plan goes on to do would be
-    linear between other knots, so that it is no solution of the new program. Where it rides on the frequency
-    bound, the new program may have no solution that keeps it.
-
-    Args:
-        case: gives the distance of knots.
-        instance: gives the grid.
-        last: the plan in force, on the time of the instance. What has fewer knots than a horizon has, or
-            others closer together than the case's, gives none.
-    """
-    times = case.knot_times(instance.horizon_s)
-    distance = times[1] - times[0]
-    # The last two points are the end of the plan in force, which no knot has, and the horizon.
-    ahead = np.empty(0) if last is None else last.t[1:-2]
-    if len(ahead) < 2 or np.diff(ahead).min() < distance / 2:
-        return case_knots(case, instance)
-    beyond = np.arange(ahead[-1] + distance, instance.horizon_s - distance / 2, distance)
-    ends = np.array([0.0, instance.horizon_s])
-    knots = np.concatenate([ends, ahead, beyond, control_times(case, instance)])
-    return knot_points(knots, instance.dt_s)
-
-
-def knots_in_operation(case: Case, instance: Instance, last: Schedule | None) -> Indices:
-    """Grid points of knots of a plan that will be made anew: see `receding_knots`.
+def knots_in_operation(case: Case, instance: Instance) -> Indices:
+    """Grid points of knots of a plan that will be made anew: the case's.
 
     Under secondary control its times are knots, wherever plans start. Beyond NEAR_S they are the only ones.
     """
     if case.agc is None:
-        return receding_knots(case, instance, last)
+        return case_knots(case, instance)
     times = case.knot_times(instance.horizon_s)
     near = times[times < NEAR_S], times[-1:]
     return knot_points(np.concatenate([*near, control_times(case, instance)]), instance.dt_s)

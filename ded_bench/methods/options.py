@@ -38,7 +38,6 @@ def option(
     choices: Sequence[str] = (),
     lowest: float = -math.inf,
     highest: float = math.inf,
-    in_operation: bool = False,
 ) -> Any:
     """Declare a field of an `Options` dataclass, of type bool, int, float, str, or one of these or None.
 
@@ -47,9 +46,8 @@ def option(
         text: one line of help, with the unit.
         choices: the texts that a str may be.
         lowest, highest: of a number.
-        in_operation: it changes answers in the closed loop alone, so that times are those without it.
     """
-    limits = {"choices": tuple(choices), "lowest": lowest, "highest": highest, "in_operation": in_operation}
+    limits = {"choices": tuple(choices), "lowest": lowest, "highest": highest}
     return dataclasses.field(default=default, metadata={"text": text, **limits})
 
 
@@ -75,17 +73,12 @@ def read_options(kind: type[T], text: str) -> T:
     return kind(**values)
 
 
-def options_text(options: Any, *, timed: bool = False) -> str:
-    """The canonical text of a method's options.
-
-    Args:
-        options: an instance of its `Options`.
-        timed: leave out what matters in operation alone.
-    """
+def options_text(options: Any) -> str:
+    """The canonical text of a method's options, an instance of its `Options`."""
     parts = []
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if value != field.default and not (timed and field.metadata.get("in_operation")):
+        if value != field.default:
             parts.append(f"{field.name}={_text(value)}")
     return ",".join(parts) or DEFAULT
 

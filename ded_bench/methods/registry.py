@@ -51,18 +51,14 @@ class Method:
         kind: type[Any] = self._answering.Options
         return kind
 
-    def canonical(self, settings: Settings, *, timed: bool = False) -> Settings:
+    def canonical(self, settings: Settings) -> Settings:
         """The same settings with the canonical text of their options.
-
-        Args:
-            settings: whose options are read.
-            timed: without the options that matter in operation alone.
 
         Raises:
             InputError: unknown options (names those it has), or a wrong value.
         """
-        options = read_options(self.options, settings.options)
-        return dataclasses.replace(settings, options=options_text(options, timed=timed))
+        options = options_text(read_options(self.options, settings.options))
+        return dataclasses.replace(settings, options=options)
 
     def interval_s(self, settings: Settings) -> float | None:
         """How often it means to be asked in operation: its option `every`, where it has one and it is set."""

@@ -17,8 +17,6 @@ _SETTINGS = {
     ("ded", "accelerated"): "accelerated=on",
     ("ded-dpc-refined", "default"): "refine=200",
     ("ded-dpc-shared-refined", "default"): "iterations=80",
-    ("ded-ko-knots", "receding"): "receding=on,margin=0.0625",
-    ("ded-ko-knots", "receding-wide"): "receding=on,margin=0.25",
 }
 #: Settings of `ded-ko-knots` that are a method of their own, with its options.
 _REAL_TIME = {"real-time": "default", "reserve": "reserve=on"}

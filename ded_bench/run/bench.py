@@ -272,7 +272,7 @@ def _peak_memory_mib() -> float:
 def runs_of(
     rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method] | None = None
 ) -> list[Job]:
-    """What a results table holds, to be timed, in the methods' order, without options of operation.
+    """What a results table holds, to be timed, in the methods' order.
 
     Rows of other methods and of models given as a file are left out. A job all of whose rows were made with
     a time limit has it, here as there: without it a call might take hours.
@@ -288,7 +288,7 @@ def runs_of(
         model = model_name(row.model)
         if row.method in methods and model in ("", *MODELS):
             own = dataclasses.replace(settings, options=row.settings, model=model)
-            options = methods[row.method].canonical(own, timed=True).options
+            options = methods[row.method].canonical(own).options
             limits.setdefault((row.method, options, model, row.regime), []).append(row.time_limit_s)
     order = list(methods)
     jobs = []

@@ -24,7 +24,7 @@ from tests.analysis.test_summary import frame_of, row
         (("ded", "accelerated=on"), "DED [accelerated=on]"),
         (("ded-ko", "default", "koopman"), "DED-KO"),
         (("ded-ko", "default", "linear"), "DED-KO [linear]"),
-        (("ded-ko-knots", "receding=on", "trajectory"), "DED-KO (knots) [receding=on, trajectory]"),
+        (("ded-slp", "knot_s=0.1", "own"), "DED (SLP) [knot_s=0.1, own]"),
         (("ded-rti", "reserve=on", "trajectory"), "DED (real-time iteration) [reserve=on]"),
         (("mine", "default", "own"), "mine [own]"),
     ],

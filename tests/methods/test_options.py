@@ -16,7 +16,7 @@ from ded_bench.methods.solution import Settings
 @dataclass(frozen=True)
 class Options:
     steps: int = option(3, "of something", lowest=1, highest=9)
-    margin: float = option(0.5, "part of the bound", lowest=0.0, in_operation=True)
+    margin: float = option(0.5, "part of the bound", lowest=0.0)
     length_s: float | None = option(None, "s")
     solver: str = option("a", "which", choices=("a", "b"))
     fast: bool = option(False, "or slow")
@@ -35,8 +35,6 @@ def test_what_differs_from_the_defaults_is_the_canonical_text() -> None:
         options = read_options(Options, text)
         assert options_text(options) == canonical
         assert read_options(Options, canonical) == options
-    assert options_text(read_options(Options, "margin=0.25")) == "margin=0.25"
-    assert options_text(read_options(Options, "margin=0.25"), timed=True) == "default"
 
 
 @pytest.mark.parametrize(
@@ -66,9 +64,7 @@ def test_a_description_has_every_option() -> None:
 
 
 def test_settings_of_a_method_are_canonical() -> None:
-    method = get_method("ded-ko-knots")
-    assert method.canonical(Settings("margin=0.250,receding=on")).options == "receding=on,margin=0.25"
-    assert method.canonical(Settings("receding=on"), timed=True).options == "default"
+    assert get_method("ed").canonical(Settings("lead=on, every=60.0")).options == "every=60,lead=on"
 
 
 def test_the_command_describes_one_method(capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,7 +47,6 @@ class Choices:
     """Options of the fake method."""
 
     fast: bool = option(False, "quick and dirty")
-    reserve: float = option(0.0, "kept back in the closed loop", in_operation=True)
 
 
 class Inline(Workers):
@@ -270,7 +269,6 @@ def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
         Key("c", "b", "NO", "fake", "default"),
         Key("c", "c", "NO", "fake", "default", time_limit_s=9.0),
         Key("c", "a", "TO", "fake", "fast=on", "linear@f00"),
-        Key("c", "a", "TO", "fake", "fast=on,reserve=0.5", "linear@f00"),  # timed as without a reserve
         Key("c", "a", "TO", "fake", "default", "myfile@f00"),
         Key("c", "a", "TO", "stranger", "default"),
     }

@@ -258,7 +258,7 @@ def _latency(
 def timed_job(case: Case, method: Method, regime: str, settings: Settings) -> tuple[str, str, str, str]:
     """What times of a method are found by (see `TimingRow.job`)."""
     model = model_name(named(method.artifacts(case, regime, settings), "model"))
-    return regime, method.name, method.canonical(settings, timed=True).options, model
+    return regime, method.name, method.canonical(settings).options, model
 
 
 def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[Path]) -> float:

@@ -169,14 +169,13 @@ def timed(case, scenarios, folder, rows, method, settings) -> float:
     return found.options.latency_s
 
 
-def test_options_that_matter_in_operation_only_have_the_time_of_others(threebus, scenarios, tmp_path):
-    """On the model of the same name."""
+def test_the_latency_is_that_of_the_model_of_the_same_name(threebus, scenarios, tmp_path):
     row = TimingRow("r", 1, "TO", "ded-ko-knots", "default", "i", "Optimal", 0.25, 5.0, 0.5, case="threebus")
     rows = [
         dataclasses.replace(row, model="linear@00"),
         dataclasses.replace(row, model="koopman@00", build_s=9.0),
     ]
-    settings = Settings("receding=on", model="linear")
+    settings = Settings(model="linear")
     found = timed(threebus, scenarios, tmp_path, rows, "ded-ko-knots", settings)
     assert found == pytest.approx(0.75)
 

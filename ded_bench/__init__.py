@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from ded_bench.problem.benchmark import SplitName
     from ded_bench.problem.case import Case as Case
     from ded_bench.problem.instance import Instance as Instance
-    from ded_bench.problem.instance import instances_frame as instances_frame
     from ded_bench.problem.schedule import Schedule as Schedule
     from ded_bench.problem.schedule import Trajectory as Trajectory
     from ded_bench.solvers.status import Status as Status
@@ -45,7 +44,6 @@ _HOMES = {
     "Solution": "methods.solution",
     "Status": "solvers.status",
     "Trajectory": "problem.schedule",
-    "instances_frame": "problem.instance",
 }
 __all__ = [*_HOMES, "load_instances", "score", "simulate", "simulate_many", "solve"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ded_bench import Case, instances_frame, load_instances, score, simulate, solve
+from ded_bench import Case, load_instances, score, simulate, solve
 
 OUT = Path("results/tour")
 REGIME = "TO"  # the tight bound on frequency, where dynamics bind
@@ -16,7 +16,8 @@ METHODS = ("ed", "ded-ko-knots", "ded-slp", "ded-dpc")
 # %% What is asked: instances, each with costs, load ramps and an initial state
 case = Case.load("9bus")
 instances = load_instances("9bus", split="test", limit=3)
-print(instances_frame(instances)[["id", "cost_2", "load_5_rate", "P0_2"]].to_string(index=False))
+asked = pd.json_normalize([instance.model_dump() for instance in instances])
+print(asked[["id", "cost.2", "load.5.rate", "initial.power.2"]].to_string(index=False))
 
 # %% What methods answer, and what the scorer says to it: always by simulation of the true system
 rows, schedules = [], {}

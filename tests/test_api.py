@@ -186,22 +186,6 @@ def test_a_trajectory_is_a_frame_by_bus(case: Case, quiet_instance, constant) ->
     assert injections.sum(axis=1).to_numpy() == pytest.approx(0.0, abs=1e-9)
 
 
-def test_instances_are_a_frame(case: Case, quiet_instance) -> None:
-    ramp = {bus: {"initial": -1.0, "start": 0.5, "duration": 2.0, "rate": -0.01} for bus in case.loads}
-    frame = ded_bench.instances_frame(
-        [quiet_instance(case), quiet_instance(case, id="other", load=ramp, seed=[1, 2])]
-    )
-    assert frame["id"].to_list() == [f"{case.id}-quiet", "other"]
-    assert frame["seed"].to_list() == ["0", "1 2"]
-    assert len(frame.columns) == 5 + 1 + 3 * len(case.generators) + 4 * len(case.loads)
-    first = case.loads[0]
-    assert frame.loc[
-        1, [f"load_{first}_{n}" for n in ("initial", "start", "duration", "rate")]
-    ].to_list() == [*(-1.0, 0.5, 2.0, -0.01)]
-    assert frame[f"P0_{case.generators[0]}"].to_list() == [case.p_nominal[0]] * 2
-    assert len(ded_bench.instances_frame([])) == 0
-
-
 @pytest.mark.parametrize("folder", [CASE_FILES["fivemachine"].parent, MIXED], ids=["lossless", "detailed"])
 def test_many_simulations_are_those_of_one_after_the_other(folder, quiet_instance, constant) -> None:
     """To the last bit; what fails stands as its error among the others, which are not lost."""

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -25,9 +25,6 @@ from ded_bench.problem.quantities import (
     Positive,
     check_whole_steps,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 #: No grid in operation is further from its nominal frequency, Hz; whoever writes more means another quantity.
 LARGEST_DEVIATION_HZ = 1.0
@@ -335,33 +332,3 @@ def load_instances(paths: Sequence[str | Path], case: Case | None = None) -> tup
     if case is None:
         raise InputError("instances", "", "no instance was given")
     return list(instances.values()), case
-
-
-def instances_frame(instances: Sequence[Instance]) -> pd.DataFrame:
-    """One row per instance with everything that its file says.
-
-    Columns: `id, case, seed, horizon_s, dt_s` (the seed's parts joined by spaces), then by bus
-    `cost_<bus>`, `load_<bus>_initial` (pu), `_start` (s), `_duration` (s), `_rate` (pu/s), `P0_<bus>`
-    (initial power, pu) and `omega0_<bus>` (initial frequency deviation, rad/s). A load that is given by
-    points has them as pairs (s, pu) in `load_<bus>_points` instead; where an instance gives a measured state,
-    `theta0_<bus>` are its angles (rad), `mechanical0_<bus>` its turbines' powers (pu), and `agc0_held_pu`,
-    `agc0_integral_rad` and `agc0_next_s` its secondary control.
-    """
-    import pandas as pd  # here only: loading instances does without it
-
-    rows = []
-    for instance in instances:
-        seed = instance.seed if isinstance(instance.seed, tuple) else (instance.seed,)
-        row: dict[str, Any] = {"id": instance.id, "case": instance.case, "seed": " ".join(map(str, seed))}
-        row |= {"horizon_s": instance.horizon_s, "dt_s": instance.dt_s}
-        row |= {f"cost_{bus}": value for bus, value in instance.cost.items()}
-        for bus, load in instance.load.items():
-            row |= {f"load_{bus}_{name}": value for name, value in load}
-        row |= {f"P0_{bus}": value for bus, value in instance.initial.power.items()}
-        row |= {f"omega0_{bus}": value for bus, value in instance.initial.omega.items()}
-        for name in ("theta", "mechanical"):
-            given = getattr(instance.initial, name) or {}
-            row |= {f"{name}0_{bus}": value for bus, value in given.items()}
-        row |= {f"agc0_{name}": value for name, value in instance.initial.agc or ()}
-        rows.append(row)
-    return pd.DataFrame(rows)

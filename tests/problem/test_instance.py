@@ -10,7 +10,7 @@ import pytest
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import parse_record
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp, check_plausible, instances_frame
+from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp, check_plausible
 from ded_bench.problem.sampling import sample_instance
 
 
@@ -88,10 +88,6 @@ def test_instance_2_reads_back_as_it_was_written(case, quiet_instance):
     assert instance.p_load(case)[[0, 150, 250, 350], 0] == pytest.approx([-0.9, -0.9, -0.93, -0.96])
     with pytest.raises(InputError, match="must be ramps"):
         instance.ramps(case)
-    frame = instances_frame([instance, quiet_instance(case)])
-    assert frame[f"load_{case.loads[0]}_points"][0] == tuple(map(tuple, POINTS))
-    assert frame[f"theta0_{case.generators[0]}"][0] == theta[case.generators[0]]
-    assert frame[f"load_{case.loads[0]}_initial"].isna().tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

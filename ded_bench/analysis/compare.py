@@ -15,7 +15,7 @@ import math
 import random
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,11 +122,7 @@ def _read(folder: Path) -> dict[Asked, Row]:
     if not results.path.is_file():
         raise InputError(results.path, "", "is missing: this is no results folder")
     rows = sorted(results.rows.values(), key=lambda row: row.date)
-    return {_asked(row): row for row in rows}
-
-
-def _asked(row: Row) -> Asked:
-    return Asked(row.case, row.instance, row.regime, row.method, row.settings, model_name(row.model))
+    return {Asked(*row.key[:5], model_name(row.model)): row for row in rows}
 
 
 def _head(rows: Mapping[Asked, Row]) -> str:
@@ -137,21 +133,14 @@ def _head(rows: Mapping[Asked, Row]) -> str:
 
 def _incomparable(before: Mapping[Asked, Row], after: Mapping[Asked, Row], shared: Sequence[Asked]) -> str:
     """Why the two tables are not about the same problems; empty if they are."""
-    pairs = [(before[key], after[key]) for key in shared]
-    other = [(x, y) for x, y in pairs if (x.case, x.problems_version) != (y.case, y.problems_version)]
+    other = [key for key in shared if before[key].problems_version != after[key].problems_version]
     if other:
-        x, y = other[0]
+        was, now = (rows[other[0]].problems_version or "(no version)" for rows in (before, after))
         return (
-            f"{len(other)} common rows are of different problems, "
-            f"such as {name_of(_asked(x))}: {_problems(x)} in A, {_problems(y)} in B"
+            f"{len(other)} common rows are of different problems, such as {name_of(other[0])}: "
+            f"{other[0].case} {was} in A, {other[0].case} {now} in B"
         )
-    if not shared and before and after:
-        return "no row is in both"
-    return ""
-
-
-def _problems(row: Row) -> str:
-    return f"{row.case} {row.problems_version or '(no version)'}"
+    return "no row is in both" if before and after and not shared else ""
 
 
 def name_of(key: Asked) -> str:
@@ -214,41 +203,8 @@ def _cell(value: object) -> str:
 LIMITS = {"objective": 1e-6, "freq_violation_hz": 1e-6}
 #: Seed of the sample, with the name of its line.
 SEED = 0
-
-
-@dataclass
-class Sampled:
-    """What came of the sample of one method, settings, surrogate and regime.
-
-    Attributes:
-        tell: called with everything that differs or is skipped.
-        rows: how many were solved again.
-        skipped: what was not, and why: a sentence each.
-        differences: a sentence for each row that differs.
-        objective: largest relative difference of objectives.
-        hz: largest difference of frequency violations.
-    """
-
-    method: str
-    settings: str
-    model: str
-    regime: str
-    tell: Callable[[str], None]
-    rows: int = 0
-    skipped: list[str] = field(default_factory=list)
-    differences: list[str] = field(default_factory=list)
-    objective: float = 0.0
-    hz: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """As its sentences call it."""
-        return " ".join(filter(None, (self.method, self.settings, self.model, self.regime)))
-
-    def note(self, kind: list[str], sentence: str) -> None:
-        """Add a sentence to those of its kind."""
-        kind.append(sentence)
-        self.tell(f"{self.name}: {sentence}")
+#: What makes a line of the sample.
+LINE = ["method", "settings", "model", "regime"]
 
 
 def reproduce(
@@ -258,8 +214,8 @@ def reproduce(
     methods: Sequence[str] = (),
     sample: int = 5,
     workers: int = 1,
-    on_sentence: Callable[[str], None] = lambda sentence: None,
-) -> list[Sampled]:
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> pd.DataFrame:
     """Solve a sample of rows again and compare; the folder stays as it is.
 
     Args:
@@ -269,91 +225,85 @@ def reproduce(
         methods: only rows of these; none: of all.
         sample: rows of each line, drawn with a fixed seed.
         workers: processes.
-        on_sentence: called with everything that differs or is skipped.
+        tell: called with a sentence for everything that differs or is skipped, and why.
+
+    Returns:
+        One row per line (see LINE): how many `rows` were solved again, how many of them `differ`, the largest
+        relative difference of objectives, and of frequency violations in Hz.
 
     Raises:
         InputError: there is no row of these methods.
     """
-    parts: dict[tuple[str, str, str, str], list[Row]] = {}
+    lines: dict[tuple[str, ...], list[Row]] = {}
     for row in results.rows.values():
         if row.case == case.id and (not methods or row.method in methods):
             name = row.method, row.settings, model_name(row.model), row.regime
-            parts.setdefault(name, []).append(row)
-    if not parts:
+            lines.setdefault(name, []).append(row)
+    if not lines:
         raise InputError(results.path, "method", f"has no rows of {', '.join(methods) or case.id}")
-    lines = [Sampled(*name, on_sentence) for name in sorted(parts)]
-    tasks: list[tuple[Sampled, Row, Task]] = []
-    for line in lines:
-        chosen = _sample(line, parts[line.method, line.settings, line.model, line.regime], instances, sample)
-        tasks += [
-            (line, row, task) for row in chosen if (task := _task(case, line, row, instances, results.folder))
-        ]
+    asked: list[tuple[tuple[str, ...], Row, Task]] = []
+    for line in sorted(lines):
+        said = " ".join(filter(None, line))
+        for row in _sample(said, lines[line], instances, sample, tell):
+            task = _task(case, row, instances, results.folder)
+            if isinstance(task, Task):
+                asked.append((line, row, task))
+            else:
+                tell(f"{said}: {row.instance}: {task}")
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as folder:
-        solved = run(case, [task for *_, task in tasks], Results(folder), workers)
-    for (line, row, _), again in zip(tasks, solved, strict=True):
-        _compare(line, row, again)
-    return lines
+        solved = run(case, [task for *_, task in asked], Results(folder), workers)
+    cells: list[tuple[object, ...]] = [(*line, 0, 0, 0.0, 0.0) for line in sorted(lines)]
+    for (line, row, _), again in zip(asked, solved, strict=True):
+        apart = dict.fromkeys(LIMITS, 0.0) | differences(row, again, dict.fromkeys(LIMITS, 0.0))
+        problem = _problem(row, again, apart)
+        if problem:
+            tell(f"{' '.join(filter(None, line))}: {row.instance}: {problem}")
+        if again.status != Status.TIME_LIMIT:
+            cells.append((*line, 1, bool(problem), *apart.values()))
+    made = pd.DataFrame(cells, columns=[*LINE, "rows", "differ", "objective", "Hz"])
+    by = made.groupby(LINE, sort=False, as_index=False)
+    return by.agg({"rows": "sum", "differ": "sum", "objective": "max", "Hz": "max"})
 
 
-def _sample(line: Sampled, rows: Sequence[Row], instances: Mapping[str, Instance], count: int) -> list[Row]:
-    """Rows to be solved again; what cannot be is noted."""
+def _sample(
+    line: str, rows: Sequence[Row], instances: Mapping[str, Instance], count: int, tell: Callable[[str], None]
+) -> list[Row]:
+    """Rows to be solved again; what cannot be is told."""
     unlike = [r for r in rows if r.objective is None or r.status in (Status.TIME_LIMIT, Status.FAILED)]
     if unlike:
         named = ", ".join(row.instance for row in unlike[:5]) + (", …" if len(unlike) > 5 else "")
-        line.note(line.skipped, f"{len(unlike)} of {len(rows)} rows failed or ended by a limit ({named})")
+        tell(f"{line}: {len(unlike)} of {len(rows)} rows failed or ended by a limit ({named})")
     known = sorted((r for r in rows if r not in unlike and r.instance in instances), key=lambda r: r.key[1:7])
     if not known and len(unlike) < len(rows):
-        line.note(line.skipped, "its instances are unknown here")
-    return random.Random(f"{SEED} {line.name}").sample(known, min(count, len(known)))
+        tell(f"{line}: its instances are unknown here")
+    return random.Random(f"{SEED} {line}").sample(known, min(count, len(known)))
 
 
-def _task(
-    case: Case, line: Sampled, row: Row, instances: Mapping[str, Instance], folder: Path
-) -> Task | None:
-    """The task that makes a row; None, and noted why, if the folder has not what made it."""
-    if line.method not in registered():
-        line.note(line.skipped, f"{row.instance}: no method has this name")
-        return None
-    if line.model not in ("", *MODELS):
-        line.note(line.skipped, f"{row.instance}: made with a model of its own ({row.model})")
-        return None
+def _task(case: Case, row: Row, instances: Mapping[str, Instance], folder: Path) -> Task | str:
+    """The task that makes a row, or why the folder has not what made it."""
+    model = model_name(row.model)
+    if row.method not in registered():
+        return "no method has this name"
+    if model not in ("", *MODELS):
+        return f"made with a model of its own ({model})"
     search = search_folders(case, folder)
-    settings = Settings(line.settings, line.model, time_limit_s=row.time_limit_s, search=search)
+    settings = Settings(row.settings, model, time_limit_s=row.time_limit_s, search=search)
+    chosen = [(instances[row.instance], row.split)]
     try:
-        (task,) = make_tasks(
-            case, [(instances[row.instance], row.split)], [line.method], [line.regime], settings
-        )
+        (task,) = make_tasks(case, chosen, [row.method], [row.regime], settings)
     except InputError as error:
-        line.note(line.skipped, f"{row.instance}: {error}")
-        return None
-    if task.key.policy != row.policy or (line.model in TRAINED and task.key.model != row.model):
-        line.note(line.skipped, f"{row.instance}: its {row.policy or row.model} is not the one in {folder}")
-        return None
+        return str(error)
+    if task.key.policy != row.policy or (model in TRAINED and task.key.model != row.model):
+        return f"its {row.policy or row.model} is not the one in {folder}"
     return task
 
 
-def _compare(line: Sampled, row: Row, again: Row) -> None:
-    """Note whether a row that was solved again is as before."""
+def _problem(row: Row, again: Row, apart: Mapping[str, float]) -> str:
+    """What to say of a row that was solved again; empty if it is as before."""
     if again.status == Status.TIME_LIMIT:
-        line.note(line.skipped, f"{row.instance}: ended by its limit this time")
-        return
-    line.rows += 1
-    apart = dict.fromkeys(LIMITS, 0.0) | differences(row, again, dict.fromkeys(LIMITS, 0.0))
-    line.objective = max(line.objective, apart["objective"])
+        return "ended by its limit this time"
     if again.objective is None:
-        line.note(line.differences, f"{row.instance}: no score this time ({again.error or again.status})")
-        return
-    line.hz = max(line.hz, apart["freq_violation_hz"])
+        return f"no score this time ({again.error or again.status})"
     if any(apart[name] > limit for name, limit in LIMITS.items()):
-        said = (f"{name} {getattr(row, name)!r}, now {getattr(again, name)!r}" for name in LIMITS)
-        line.note(line.differences, f"{row.instance}: {'; '.join(said)}")
-
-
-def table_of(lines: Sequence[Sampled]) -> str:
-    """One line each: rows, how many differ, the largest differences."""
-    cells = []
-    for line in lines:
-        numbers = line.rows, len(line.differences), f"{line.objective:.1e}", f"{line.hz:.1e}"
-        cells.append((line.method, line.settings, line.model or "-", line.regime, *numbers))
-    heads = ["method", "settings", "model", "regime", "rows", "differ", "objective", "Hz"]
-    return pd.DataFrame(cells, columns=heads).to_string(index=False)
+        return "; ".join(f"{name} {getattr(row, name)!r}, now {getattr(again, name)!r}" for name in LIMITS)
+    return ""

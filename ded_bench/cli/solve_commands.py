@@ -224,12 +224,12 @@ def _reproduce(a: argparse.Namespace) -> int:
     """Rows of a results folder, solved again."""
     results, case, instances = _rows_of(a)
     say(f"solving up to {a.sample} rows of each method, settings, model and regime in {a.results} again")
-    from ded_bench.analysis.compare import reproduce, table_of
+    from ded_bench.analysis.compare import reproduce
 
-    lines = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
-    print(table_of(lines))
-    differ = sum(len(line.differences) for line in lines)
-    print(f"{counted(sum(line.rows for line in lines), 'row')} solved again, {differ} differ")
+    found = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
+    print(found.replace({"model": {"": "-"}}).to_string(index=False, float_format="{:.1e}".format))
+    differ = found["differ"].sum()
+    print(f"{counted(int(found['rows'].sum()), 'row')} solved again, {differ} differ")
     return 1 if differ else 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ded_bench.analysis.compare import reproduce, table_of
+from ded_bench.analysis.compare import reproduce
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
@@ -29,13 +29,16 @@ def test_differences_are_told_and_limits_named(threebus: Case, quiet_instance, t
     results.add([dataclasses.replace(a, method="mine"), dataclasses.replace(a, policy="ed@f00")])
     before = results.path.read_bytes()
     said: list[str] = []
-    ours, theirs = reproduce(threebus, instances, results, sample=9, on_sentence=said.append)
-    assert (ours.rows, ours.objective) == (3, pytest.approx(2e-6, rel=1e-3))
-    assert [sentence.split(":")[0] for sentence in ours.differences] == ["b"]
+    found = reproduce(threebus, instances, results, sample=9, tell=said.append)
+    ours, theirs = found.to_dict("records")
+    assert (ours["method"], ours["rows"], ours["differ"]) == ("ed", 3, 1)
+    assert (ours["objective"], ours["Hz"]) == (pytest.approx(2e-6, rel=1e-3), 0.0)
+    (different,) = (sentence for sentence in said if "now" in sentence)
+    assert different.startswith("ed default TO: b: objective ")
     assert [s for s in said if "ended by a limit (d)" in s]
     assert [s for s in said if "its ed@f00 is not the one in" in s]
-    assert (theirs.rows, theirs.skipped) == (0, ["a: no method has this name"])
-    assert table_of([ours, theirs]).splitlines()[1].split()[:6] == ["ed", "default", "-", "TO", "3", "1"]
+    assert (theirs["method"], theirs["rows"], theirs["differ"]) == ("mine", 0, 0)
+    assert "mine default TO: a: no method has this name" in said
     assert results.path.read_bytes() == before
 
 
@@ -45,8 +48,10 @@ def test_the_sample_is_the_same_every_time(threebus: Case, quiet_instance, tmp_p
     chosen = [(instance, "test") for instance in instances.values()]
     rows = run(threebus, make_tasks(threebus, chosen, ["ed"], ["TO"], Settings()), results)
     results.add([dataclasses.replace(row, objective=2.0 * row.objective) for row in rows])
-    first, again = (reproduce(threebus, instances, results, ["ed"], 2)[0].differences for _ in range(2))
-    assert sorted(first) == sorted(again)
-    assert len(first) == 2
+    said: tuple[list[str], list[str]] = [], []
+    for sentences in said:
+        reproduce(threebus, instances, results, ["ed"], 2, tell=sentences.append)
+    assert said[0] == said[1]
+    assert len(said[0]) == 2
     with pytest.raises(InputError, match="has no rows of nobody"):
         reproduce(threebus, instances, results, ["nobody"])

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pydantic import Field
 
 from ded_bench.analysis.summary import (
@@ -105,7 +107,8 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
 
     Returns:
         What `summary` has, `is_reference`, the time alone on a machine `solve_s` and its `timing_failures`,
-        the mean gap `increase_percent` (missing for the reference), and the paper's numbers as `paper_…`.
+        the mean gap `increase_percent` (missing for the reference), mean violations, the paper's numbers as
+        `paper_…`, and how ours stand against them.
     """
     ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
     usual = {key[:2]: key for key in ours if is_usual(key[2], key[3], key[1])}
@@ -125,7 +128,26 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
         lines.append(line)
     own = ("is_reference", "solve_s", "timing_failures", "increase_percent")
     papers = (f"paper_{name}" for name in PaperRow.model_fields)
-    return pd.DataFrame(lines, columns=[*HEAD, *statistics(rows[:0]), *own, *papers])
+    made = pd.DataFrame(lines, columns=[*HEAD, *statistics(rows[:0]), *own, *papers])
+    for name in ("freq_violation_hz", "ramp_violation"):
+        made[name] = made[f"{name}_mean"]
+    return made.assign(
+        against_paper_increase=_against(made, "increase_percent"),
+        against_paper_time=_against(made, "solve_s", "timing_failures"),
+        against_paper_frequency=_against(made, "freq_violation_hz"),
+        against_paper_ramp=_against(made, "ramp_violation"),
+    )
+
+
+def _against(lines: pd.DataFrame, name: str, failures: str = "failures") -> NDArray[np.str_]:
+    """How a number of ours stands against the paper's: ahead if it is lower, empty where either is missing.
+
+    A mean over the instances that did not fail is never ahead.
+    """
+    ours, papers = lines[name], lines[f"paper_{name}"]
+    behind = (lines[failures] > 0) | (ours > papers)
+    known = ours.notna() & papers.notna()
+    return np.select([~known, behind, ours < papers], ["", "behind", "ahead"], "equal")
 
 
 #: References of cases without a paper's numbers, the first that has objectives.

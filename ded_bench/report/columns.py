@@ -1,21 +1,14 @@
-"""Every column that pages print, declared once: name, heading, unit, format, value.
-
-A column with a `value` computes its cells from the other cells of a line; any other names a column of the
-frame that the table prints.
-"""
+"""Every column that pages print, declared once: name, heading, unit, format."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
-from ded_bench.analysis.summary import HEAD, records
-
-Cells = Mapping[str, Any]
+from ded_bench.analysis.summary import HEAD
 
 
 @dataclass(frozen=True)
@@ -27,14 +20,12 @@ class Column:
         text: what stands above it, without the unit.
         unit: printed after the text, in brackets.
         form: format of its floats.
-        value: computes a cell from the other cells of its line.
     """
 
     name: str
     text: str
     unit: str = ""
     form: str = ".3g"
-    value: Callable[[Cells], object] | None = None
 
     @property
     def heading(self) -> str:
@@ -50,36 +41,9 @@ class Column:
         return str(value)
 
 
-def computed(frame: pd.DataFrame, columns: Sequence[Column]) -> pd.DataFrame:
-    """The frame with the columns that have a `value` and that it lacks."""
-    missing = [column for column in columns if column.value and column.name not in frame]
-    rows = records(frame) if missing else []
-    made = {c.name: pd.Series([c.value(row) for row in rows], frame.index) for c in missing if c.value}
-    return frame.assign(**made)
-
-
 def tabulate(columns: Sequence[Column], lines: pd.DataFrame) -> pd.DataFrame:
-    """What each line is about, then the columns, those with a `value` computed anew; nothing else."""
-    own = [column.name for column in columns if column.value]
-    made = computed(lines.drop(columns=own, errors="ignore"), columns)
-    return made[list(dict.fromkeys((*HEAD, *(column.name for column in columns))))]
-
-
-def _against(what: str, ours: str, paper: str, failures: str = "failures") -> Column:
-    """How a number of ours stands against the paper's: ahead if it is lower.
-
-    A mean over the instances that did not fail is never ahead. Empty where either number is missing.
-    """
-
-    def verdict(line: Cells) -> str:
-        a, b = line[ours], line[paper]
-        if math.isnan(a) or math.isnan(b):
-            return ""
-        if line[failures] or a > b:
-            return "behind"
-        return "ahead" if a < b else "equal"
-
-    return Column(f"against_paper_{what}", f"{what} against the paper", value=verdict)
+    """What each line is about, then the columns; nothing else."""
+    return lines[list(dict.fromkeys((*HEAD, *(column.name for column in columns))))]
 
 
 REGIME, TITLE, CASE = Column("regime", "Regime"), Column("title", "Method"), Column("case", "Grid")
@@ -96,19 +60,19 @@ TABLE_V = (
     Column("paper_solve_s", "paper's time", "s", "g"),
     N,
     FAILURES,
-    _against("increase", "increase_percent", "paper_increase_percent"),
-    _against("time", "solve_s", "paper_solve_s", "timing_failures"),
+    Column("against_paper_increase", "increase against the paper"),
+    Column("against_paper_time", "time against the paper"),
 )
 TABLE_VI = (
     *_HEAD,
-    Column("freq_violation_hz", "freq. const. viol.", "Hz", value=lambda x: x["freq_violation_hz_mean"]),
+    Column("freq_violation_hz", "freq. const. viol.", "Hz"),
     Column("paper_freq_violation_hz", "paper's", "Hz", "g"),
-    Column("ramp_violation", "ramp const. viol.", "pu", value=lambda x: x["ramp_violation_mean"]),
+    Column("ramp_violation", "ramp const. viol.", "pu"),
     Column("paper_ramp_violation", "paper's", "pu", "g"),
-    Column("n", "n", value=lambda x: x["rows"] - x["failures"]),
+    N,
     FAILURES,
-    _against("frequency", "freq_violation_hz_mean", "paper_freq_violation_hz"),
-    _against("ramp", "ramp_violation_mean", "paper_ramp_violation"),
+    Column("against_paper_frequency", "frequency against the paper"),
+    Column("against_paper_ramp", "ramp against the paper"),
 )
 
 
@@ -144,9 +108,9 @@ DETAIL = (
 #: Beside them, where full machine models or ANDES have judged schedules.
 OTHER_RATES = (
     Column("validated_rate", "feasible (validated)", form=".1%"),
-    Column("carried", "carried", value=lambda x: f"{x['validated_n']} of {x['validated_asked']}"),
+    Column("carried", "carried"),
     Column("confirmed_rate", "confirmed by ANDES", form=".1%"),
-    Column("refereed", "answered", value=lambda x: f"{x['confirmed_n']} of {x['confirmed_asked']}"),
+    Column("refereed", "answered"),
 )
 TIMING = (
     *(*_HEAD, INSTANCES, Column("repeats", "repeats")),

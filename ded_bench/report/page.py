@@ -14,7 +14,7 @@ import pandas as pd
 from markdown_it import MarkdownIt
 
 from ded_bench.files.strict import write_atomically
-from ded_bench.report.columns import Column, computed
+from ded_bench.report.columns import Column
 
 #: What the text of a page may hold; links and pictures in it would be strangers'.
 MARKDOWN = MarkdownIt("commonmark").enable("table").disable(["link", "autolink", "image"])
@@ -49,9 +49,6 @@ class PageTable:
     columns: tuple[Column, ...]
     caption: str = ""
     file: str = ""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", computed(self.frame, self.columns))
 
     @property
     def cells(self) -> list[list[str]]:

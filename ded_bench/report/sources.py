@@ -30,6 +30,7 @@ from ded_bench.problem.benchmark import load_manifest, load_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Trajectory
+from ded_bench.report.columns import TRAINING
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import OnlineResults
 from ded_bench.results.rows import VALIDATED, Key, Results, reference_objectives
@@ -194,13 +195,6 @@ def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
     return paper
 
 
-#: What headers of models and policies say of their training.
-TRAINING_FACTS = (
-    *("seconds", "epochs", "instances", "trajectories", "held_out", "held_out_loss", "training_loss"),
-    *("parameters", "model", "seed", "device"),
-)
-
-
 def trainings(paths: Iterable[Path]) -> pd.DataFrame:
     """How models or policies were trained, from their files' headers; `problem` if one is damaged."""
     rows = []
@@ -210,4 +204,4 @@ def trainings(paths: Iterable[Path]) -> pd.DataFrame:
         except InputError as error:
             facts, problem = None, str(error)
         rows.append({"name": path.stem, "problem": problem} | (facts if isinstance(facts, dict) else {}))
-    return pd.DataFrame(rows, columns=["name", *TRAINING_FACTS, "problem"])
+    return pd.DataFrame(rows, columns=[column.name for column in TRAINING])

@@ -33,6 +33,8 @@ def times(*rows: tuple[str, float, int]) -> pd.DataFrame:
 def made(columns: tuple[Column, ...], frame: pd.DataFrame, timing: pd.DataFrame = NO_TIMES) -> pd.DataFrame:
     """A table by regime, method and settings."""
     lines = result_lines(with_gaps(frame), timing, PAPER, "ded")
+    if columns is TABLE_VI:
+        lines["n"] = lines["rows"] - lines["failures"]
     return tabulate(columns, lines).set_index(["regime", "method", "settings"])
 
 

@@ -14,7 +14,7 @@ from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.problem.benchmark import load_split, write_benchmark
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.report import figures
+from ded_bench.report.figures import style
 
 HORIZON = 1.0
 TEST, TRAIN = 5, 3
@@ -47,4 +47,4 @@ def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
         drawn = b"".join(np.asarray(line.get_ydata(), dtype=float).tobytes() for line in lines)
         write_atomically(path, hashlib.sha256(drawn).hexdigest())
 
-    monkeypatch.setattr(figures, "save_figure", sketch)
+    monkeypatch.setattr(style, "save_figure", sketch)

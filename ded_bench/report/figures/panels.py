@@ -20,7 +20,17 @@ from ded_bench.files.arrays import read_arrays
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.scenario import QUALITIES
-from ded_bench.report.figures.style import DASHES, GREY, PALETTE, Drawn, legend_below, look, new_figure, plain
+from ded_bench.report.figures.style import (
+    DASHES,
+    GREY,
+    PALETTE,
+    legend_below,
+    look,
+    new_figure,
+    placed,
+    plain,
+)
+from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
 
 RAD_TO_HZ = 1 / (2 * np.pi)
@@ -156,13 +166,16 @@ def busiest(curves: Sequence[Array], count: int) -> list[int]:
     return sorted(np.argsort(-ranges, kind="stable")[:count].tolist())
 
 
-def draw_schedules(sources: Sources) -> Iterator[Drawn]:
+def draw_schedules(sources: Sources) -> Iterator[Picture]:
     """Of every regime that has a schedule (paper, Figs. NO_cmp, TO_cmp, freq_cmp)."""
     case = sources.case
     for regime in case.regimes:
         chosen = representative(sources, regime)
-        rows = enumerate(records(chosen))
-        shown = [one for place, row in rows if (one := shown_run(sources, row, place))]
+        shown = []
+        for place, row in enumerate(records(chosen)):
+            if run := sources.trajectory(row["key"]):
+                arrays = run.t, run.p_set, run.omega, run.p_load, run.p_slack
+                shown.append(Shown(row["method"], row["title"], place, *arrays))
         if not shown:
             continue
         heading = f"{chosen['instance'].iloc[0]}, {regime}"
@@ -170,18 +183,11 @@ def draw_schedules(sources: Sources) -> Iterator[Drawn]:
         names = " and ".join(one.label for one in reversed(shown))
         caption = f"{names} on {heading}: set-points with bounds, loads, {last}; the gap is near the median"
         panels = [*power_panels(case, shown), load_panel(case, shown[0]), balance_panel(case, regime, shown)]
-        yield Drawn(f"schedule_{regime}", caption, time_figure(heading, panels, 2))
+        yield placed(time_figure(heading, panels, 2), sources, f"schedule_{regime}", caption)
         if regime == sources.tightest:
             caption = f"Frequencies under {names} on {heading}; dotted: the regime's bounds."
             panels = frequency_panels(case, regime, shown, 4)
-            yield Drawn(f"frequencies_{regime}", caption, time_figure(heading, panels, 1))
-
-
-def shown_run(sources: Sources, row: dict[Any, Any], place: int = 0) -> Shown | None:
-    """What figures show of a row; None if it cannot be simulated."""
-    run = sources.trajectory(row["key"])
-    arrays = (run.t, run.p_set, run.omega, run.p_load, run.p_slack) if run else ()
-    return Shown(row["method"], row["title"], place, *arrays) if run else None
+            yield placed(time_figure(heading, panels, 1), sources, f"frequencies_{regime}", caption)
 
 
 def representative(sources: Sources, regime: str) -> pd.DataFrame:
@@ -214,7 +220,7 @@ STATICS = ((PRACTICE[0], "every=300"), PRACTICE, STATIC)
 METHODS_SHOWN, GENERATORS_SHOWN = 2, 3
 
 
-def draw_scenario(sources: Sources) -> Iterator[Drawn]:
+def draw_scenario(sources: Sources) -> Iterator[Picture]:
     """Of the scenario that is chosen, if any is kept."""
     scenario, shown = shown_scenario(sources)
     if shown:
@@ -228,7 +234,7 @@ def draw_scenario(sources: Sources) -> Iterator[Drawn]:
         panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
         agc = Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])
         panels.append(balance_panel(case, sources.tightest, shown) if case.slack else agc)
-        yield Drawn("online_scenario", caption, time_figure(heading, panels, 1))
+        yield placed(time_figure(heading, panels, 1), sources, "online_scenario", caption)
 
 
 def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,6 +19,8 @@ from PIL import Image  # matplotlib brings it
 
 from ded_bench.files.strict import write_atomically
 from ded_bench.methods.registry import METHODS
+from ded_bench.report.page import Picture
+from ded_bench.report.sources import Sources
 
 BLACK, GREY = "#000000", "#7f7f7f"
 #: Colours that the colour-blind can distinguish (Okabe and Ito's first).
@@ -54,14 +56,6 @@ STYLE: dict[Any, Any] = {
 }
 
 
-class Drawn(NamedTuple):
-    """A figure, the name of its file without suffix, and what stands below it."""
-
-    file: str
-    caption: str
-    figure: Figure
-
-
 @contextmanager
 def new_figure(height: float) -> Iterator[Figure]:
     """A figure of WIDTH and a height in inches, to be filled inside the `with` in the common style."""
@@ -69,6 +63,12 @@ def new_figure(height: float) -> Iterator[Figure]:
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
+
+
+def placed(figure: Figure, sources: Sources, name: str, caption: str) -> Picture:
+    """Save a figure as `<results>/figures/<name>.png`; the caption stands below it."""
+    save_figure(figure, sources.results.paths.figures / f"{name}.png")
+    return Picture(f"figures/{name}.png", caption)
 
 
 def save_figure(figure: Figure, path: Path) -> None:

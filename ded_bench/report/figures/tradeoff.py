@@ -16,7 +16,8 @@ from matplotlib.transforms import Bbox
 from ded_bench.analysis.reference import Paper
 from ded_bench.analysis.summary import title
 from ded_bench.methods.options import DEFAULT
-from ded_bench.report.figures.style import GREY, Drawn, colour, legend_below, marker, new_figure, plain
+from ded_bench.report.figures.style import GREY, colour, legend_below, marker, new_figure, placed, plain
+from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
 
 #: Gaps below this are drawn on a linear scale, larger ones on a logarithmic one, %.
@@ -28,7 +29,7 @@ SIDES = (
 )
 
 
-def draw(sources: Sources) -> Iterator[Drawn]:
+def draw(sources: Sources) -> Iterator[Picture]:
     """One point per line of the tables, where there is a gap."""
     points = sources.outcome
     points = points[points["regime"].isin(list(sources.case.regimes))].dropna(
@@ -43,7 +44,7 @@ def draw(sources: Sources) -> Iterator[Drawn]:
         f"by `ded-bench bench`{grey}. The vertical scale is linear within ±0.01 %."
     )
     papers = paper_points(sources.paper) if sources.paper else pd.DataFrame(columns=["regime"])
-    yield Drawn("tradeoff", caption, tradeoff_figure(points, sources.reference.title, papers))
+    yield placed(tradeoff_figure(points, sources.reference.title, papers), sources, "tradeoff", caption)
 
 
 def paper_points(paper: Paper) -> pd.DataFrame:

@@ -17,11 +17,14 @@ from ded_bench.cli.arguments import (
     say,
 )
 from ded_bench.files.errors import InputError
+from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
+from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import MODELS
 
 
 def add_commands(commands: Any) -> None:
@@ -72,11 +75,8 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
-    from ded_bench.methods.registry import get_method, registered
-    from ded_bench.plants.plant import servable
     from ded_bench.results.rows import Results
     from ded_bench.results.timing import model_name, timing_summary
-    from ded_bench.surrogates.find import MODELS
 
     chosen = select_split(a.case)
     case = chosen.case
@@ -118,8 +118,6 @@ def _bench(a: argparse.Namespace) -> int:
 
 
 def _certify(a: argparse.Namespace) -> int:
-    from ded_bench.methods.registry import get_method
-
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
@@ -153,14 +151,13 @@ def _compare(a: argparse.Namespace) -> int:
 
 
 def _report(a: argparse.Namespace) -> int:
-    from ded_bench.results.rows import Results
+    from ded_bench.results.rows import OBJECTIVES, Results, objectives_of
 
     case = Case.load(a.case)
     folder = a.results or default_results(case)
     if rows := sum(row.case in (case.id, "") for row in Results(folder).rows.values()):
         say(f"tables and figures of {counted(rows, 'row')} in {folder}")
     from ded_bench.report.report import write_report
-    from ded_bench.results.rows import OBJECTIVES, objectives_of
 
     written = write_report(case, folder, problem_folder(a.case, case), print)
     OBJECTIVES.write(ResultsFolder(folder).objectives, objectives_of(Results(folder).rows.values()))

@@ -15,6 +15,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.methods.options import described
 from ded_bench.methods.registry import Method, get_method, registered
+from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.problem.benchmark import (
     Manifest,
     copy_case,
@@ -79,8 +80,6 @@ def add_commands(commands: Any) -> None:
 
 
 def _instances(a: argparse.Namespace) -> int:
-    from ded_bench.plants.plant import servable
-
     case = Case.load(a.case)
     home = problem_folder(a.case, case)
     split = load_split(home) if (home / "split.json").is_file() else None
@@ -137,7 +136,6 @@ def _path(a: argparse.Namespace) -> int:
 
 def _import(a: argparse.Namespace) -> int:
     from ded_bench.analysis.matpower_case import imported
-    from ded_bench.plants.plant import SimulationError
 
     path = a.out / "case.json"
     if path.exists():
@@ -193,7 +191,6 @@ def _cases(a: argparse.Namespace) -> int:
     if a.case is None:
         return _list()
     from ded_bench.analysis.inspect_case import check_case, implausible
-    from ded_bench.plants.plant import SimulationError
 
     case = Case.load(a.case)
     sizes = f"{case.n_bus} buses, {len(case.generators)} generators, {len(case.loads)} loads"
@@ -240,8 +237,6 @@ def _print_check(case: Case, found: CaseCheck) -> None:
 
 
 def _scenarios(a: argparse.Namespace) -> int:
-    from ded_bench.plants.plant import servable
-
     case = Case.load(a.case)
     try:
         check_whole_steps(f"a scenario's duration of {DURATION_S:g} s", DURATION_S, case.sampling.dt_s)

@@ -25,7 +25,7 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
-from ded_bench.plants.plant import PLANTS
+from ded_bench.plants.plant import PLANTS, SimulationError, plant_of, servable
 from ded_bench.problem.benchmark import (
     Selection,
     check_own_name,
@@ -152,7 +152,6 @@ def _score_one(a: argparse.Namespace) -> int:
     case, (instance, _) = chosen.case, chosen.instances[0]
     case.check_regimes([regime])
     schedule = Schedule.read(a.schedule, case, instance.horizon_s)
-    from ded_bench.plants.plant import SimulationError, plant_of
     from ded_bench.plants.score import score
 
     try:
@@ -201,7 +200,6 @@ def _score_results(a: argparse.Namespace) -> int:
 
 def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance], results: Results) -> int:
     """The schedules kept in a results folder, on the plant of `--plant`."""
-    from ded_bench.plants.plant import plant_of
     from ded_bench.run.scoring import validate
 
     plant_of(case, a.plant)  # says what the case lacks
@@ -293,8 +291,6 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
-    from ded_bench.plants.plant import plant_of, servable
-
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
     else:

@@ -21,10 +21,14 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
-from ded_bench.methods.registry import trainable
+from ded_bench.methods.registry import get_method, trainable
+from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
+from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders
+from ded_bench.run.environment import commit, version
+from ded_bench.run.pool import Workers
 from ded_bench.surrogates.find import TRAINED
 
 
@@ -66,7 +70,6 @@ def _train_ko(a: argparse.Namespace) -> int:
         if is_paper:
             from ded_bench.surrogates.koopman_paper import identify_paper
     say(f"simulating trajectories of {case.id}, then identifying {out.stem}")
-    from ded_bench.plants.lossless.network import Network
     from ded_bench.surrogates.identify import held_out, identify, rollout_errors
 
     model = (identify_paper if is_paper else identify)(case, a.seed, a.count)
@@ -78,8 +81,6 @@ def _train_ko(a: argparse.Namespace) -> int:
 
 
 def _train_dpc(a: argparse.Namespace) -> int:
-    from ded_bench.methods.registry import get_method
-    from ded_bench.run.pool import Workers
     from ded_bench.run.tasks import reason_of
 
     case = Case.load(a.case)
@@ -111,10 +112,6 @@ def _train_dpc(a: argparse.Namespace) -> int:
 
 def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     """Train one policy as the command's options say; returns what to tell."""
-    from ded_bench.methods.registry import get_method
-    from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
-    from ded_bench.run.environment import commit, version
-
     case = Case.load(a.case)
     results = a.results or default_results(case)
     out: Path = a.out or policy_file(results, name, regime, a.model)

@@ -155,7 +155,10 @@ class TimeVarying:
         if f.strides[0] == 0:  # the same map in all intervals
             which, f = np.zeros_like(which), f[:1]
         march(np.ascontiguousarray(f), which, state, force, growth, self.points, deviation)
-        return self._outputs(deviation)
+        p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
+        change = deviation[:, self.speed]
+        change = change if self.matrix is None else change @ self.matrix.T
+        return self.omega + change, self.p_slack + p_slack
 
     def before_reset(self, rows: Array, intervals: Indices) -> Array:
         """Rows in the state after the start of intervals, (n, ..., n_state), as rows in that before it."""
@@ -169,12 +172,6 @@ class TimeVarying:
         """In which interval each grid point lies; the point at a knot belongs to the one after it."""
         owner = np.repeat(np.arange(len(self.lengths)), self.lengths)
         return np.append(owner, owner[-1])
-
-    def _outputs(self, deviation: Array) -> tuple[Array, Array]:
-        p_slack = np.einsum("ki,ki->k", self.slack[self._intervals], deviation)
-        change = deviation[:, self.speed]
-        change = change if self.matrix is None else change @ self.matrix.T
-        return self.omega + change, self.p_slack + p_slack
 
     def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
         """δω at single grid points, as rows in the variables of the intervals that they lie in.

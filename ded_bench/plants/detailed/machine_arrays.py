@@ -69,32 +69,27 @@ def machine_arrays(machines: Any, ports: Indices, infinite: str | None) -> Machi
         ports: the port of each machine, (n,).
         infinite: name of the machine that keeps its speed, if one does.
     """
-    rows = [_constants(m, machines.base_mva) for m in machines.machines]
+    data = np.zeros(len(machines.machines), MACHINE).view(np.recarray)
+    for place, machine in enumerate(machines.machines):
+        for name, value in _constants(machine, machines.base_mva).items():
+            data[name][place] = value
     rigid = np.array([m.name == infinite for m in machines.machines])
-    m = np.array([row.pop("m") for row in rows])
+    m = np.array([2.0 * m.h * (m.mva / machines.base_mva) for m in machines.machines])
     weights = rigid if rigid.any() else m
-    common = {
-        "port": ports,
-        "omega_0": 2.0 * np.pi * machines.f0_hz,
-        "inverse_m": np.where(rigid, 0.0, 1.0 / m),
-        "inertia": weights / weights.sum(),
-    }
-    data = np.recarray(len(rows), dtype=MACHINE)
-    for name in MACHINE.names or ():
-        data[name] = common[name] if name in common else [row[name] for row in rows]
+    data["port"], data["omega_0"] = ports, 2.0 * np.pi * machines.f0_hz
+    data["inverse_m"], data["inertia"] = np.where(rigid, 0.0, 1.0 / m), weights / weights.sum()
     return data
 
 
 def _constants(machine: Any, base_mva: float) -> dict[str, float]:
-    k = machine.mva / base_mva
-    common = {"m": 2.0 * machine.h * k, "d": machine.d * k}
-    common |= _exciter(machine.exciter) | _stabiliser(machine.pss)
-    governor = machine.governor
+    """What a machine's own data say; all else is zero."""
+    k, governor = machine.mva / base_mva, machine.governor
+    common = {"d": machine.d * k, **_exciter(machine.exciter), **_stabiliser(machine.pss)}
     common |= {"droop": k / governor.r, "rate_g": 1.0 / governor.t1}
     common |= {"reheat": governor.t2 / governor.t3, "rate_h": 1.0 / governor.t3}
     if machine.model == "GENCLS":
         same = dict.fromkeys(("x", "xd", "xd1", "xq", "xq1", "xl"), machine.xd1 / k)
-        return common | same | _CLASSICAL
+        return common | same | {"gd1": 1.0, "gq1": 1.0}
     xd1, xq1, xd2, xl = machine.xd1, machine.xq1, machine.xd2, machine.xl
     return common | {
         "x": xd2 / k,
@@ -110,18 +105,18 @@ def _constants(machine: Any, base_mva: float) -> dict[str, float]:
     }
 
 
-_CLASSICAL = {"gd1": 1.0, "gd2": 0.0, "gq1": 1.0, "gq2": 0.0} | dict.fromkeys(
-    ("rate_d1", "rate_q1", "rate_d2", "rate_q2"), 0.0
-)
-
-
 def _exciter(exciter: Any) -> dict[str, float]:
-    none = {"dc": 0.0, "gain": 0.0, "lead": 0.0, "rate_x": 0.0, "rate_f": 0.0, "ke": 1.0, "rate_fb": 0.0}
     if exciter is None:
-        return none
+        return {"ke": 1.0}
     if exciter.model == "SEXS":
         lead = exciter.ta / exciter.tb
-        return none | {"gain": exciter.k, "lead": lead, "rate_x": 1 / exciter.tb, "rate_f": 1 / exciter.te}
+        return {
+            "gain": exciter.k,
+            "lead": lead,
+            "rate_x": 1 / exciter.tb,
+            "rate_f": 1 / exciter.te,
+            "ke": 1.0,
+        }
     return {
         "dc": 1.0,
         "gain": exciter.ka,
@@ -135,7 +130,7 @@ def _exciter(exciter: Any) -> dict[str, float]:
 
 def _stabiliser(pss: Any) -> dict[str, float]:
     if pss is None:
-        return dict.fromkeys(("ks", "rate_w", "lead_a", "rate_a", "lead_b", "rate_b"), 0.0)
+        return {}
     return {
         "ks": pss.ks,
         "rate_w": 1.0 / pss.tw,

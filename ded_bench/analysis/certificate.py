@@ -151,12 +151,6 @@ class Candidate:
         name = {"method": self.method, "settings": settings, "regime": self.regime}
         return name | {"reference": self.reference} | made_with
 
-    def fingerprint(self, case: Case, seed: int) -> str:
-        """Twelve hex digits that change with whatever decides on its rows."""
-        versions = [str(get_method(method).version) for method, _ in self.pair]
-        parts = [case.fingerprint, str(seed), *versions, *self.facts(case).values()]
-        return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
-
     def rows_file(self, case: Case, folder: Path) -> Path:
         """Where a results folder keeps the rows that its certificate counts."""
         facts = self.facts(case)
@@ -217,7 +211,10 @@ def certify(
         InputError: unknown method or regime, a missing policy or model, or a wrong file of rows.
     """
     case.check_regimes([candidate.regime])
-    path, fingerprint = candidate.rows_file(case, folder), candidate.fingerprint(case, seed)
+    path, facts = candidate.rows_file(case, folder), candidate.facts(case)
+    versions = [str(get_method(method).version) for method, _ in candidate.pair]
+    decisive = "|".join([case.fingerprint, str(seed), *versions, *facts.values()])
+    fingerprint = hashlib.sha256(decisive.encode()).hexdigest()[:12]
     done = {r.index: r for r in ROWS.existing(path) if r.fingerprint == fingerprint and r.index < count}
     missing = [i for i in range(count) if i not in done]
     calls = [
@@ -231,9 +228,9 @@ def certify(
             bar.update(len(made))
     rows = ROWS.frame(done.values())
     limits = meets_limits(rows, criteria.tolerance_hz, criteria.tolerance_pu)
-    near = gaps(rows) <= criteria.gap_percent
+    near = 100.0 * (rows["objective"] / rows["reference"] - 1.0) <= criteria.gap_percent
     successes = int((limits & near).sum())
-    facts: dict[str, Any] = criteria.model_dump() | candidate.facts(case)
+    known: dict[str, Any] = criteria.model_dump() | facts
     return Certificate(
         case=case.id,
         seed=CERTIFICATE_SEED + seed,
@@ -248,13 +245,8 @@ def certify(
         version=version(),
         host=host(),
         date=now(),
-        **facts,
+        **known,
     )
-
-
-def gaps(rows: pd.DataFrame) -> pd.Series[float]:
-    """Increase of the cost over the reference, percent; missing where either failed."""
-    return 100.0 * (rows["objective"] / rows["reference"] - 1.0)
 
 
 def meets_limits(rows: pd.DataFrame, tolerance_hz: float, tolerance_pu: float) -> pd.Series[bool]:

@@ -210,15 +210,12 @@ def referee(
         if table.made_from(row.key, name):
             found.append(table.rows[row.key])
         else:
-            todo.append((row, name))
+            todo.append((row, schedule, name))
 
-    def judge(row: Row, name: str) -> RefereeRow:
-        instance = instances[row.instance]
-        schedule = results.schedule(row, case, instance)
-        made = RefereeRow(
-            **row.key._asdict(), plant=PLANT, fingerprint=name, method_version=row.method_version
-        )
-        return dataclasses.replace(made, **judged(case, instance, schedule, row.regime, grid, python))
+    def judge(row: Row, schedule: Schedule, name: str) -> RefereeRow:
+        cells = judged(case, instances[row.instance], schedule, row.regime, grid, python)
+        cells |= {"fingerprint": name, "method_version": row.method_version}
+        return RefereeRow(**row.key._asdict(), plant=PLANT, **cells)
 
     with ThreadPoolExecutor(workers) as pool:
         waiting = [pool.submit(judge, *asked) for asked in todo]

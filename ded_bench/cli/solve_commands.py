@@ -184,18 +184,19 @@ def _score_results(a: argparse.Namespace) -> int:
         return _validate(a, case, instances, results)
     from ded_bench.run.scoring import rescore
 
-    check = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)
+    rows, found = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)
     if a.json:
-        for row in check.rows:
+        for row in rows:
             _print_row(results, row)
+    unknown = sum(row.instance not in instances for row in results.rows.values())
     parts = [
-        f"{counted(len(check.rows), 'row')} {'scored anew' if a.update else 'checked'} in {results.path}",
-        counted(len(check.differences), "difference"),
-        f"{counted(check.without_schedule, 'row')} without a kept schedule",
-        *([f"{check.unknown} of unknown instances"] if check.unknown else []),
+        f"{counted(len(rows), 'row')} {'scored anew' if a.update else 'checked'} in {results.path}",
+        counted(len(found), "difference"),
+        f"{counted(len(results.rows) - unknown - len(rows), 'row')} without a kept schedule",
+        *([f"{unknown} of unknown instances"] if unknown else []),
     ]
     tell(", ".join(parts))
-    return 0 if a.update or not check.differences else 1
+    return 0 if a.update or not found else 1
 
 
 def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance], results: Results) -> int:

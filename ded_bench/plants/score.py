@@ -80,8 +80,8 @@ def judge(case: Case, instance: Instance, trajectory: Trajectory, regime: str) -
     return Score(
         objective=trajectory.cost(instance.cost_gen(case), instance.cost_slack(case)),
         freq_violation_hz=max(excess.values()),
-        ramp_violation=_positive(excess_ramp.max()),
-        bound_violation=_positive(max(excess_bound.max(), excess_transfer.max(initial=0.0))),
+        ramp_violation=float(max(excess_ramp.max(), 0.0)),
+        bound_violation=float(max(excess_bound.max(), excess_transfer.max(initial=0.0), 0.0)),
         initial_violation=float(np.abs(p_set[0] - instance.p_initial(case)).max()),
         **own,
     )
@@ -101,7 +101,3 @@ def mean_hz(trajectory: Trajectory) -> Array:
     """The mean frequency, weighted with inertia, (n,), Hz, deviation from nominal."""
     weight = trajectory.case.inertia
     return np.asarray(trajectory.omega / (2 * np.pi) @ (weight / weight.sum()))
-
-
-def _positive(value: float) -> float:
-    return max(float(value), 0.0)

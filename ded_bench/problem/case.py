@@ -113,14 +113,10 @@ class Case(Fingerprinted, Extended):
         path = case_file(name_or_path)
         text = read_text(path)
         case = parse_record(_record_of(text), text, path)
-        case._read_grid(path.parent)
+        if case.needs_grid or all((path.parent / name).is_file() for name in GRID_FILES):
+            case._grid = load_grid_files(path.parent, case.id, case.f0_hz)
+            case._check_grid(case._grid, path.parent)
         return case
-
-    def _read_grid(self, folder: Path) -> None:
-        if self.needs_grid or all((folder / name).is_file() for name in GRID_FILES):
-            grid = load_grid_files(folder, self.id, self.f0_hz)
-            self._grid = grid
-            self._check_grid(grid, folder)
 
     def _check_grid(self, grid: GridFiles, folder: Path) -> None:
         """Raise InputError unless the files beside the case have its machines and loads."""

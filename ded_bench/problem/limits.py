@@ -47,10 +47,8 @@ class Bounds:
     def excess_hz(self, omega: Array, ended: bool = True) -> dict[str, float]:
         """Largest excess over the bounds of each kind, Hz, along frequency deviations (n, n_gen), rad/s."""
         excess = np.maximum(self.beyond(omega @ self.matrix.T, ended).max(axis=0), 0.0) / (2 * np.pi)
-        found = dict.fromkeys(self.kinds, 0.0)
-        for kind, value in zip(self.kinds, excess.tolist(), strict=True):
-            found[kind] = max(found[kind], value)
-        return found
+        kinds = np.array(self.kinds)
+        return {kind: float(excess[kinds == kind].max()) for kind in dict.fromkeys(self.kinds)}
 
 
 class Regime(Record):

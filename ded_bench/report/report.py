@@ -2,7 +2,7 @@
 
 First come findings, the trade-off and the methods that were run; then the paper's tables, and the schedules;
 then methods in detail, times, trainings, the closed loop, provenance. Every section is a function of what was
-read, and of pictures by topic (see `figures.FIGURES`).
+read, and of pictures by topic (see FIGURES).
 """
 
 from __future__ import annotations
@@ -33,11 +33,17 @@ from ded_bench.report.columns import (
     TRAINING,
     tabulate,
 )
-from ded_bench.report.figures import draw_figures
+from ded_bench.report.figures import panels, tradeoff
 from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, usual_first, write_page
 from ded_bench.report.sources import Sources, read_sources, trainings
 from ded_bench.run.environment import environment, now
 
+#: The topic under which a section shows a figure, and what draws and saves it.
+FIGURES: Mapping[str, Callable[[Sources], Iterator[Picture]]] = {
+    "tradeoff": tradeoff.draw,
+    "schedules": panels.draw_schedules,
+    "online": panels.draw_scenario,
+}
 #: How the tables are to be read.
 EXPLANATION = (
     "**Objective and violations are re-simulated**: every schedule is simulated on the plant of "
@@ -99,7 +105,7 @@ def write_report(
     sources = read_sources(case, folder, problems)
     for sentence in findings(sources.outcome, sources.reference.title):
         tell(sentence.replace("**", ""))
-    pictures = draw_figures(sources)
+    pictures = {topic: list(draw(sources)) for topic, draw in FIGURES.items()}
     sections = opening, each_method, solve_times, trained, closed_loop, made_by
     return write_page([b for section in sections for b in section(sources, pictures)], folder, "report")
 

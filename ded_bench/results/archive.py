@@ -16,7 +16,6 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,20 +36,12 @@ _COLUMNS = "columns"
 _MADE = (1980, 1, 1, 0, 0, 0)
 
 
-class _Index(NamedTuple):
-    """What an archive file holds, and which state of the file that was."""
-
-    mark: tuple[int, int]
-    names: frozenset[str]
-    columns: list[str]
-
-
 class Archive:
     """The schedules of one method, settings and regime by name; nothing need be there."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._loose = path, path.with_suffix("") if path.suffix == ".npz" else path
-        self._index: _Index | None = None
+        self._mark, self._names, self._packed_columns = (0, 0), frozenset[str](), list[str]()
 
     def __contains__(self, name: str) -> bool:
         return self._file(name).is_file() or name in self._packed()
@@ -122,7 +113,7 @@ class Archive:
         if loose.is_file():
             with _readable(loose):
                 return [str(name) for name in _array(loose.read_bytes())]
-        return self._index.columns if self._packed() and self._index else []
+        return self._packed_columns if self._packed() else []
 
     def _packed(self) -> frozenset[str]:
         """Names in the archive file, which is read again when it has changed."""
@@ -131,13 +122,13 @@ class Archive:
         except FileNotFoundError:
             return frozenset()
         mark = found.st_ino, found.st_mtime_ns
-        if self._index is None or self._index.mark != mark:
+        if self._mark != mark:
             with _readable(self.path), zipfile.ZipFile(self.path) as archive:
                 names = frozenset(name.removesuffix(".npy") for name in archive.namelist())
             with _readable(self.path):
                 columns = [str(n) for n in _array(self._member(_COLUMNS))] if _COLUMNS in names else []
-            self._index = _Index(mark, names, columns)
-        return self._index.names
+            self._mark, self._names, self._packed_columns = mark, names, columns
+        return self._names
 
     def _member(self, name: str) -> bytes:
         """The bytes of a member, which may not be larger than any schedule is."""

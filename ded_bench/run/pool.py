@@ -141,7 +141,8 @@ class Children:
                 return NoAnswerError(f"no answer after {limit_s:g} s, so its process was killed")
             self._give_back(child)
             return answer
-        return WorkerDiedError(f"the worker process died {ATTEMPTS} times on this task ({_ending(code)})")
+        ending = f"exit code {code}" if code >= 0 else signal.strsignal(-code) or f"signal {-code}"
+        return WorkerDiedError(f"the worker process died {ATTEMPTS} times on this task ({ending})")
 
     def rest(self) -> None:
         """End the processes that have nothing to do."""
@@ -260,8 +261,3 @@ def _read(answer: Answer) -> object:
     except Exception as error:  # an exception class may want more than its message
         return RuntimeError(f"the answer cannot be read: {error}")
     return result
-
-
-def _ending(code: int) -> str:
-    """How a process ended, in words."""
-    return f"exit code {code}" if code >= 0 else signal.strsignal(-code) or f"signal {-code}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from tqdm import tqdm
@@ -29,23 +28,6 @@ SAME = dict.fromkeys(_SCORE, 1e-9)
 
 #: What a kept schedule is worth, or why that cannot be told.
 Verdict = Score | Exception
-
-
-@dataclass(frozen=True)
-class Check:
-    """What was found when the kept schedules of a results folder were scored again.
-
-    Attributes:
-        rows: those that were compared, as they are scored now.
-        differences: one sentence each.
-        without_schedule: rows whose schedule is not kept.
-        unknown: rows of instances that are not among those given.
-    """
-
-    rows: list[Row]
-    differences: list[str]
-    without_schedule: int
-    unknown: int
 
 
 def verdicts(
@@ -100,24 +82,26 @@ def rescore(
     *,
     update: bool = False,
     on_difference: Callable[[str], None] = lambda sentence: None,
-) -> Check:
+) -> tuple[list[Row], list[str]]:
     """Score the kept schedules of a results folder again, and compare with its rows.
 
     Args:
         case: of the rows.
-        instances: by id; rows of others are counted.
+        instances: by id; rows of others are passed over.
         results: the folder's.
         workers: processes.
         update: write the new scores into the rows.
         on_difference: called with each sentence.
 
+    Returns:
+        The rows that were compared, as they are scored now, and their differences, a sentence each.
+
     Raises:
         InputError: none of the rows' schedules is kept.
     """
-    kept = results.kept(instances)
     rows, found = [], []
     with Workers(workers) as pool:
-        for old, verdict in verdicts(case, kept, instances, results, pool):
+        for old, verdict in verdicts(case, results.kept(instances), instances, results, pool):
             rows.append(scored_row(old, verdict))
             for sentence in _differences(old, rows[-1]):
                 found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
@@ -125,8 +109,7 @@ def rescore(
     if update:
         results.add(rows)
         results.compact()
-    unknown = sum(row.instance not in instances for row in results.rows.values())
-    return Check(rows, found, len(results.rows) - unknown - len(kept), unknown)
+    return rows, found
 
 
 def validate(

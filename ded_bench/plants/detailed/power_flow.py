@@ -88,7 +88,10 @@ class PortNetwork:
             off = np.concatenate([injected.real - wanted, injected.imag + self.q_drawn])[unknown]
             worst = np.abs(off).max(initial=0.0)
             if worst < MISMATCH:
-                return self._point(voltage, injected, p_machine, p_drawn)
+                delivered = injected[held] + (p_drawn + 1j * self.q_drawn)[held]
+                power = p_machine + 1j * self.share * delivered.imag
+                power[self.balancing] = delivered[self.balancing]
+                return OperatingPoint(voltage, power, p_drawn)
             if not worst < np.inf:
                 break
             if factors is None or worst > KEPT * before:
@@ -117,12 +120,6 @@ class PortNetwork:
         by_all = np.zeros(len(slopes))
         by_all[self._unknown] = np.linalg.solve(jacobian.T, slopes[balancing, self._unknown])
         return by_all[self.machine_port]
-
-    def _point(self, voltage: Complex, injected: Complex, p_machine: Array, p_drawn: Array) -> OperatingPoint:
-        delivered = injected[self.machine_port] + (p_drawn + 1j * self.q_drawn)[self.machine_port]
-        power = p_machine + 1j * self.share * delivered.imag
-        power[self.balancing] = delivered[self.balancing]
-        return OperatingPoint(voltage, power, p_drawn)
 
     @functools.cached_property
     def _unknown(self) -> Indices:

@@ -90,11 +90,6 @@ class Network:
         places = self.generators, self.algebraic, self.slack
         return CompiledGrid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
 
-    @functools.cached_property
-    def _whole(self) -> CompiledGrid:
-        """The same with all angles but the slack's unknown."""
-        return self.grid._replace(algebraic=self.unknown)
-
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
         flow = np.sin(theta @ self.incidence.T) * self.coupling
@@ -133,7 +128,8 @@ class Network:
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
         theta = wanted @ self._first_step  # Newton's first step from θ = 0
-        theta, _ = self._newton(theta, wanted[..., self.unknown], self._whole)
+        whole = self.grid._replace(algebraic=self.unknown)
+        theta, _ = self._newton(theta, wanted[..., self.unknown], whole)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
             raise SimulationError("an angle across a line exceeds 90 degrees")
         return theta

@@ -27,7 +27,7 @@ from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 from tests.lagged_plant import lagged
 from tests.methods.policies import random_policy
 from tests.test_strange_grid import HORIZON, grid
@@ -49,7 +49,7 @@ def strange() -> Case:
 def folder(strange: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results with a Koopman model, and policies of random weights: what they promise holds for any."""
     results = tmp_path_factory.mktemp("contract")
-    nominal_model(strange).save(ResultsFolder(results).model("koopman"))
+    linear_model(strange).save(ResultsFolder(results).model("koopman"))
     for method in trainable():
         random_policy(method, strange, horizon=HORIZON).save(policy_file(results, method, REGIME))
     return results

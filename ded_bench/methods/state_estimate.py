@@ -7,8 +7,6 @@ what it has of that. So with a forecast that comes true the estimate is the plan
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ded_bench.plants.plant import Plant, PlantState, SimulationError
@@ -36,14 +34,6 @@ def passed_s(instance: Instance, in_force: Schedule | None, given: Schedule) -> 
     return passed if np.abs(given.at(ahead + passed) - in_force.p[:-1]).max() <= SAME else None
 
 
-class _Given(NamedTuple):
-    """A plan, and what it was made for."""
-
-    instance: Instance
-    state: PlantState
-    schedule: Schedule
-
-
 class StateEstimate:
     """Estimates of one plant's states, from plan to plan.
 
@@ -53,7 +43,8 @@ class StateEstimate:
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
-        self._given: _Given | None = None
+        #: A plan, and what it was made for.
+        self._given: tuple[Instance, PlantState, Schedule] | None = None
 
     def initial(self, instance: Instance, in_force: Schedule | None) -> PlantState:
         """The state at t = 0.
@@ -70,7 +61,7 @@ class StateEstimate:
 
     def keep(self, instance: Instance, state: PlantState, schedule: Schedule | None) -> None:
         """Remember the plan that was given for an instance and a state."""
-        self._given = None if schedule is None else _Given(instance, state, schedule)
+        self._given = None if schedule is None else (instance, state, schedule)
 
     def _ahead(self, in_force: Schedule | None) -> PlantState:
         """What the last plan has led to at the instance's t = 0; None if another one is in force."""

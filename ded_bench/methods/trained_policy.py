@@ -171,18 +171,27 @@ def weights_fingerprint(weights: Weights) -> str:
     return hashlib.sha256(b"".join(value.tobytes() for value in weights.values())).hexdigest()[:12]
 
 
-def as_solver(scope: Scope, answer: Callable[[Instance], Schedule], iterations: int | None = None) -> Solver:
+def as_solver(policy: TrainedPolicy, answer: Callable[[Instance], Array], iterations: int = 0) -> Solver:
     """Return a policy as a method; `solve_s` is all from the instance to the powers at the knots.
 
     What the first answer costs (compilation, libraries, tables) is paid here, by a draw of policy training,
     so that no answer is computed twice.
+
+    Args:
+        policy: whose scope is checked.
+        answer: powers at its knots, (n_knots, n_gen), pu.
+        iterations: what rows tell of them, if there are any.
     """
+    scope = policy.scope
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
-        schedule = answer(instance)
+        scope.check([instance])
+        schedule = Schedule(policy.knots, answer(instance))
         elapsed = time.perf_counter() - started
-        return Solution(Status.POLICY, schedule, iterations, solve_s=elapsed, solver_version=SOLVER_VERSION)
+        return Solution(
+            Status.POLICY, schedule, iterations or None, solve_s=elapsed, solver_version=SOLVER_VERSION
+        )
 
     instance = sample_instance(scope.case, POLICY_SEED, 0, servable)
     solve(instance.model_copy(update={"horizon_s": scope.horizon_s}))

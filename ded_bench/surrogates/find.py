@@ -18,7 +18,7 @@ from ded_bench.problem.instance import Instance, LoadPoints, State
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 
 if TYPE_CHECKING:
     from ded_bench.plants.detailed.coarse import CoarsePlant
@@ -147,7 +147,7 @@ def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
         problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {known}"
         raise InputError("--model", name, problem)
     path = find_model_file(case, name, search)
-    return nominal_model(case) if path is None else Koopman.load(path, case)
+    return linear_model(case) if path is None else Koopman.load(path, case)
 
 
 def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | None:

@@ -26,7 +26,7 @@ from ded_bench.problem.lossless_case import lossless
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instances
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import EnergyForm, discretised, energy_form, injection_lift, steady_state
+from ded_bench.surrogates.linear import EnergyForm, energy_form, physical_model, steady_state
 
 #: Range of a uniform draw.
 Span = tuple[float, float]
@@ -36,7 +36,6 @@ Span = tuple[float, float]
 class Trajectories:
     """Simulated trajectories side by side, time first."""
 
-    kinds: tuple[str, ...]
     inputs: Array  # (n_points, batch, n_gen + n_load), pu
     theta_initial: Array  # (batch, n_bus), rad
     theta: Array  # of the generators, (n_points, batch, n_gen), rad
@@ -67,20 +66,18 @@ def sample_trajectories(
         InputError: it cannot follow most of them.
     """
     mix = mix or list(KINDS)
-    kinds, runs = [], []
+    runs = []
     for i, instance in enumerate(sample_instances(case, KOOPMAN_SEED + seed, count, first, servable)):
-        kind = mix[i % len(mix)]
         rng = np.random.default_rng(np.random.SeedSequence([KOOPMAN_SEED + seed, first + i, 1]))
-        schedule = Schedule(instance.grid, KINDS[kind](case, instance, rng))
+        schedule = Schedule(instance.grid, KINDS[mix[i % len(mix)]](case, instance, rng))
         with contextlib.suppress(SimulationError):
             runs.append(_signals(simulate(case, instance, schedule)))
-            kinds.append(kind)
     if 2 * len(runs) < count:
         lost = f"the system cannot follow {count - len(runs)} of {count} drawn schedules"
         raise InputError(f"case {case.id}", "", f"{lost}: the power flow has no solution")
     inputs, initial, *signals = zip(*runs, strict=True)
     stacked = (np.stack(signal, axis=1) for signal in signals)
-    return Trajectories(tuple(kinds), np.stack(inputs, axis=1), np.stack(initial), *stacked)
+    return Trajectories(np.stack(inputs, axis=1), np.stack(initial), *stacked)
 
 
 def tracking(
@@ -183,7 +180,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
         return make_model(case, start, {"seed": seed, "trajectories": 0})
     count = n_training(case) if count is None else count
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
-    training: dict[str, int | float] = {"seed": seed, "trajectories": len(data.kinds)}
+    training: dict[str, int | float] = {"seed": seed, "trajectories": data.inputs.shape[1]}
 
     def residuals(x: Array) -> Array:
         unit = np.append(np.full(len(network.generators), OMEGA_UNIT), SLACK_UNIT)
@@ -206,19 +203,7 @@ def held_out(case: Case, seed: int = 0, count: int = HELD_OUT) -> Trajectories:
 
 def make_model(case: Case, form: EnergyForm, training: dict[str, int | float] | None = None) -> Koopman:
     """The Koopman model with the parameters of an energy form."""
-    b = steady_state(case)
-    k, g = discretised(form.generator(), b, form.feedthrough, case.sampling.dt_s)
-    return Koopman(
-        kind="koopman",
-        case_id=case.id,
-        case_fingerprint=case.fingerprint,
-        dt_s=case.sampling.dt_s,
-        k=k,
-        b=b,
-        g=g,
-        lift=injection_lift(case),
-        training=training or {},
-    )
+    return physical_model(case, "koopman", form.generator(), form.feedthrough, training or {})
 
 
 def _is_small(case: Case) -> bool:

@@ -91,7 +91,8 @@ def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: i
         loss.backward()
         optimiser.step()
         schedule.step()
-    training = {"seed": seed, "trajectories": len(data.kinds), "steps": steps, "one_step_loss": loss.item()}
+    training = {"seed": seed, "trajectories": data.inputs.shape[1], "steps": steps}
+    training["one_step_loss"] = loss.item()
     return _in_original_units(case, model, offset, scale, training)
 
 

@@ -7,7 +7,8 @@ generators' f determine each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -94,54 +95,56 @@ def injection_lift(case: Case) -> Array:
     return lift
 
 
-def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
-    """The linearisation at the nominal point, exactly discretised, with the linearised P_s and N of x_0.
+def physical_model(
+    case: Case,
+    kind: str,
+    rates: Array,
+    feedthrough: Array,
+    training: dict[str, Any],
+    dt_s: float | None = None,
+) -> Koopman:
+    """A model dψ/dt = A (ψ - B P) + F dP/dt, exactly discretised, that starts with the true P_s and N = f(θ).
 
-    At an equilibrium away from the nominal point it does not start where it rests; `nominal_model` does.
+    It rests at every equilibrium of the nonlinear system, with the true slack power.
 
     Args:
         case: the grid.
+        kind: of the model.
+        rates: A, (2 n_gen, 2 n_gen), 1/s.
+        feedthrough: F, (2 n_gen, n_in).
+        training: facts of where A and F are from.
         dt_s: step, s; the case's own by default.
     """
-    dt_s = case.sampling.dt_s if dt_s is None else dt_s
-    network = Network(case)
-    theta = network.power_flow(case.p_nominal, case.load_nominal)
-    linear = network.linearise(theta)
-    n, n_bus = len(case.generators), network.n_bus
-    mix = injections_from_generators(n)
-    a = np.zeros((2 * n, 2 * n))
-    a[:n, :n] = -np.diag(linear.d / linear.m)
-    a[:n, n:] = -np.linalg.inv(mix) / linear.m[:, None]
-    a[n:, :n] = mix @ linear.stiffness
-    b = steady_state(case)
-    k, g = discretised(a, b, energy_form(case, theta).feedthrough, dt_s)
-    # f_gen ≈ f* + S (θ_gen - θ*) + T (P_load - L*); P_s = -Σ f_gen - Σ P_load.
-    angle = np.zeros((n, n_bus))
-    angle[:, network.generators] = linear.stiffness
-    f_start = network.injections(theta)[network.generators]
-    base = f_start - angle @ theta - linear.share @ case.load_nominal
-    lift = np.zeros((2 * n, 2 * n_bus + n + len(case.loads) + 1))
-    lift[:n, 2 * n_bus : 2 * n_bus + n] = np.eye(n)
-    lift[n:, n_bus : 2 * n_bus] = mix @ angle
-    lift[n:, 2 * n_bus + n : -1] = mix @ linear.share
-    lift[n, 2 * n_bus + n : -1] -= 1.0
-    lift[n:, -1] = mix @ base
+    dt_s, b = case.sampling.dt_s if dt_s is None else dt_s, steady_state(case)
+    k, g = discretised(rates, b, feedthrough, dt_s)
     return Koopman(
-        kind="linear",
+        kind=kind,
         case_id=case.id,
         case_fingerprint=case.fingerprint,
         dt_s=dt_s,
         k=k,
         b=b,
         g=g,
-        lift=lift,
-        training={"source": "linearisation at the nominal point"},
+        lift=injection_lift(case),
+        training=training,
     )
 
 
-def nominal_model(case: Case) -> Koopman:
-    """The surrogate `linear`: the linearisation at the nominal point, with the true P_s and N = f(θ) of x_0.
+def by_angles(case: Case) -> Array:
+    """By how much ψ changes at the nominal point with the generators' angles, (2 n_gen, n_gen), per rad."""
+    network, n = Network(case), len(case.generators)
+    linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
+    return np.vstack([np.zeros((n, n)), injections_from_generators(n) @ linear.stiffness])
 
-    It rests at every equilibrium of the nonlinear system, with the true slack power.
-    """
-    return replace(linear_model(case), lift=injection_lift(case))
+
+def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
+    """The surrogate `linear`: the linearisation at the nominal point; `dt_s` as in `physical_model`."""
+    network, n = Network(case), len(case.generators)
+    theta = network.power_flow(case.p_nominal, case.load_nominal)
+    linear = network.linearise(theta)
+    rates = np.zeros((2 * n, 2 * n))
+    rates[:, :n] = by_angles(case)
+    rates[:n, :n] -= np.diag(linear.d / linear.m)
+    rates[:n, n:] = -np.linalg.inv(injections_from_generators(n)) / linear.m[:, None]
+    facts = {"source": "linearisation at the nominal point"}
+    return physical_model(case, "linear", rates, energy_form(case, theta).feedthrough, facts, dt_s)

@@ -9,13 +9,13 @@ import pytest
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 
 
 @pytest.fixture(scope="module")
 def koopman(case: Case) -> Koopman:
     """The linearisation, starting from exact equilibria."""
-    return nominal_model(case)
+    return linear_model(case)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import SOLVERS, OnArrays
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 from tests.methods.on_surrogates import METHODS, check_limits, replay, short
 
 NAMES = ("ded-ko", "ded-ko-knots")
@@ -102,7 +102,7 @@ def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_only_just_impossible_is_infeasible_too(method, ninebus: Case) -> None:
     """On a model that answers loads a step late, this instance's frequency cannot be held in time."""
-    late = nominal_model(ninebus)
+    late = linear_model(ninebus)
     late = dataclasses.replace(late, g=np.zeros_like(late.g))
     solution = method.prepare_with(ninebus, late, "TO", Settings())(short(ninebus, 2))
     assert solution.status == Status.INFEASIBLE
@@ -136,10 +136,10 @@ def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> N
 def test_prepare_finds_the_model_that_the_settings_name(name: str, case: Case) -> None:
     settings, instance, method = Settings(model="linear"), short(case, 0), get_method(name)
     assert method.artifacts(case, "NO", settings) == (
-        Artifact("model", "linear", nominal_model(case).fingerprint),
+        Artifact("model", "linear", linear_model(case).fingerprint),
     )
     solution = method.prepare(case, "NO", settings)(instance)
-    check_limits(case, nominal_model(case), instance, solution, "NO")
+    check_limits(case, linear_model(case), instance, solution, "NO")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -164,7 +164,7 @@ def test_only_piqp_solves_what_is_made_for_each_instance(ninebus: Case) -> None:
 
 
 def test_a_lifted_models_knots_answer_as_its_own_rollout(case: Case) -> None:
-    instance, surrogate = short(case, 1), nominal_model(case)
+    instance, surrogate = short(case, 1), linear_model(case)
     points = np.array([0, 40, 41, 120, 300])
     model = surrogate.along(case, instance, slow_dispatch(case, instance, points), points)
     u = np.random.default_rng(2).normal(scale=0.02, size=model.p_gen.shape)

@@ -15,7 +15,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 from tests.methods.on_surrogates import HORIZON, check_limits, replay, short
 
 
@@ -91,7 +91,7 @@ def test_knots_reach_the_optimum_of_the_program_with_all_rows(
 
 def test_in_operation_what_is_infeasible_is_exceeded_least(ninebus: Case) -> None:
     """A start beyond the bound: no schedule, but in operation the one of least excess; honest in both."""
-    koopman = nominal_model(ninebus)
+    koopman = linear_model(ninebus)
     instance, bound = short(ninebus, 0), ninebus.omega_bound("TO")
     omega = {bus: 1.2 * bound for bus in ninebus.generators}
     instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": omega})})

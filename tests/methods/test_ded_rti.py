@@ -20,7 +20,7 @@ from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 from ded_bench.run.bench import timed
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.linear import nominal_model
+from ded_bench.surrogates.linear import linear_model
 from tests.methods.on_surrogates import replay, short
 from tests.methods.test_ded_ko_knots import least_excess
 
@@ -63,7 +63,7 @@ def test_plans_in_operation_keep_the_margin(case: Case, koopman) -> None:
 
 def test_what_is_infeasible_is_exceeded_little(ninebus: Case) -> None:
     """A start beyond the bound: the plan says so, and its total excess is nearly the least there is."""
-    koopman = nominal_model(ninebus)
+    koopman = linear_model(ninebus)
     bound, instance = ninebus.omega_bound("TO"), short(ninebus, 0)
     beyond = instance.initial.model_copy(update={"omega": dict.fromkeys(ninebus.generators, 1.2 * bound)})
     instance = instance.model_copy(update={"initial": beyond})

@@ -8,10 +8,9 @@ import torch
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance, LoadPoints
-from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.linear import by_angles, linear_model
 from tests.methods.policies import short_instances, staged_network
 
 HORIZON = 4.0
@@ -54,11 +53,8 @@ def test_the_response_is_the_linear_models(case: Case) -> None:
     theta[0] = 0.0
     loads = -rng.uniform(0.5, 1.5, (3, len(response.nodes), n_load))
     powers = rng.uniform(0.5, 1.5, (3, case.n_knots, n_gen))
-    loads[:, 0], powers[:, 0] = case.load_nominal, case.p_nominal  # where the model's angles are exact
-    network = Network(case)
-    angles = np.tile(network.power_flow(case.p_nominal, case.load_nominal), (3, 1))
-    angles[:, network.generators] += theta
-    psi = fine.observables(network, angles, omega, loads[:, 0])
+    psi = np.concatenate([powers[:, 0], loads[:, 0]], axis=1) @ fine.b.T + theta @ by_angles(case).T
+    psi[:, :n_gen] += omega
     seen = response(response.free_response(np.hstack([theta, omega]), loads), powers).reshape(
         3, case.n_knots, 2, n_gen + 1
     )

@@ -10,13 +10,12 @@ from ded_bench.methods.dpc.refinement import PARTS, BoundKeeper, predict
 from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import search_folders
-from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.linear import by_angles, linear_model
 
 #: Bounds so tight that every schedule exceeds them.
 TIGHT = 1e-3
@@ -66,11 +65,10 @@ def test_the_prediction_is_the_linear_models(case: Case) -> None:
     points = np.linspace(0.0, case.sampling.horizon_s, PARTS * (case.n_knots - 1) + 1)
     knots, n_gen = case.knot_times(case.sampling.horizon_s), len(case.generators)
     model = linear_model(case, float(points[1]))
-    angles = len(case.buses) + Network(case).generators
     for b, omega in enumerate(omega_of(keeper, inputs, p_gen)):
         powers = np.stack([np.interp(points, knots, column) for column in p_gen[b].T], axis=1)
         both = np.hstack([powers, inputs[b : b + 1].p_load(points)[0]])
-        psi = both[0] @ model.b.T + model.lift[:, angles] @ inputs.delta[b]
+        psi = both[0] @ model.b.T + by_angles(case) @ inputs.delta[b]
         psi[:n_gen] += inputs.omega[b]
         np.testing.assert_allclose(omega.T, model.rollout(psi, both)[:, :n_gen], atol=1e-12)
     change = random_powers(case, inputs, 0.3) - p_gen

@@ -30,11 +30,11 @@ from ded_bench.surrogates.identify import (
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import (
     EPSILON,
+    by_angles,
     discretised,
     energy_form,
     injection_lift,
     linear_model,
-    nominal_model,
     steady_state,
 )
 from tests.methods.on_surrogates import replay
@@ -71,7 +71,7 @@ def test_models_rest_at_the_equilibria_of_the_nonlinear_system(name: str) -> Non
         p_gen = rng.uniform(case.p_min, case.p_max)
         p_load = case.load_nominal * rng.uniform(0.95, 1.05, len(case.loads))
         theta = network.power_flow(p_gen, p_load)
-        for model in (nominal_model(case), make_model(case, nominal_form(case))):
+        for model in (linear_model(case), make_model(case, nominal_form(case))):
             psi = model.observables(network, theta, np.zeros(len(p_gen)), p_load)
             np.testing.assert_allclose(psi, b @ np.concatenate([p_gen, p_load]), atol=1e-10)
             np.testing.assert_array_equal(model.b, b)
@@ -85,6 +85,21 @@ def test_energy_form_starts_at_the_linearisation(case: Case) -> None:
     modes = Network(case).linearise(Network(case).power_flow(case.p_nominal, case.load_nominal)).modes()
     rates = np.log(np.linalg.eigvals(linear.k)) / linear.dt_s
     np.testing.assert_allclose(np.sort_complex(rates), np.sort_complex(modes), atol=1e-8)
+
+
+def test_derivatives_by_angles_are_difference_quotients(case: Case) -> None:
+    """Of ψ at the nominal point, where the loads are served; the differences err by their square."""
+    network, model, size = Network(case), linear_model(case), 1e-4
+    found, loads = by_angles(case), network.load_injections(case.load_nominal)
+    theta = np.tile(network.power_flow(case.p_nominal, case.load_nominal), (2, 1))
+    for g, bus in enumerate(network.generators):
+        moved = theta.copy()
+        moved[:, bus] += [size, -size]
+        moved, _ = network.solve_loads(moved, np.stack([loads, loads]))
+        psi = model.observables(
+            network, moved, np.zeros((2, len(case.generators))), np.zeros((2, len(case.loads)))
+        )
+        np.testing.assert_allclose(found[:, g], (psi[0] - psi[1]) / (2 * size), rtol=1e-5, atol=1e-5)
 
 
 def test_linear_model_is_exact_to_second_order(case: Case, quiet_instance) -> None:
@@ -130,6 +145,9 @@ def test_identified_model_beats_the_linearisation(case: Case) -> None:
     assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0
     network, data = Network(case), held_out(case, seed=5, count=8)
     ours, linear = (rollout_errors(one, network, data) for one in (model, linear_model(case)))
+    if model.training["trajectories"] == 0:  # of a larger grid: it is the linearisation, but for EPSILON
+        assert ours[0] == pytest.approx(linear[0], rel=1e-3)
+        return
     assert ours[0] < linear[0]
     assert ours[1] < linear[1]
 
@@ -153,7 +171,7 @@ def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkey
 
     monkeypatch.setattr("ded_bench.surrogates.identify.simulate", failing(3))
     part = sample_trajectories(case, seed=1, count=6)
-    assert part.kinds == tuple(complete.kinds[k] for k in (1, 2, 4, 5))
+    assert part.inputs.shape[1] == 4
     assert (part.omega == complete.omega[:, [1, 2, 4, 5]]).all()
     assert (part.theta_initial == complete.theta_initial[[1, 2, 4, 5]]).all()
     monkeypatch.setattr("ded_bench.surrogates.identify.simulate", failing(1))

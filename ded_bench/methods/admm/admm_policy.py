@@ -26,7 +26,6 @@ from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 
 VERSION = 1
 #: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
@@ -72,8 +71,7 @@ class AdmmPolicy(TrainedPolicy):
         return self.powers(self.problems(instances))
 
     def problems(self, instances: Sequence[Instance]) -> StackedInstances:
-        """Instances as arrays; InputError if the policy is not for them, or they cannot be served."""
-        self.scope.check(instances)
+        """Instances within the scope as arrays; InputError if one has angles without an equilibrium."""
         try:
             return problems_of(self.scope.case, instances, self.grid.points)
         except SimulationError as error:
@@ -119,15 +117,11 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     iterations = read_options(Options, settings.options).iterations
     if case.slack is None:
         island = IslandPolicy.find(case, regime, settings)
-
-        def set_points(instance: Instance) -> Schedule:
-            return Schedule(island.knots, island.powers(instance, iterations))
-
-        return as_solver(island.scope, set_points, iterations or None)
+        return as_solver(island, lambda instance: island.powers(instance, iterations), iterations)
     policy = AdmmPolicy.find(case, regime, settings)
     further = policy.further(iterations) if iterations else None
 
-    def answer(instance: Instance) -> Schedule:
-        return Schedule(policy.knots, policy.powers(policy.problems([instance]), further)[0])
+    def answer(instance: Instance) -> Array:
+        return policy.powers(policy.problems([instance]), further)[0]
 
-    return as_solver(policy.scope, answer, iterations or None)
+    return as_solver(policy, answer, iterations)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
-from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules, time_grid
+from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, set_jacobian, solve_algebraic
 from ded_bench.plants.lossless.network import Network
@@ -72,7 +72,8 @@ class ModalGrid:
     def __init__(self, case: Case, bound: float, horizon_s: float) -> None:
         self.case, self.bound, self.network = case, bound, Network(case)
         self.knots = knots = case.knot_times(horizon_s)
-        self.points = time_grid(knots)  # (n_points,), s
+        #: The time grid: knots and points between them, (n_points,), s.
+        self.points = np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
         self.spacing = float(knots[1] - knots[0])
         self.ramp = case.ramp * self.spacing
         self._linearise_nominal()

@@ -38,11 +38,6 @@ def problems_of(case: Case, instances: Sequence[Instance], points: Array) -> Sta
     return dataclasses.replace(given, load=sampled(given.load, points))
 
 
-def time_grid(knots: Array) -> Array:
-    """The knots and equidistant points between them, (n_points,), s."""
-    return np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
-
-
 def draw(case: Case, bound: float, points: Array, master: int, first: int, count: int) -> StackedInstances:
     """Draw problems: the benchmark's instances; every fourth becomes one of the closed loop.
 

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.surrogates.koopman import hat_functions
-from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.linear import by_angles, linear_model
 
 Array32 = NDArray[np.float32]
 #: Costs whose sum is smaller are as good as free.
@@ -59,7 +58,7 @@ class Response:
         for i in range(n_gen):
             unit_powers[:, i, :, i] = hat_functions(nodes, knots)
         psi = inputs[0] @ model.b.T
-        psi[:n_gen] += model.lift[:, case.n_bus + Network(case).generators].T
+        psi[:n_gen] += by_angles(case).T
         psi[n_gen : 2 * n_gen, :n_gen] += np.eye(n_gen)
         outputs = model.rollout(psi, inputs)[:, :, : n_gen + 1]
         before = np.concatenate([outputs[:1], outputs[1::2]])

@@ -21,7 +21,6 @@ from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.methods.training_record import DEFAULT_MODEL
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.find import find_model
 
 VERSION = 1
@@ -86,16 +85,15 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     policy = DispatchPolicy.find(case, regime, settings)
     steps = read_options(Options, settings.options).refine
     if not steps:
-        return as_solver(policy.scope, lambda instance: policy(instance)[0])
+        return as_solver(policy, lambda instance: policy.answers([instance])[0])
     model = find_model(case, settings.model or DEFAULT_MODEL, settings.search)
     refiners: dict[tuple[float, int], Refiner] = {}
 
-    def answer(instance: Instance) -> Schedule:
-        policy.scope.check([instance])
+    def answer(instance: Instance) -> Array:
         grid = instance.dt_s, instance.steps
         if grid not in refiners:
             refiners[grid] = Refiner(case, model, regime, instance.grid, policy.knots)
         inputs = StackedInstances.of(case, [instance])
-        return Schedule(policy.knots, refiners[grid](inputs, policy.powers(inputs), steps)[0])
+        return refiners[grid](inputs, policy.powers(inputs), steps)[0]
 
-    return as_solver(policy.scope, answer, steps)
+    return as_solver(policy, answer, steps)

@@ -30,7 +30,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import largest_divisor
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
-from ded_bench.surrogates.linear import linear_model
+from ded_bench.surrogates.linear import by_angles, linear_model
 
 Array32 = NDArray[np.float32]
 #: Spacing of the points at which P_s and ω are taken, s. Frequencies are below 0.25 Hz.
@@ -188,7 +188,7 @@ class BoundKeeper:
         of_change = linear.g - linear.b
         self.model = OmegaModel(
             linear.k,
-            np.ascontiguousarray(linear.lift[:, case.n_bus + Network(case).generators]),
+            by_angles(case),
             np.ascontiguousarray(of_change[:, :n_gen]),
             np.ascontiguousarray(of_change[:, n_gen:]),
         )

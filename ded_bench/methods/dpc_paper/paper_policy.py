@@ -62,7 +62,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         InputError: there is no policy (names the command that trains one), or it does not fit.
     """
     policy = PaperPolicy.find(case, regime, settings)
-    return as_solver(policy.scope, lambda instance: policy(instance)[0])
+    return as_solver(policy, lambda instance: policy.answers([instance])[0])
 
 
 def n_channels(case: Case) -> int:

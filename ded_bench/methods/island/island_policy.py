@@ -57,10 +57,9 @@ class IslandPolicy(TrainedPolicy):
         """Set-points at the knots, (n_knots, n_gen), pu.
 
         Args:
-            instance: to answer.
+            instance: to answer, within the scope.
             further: iterations with costs along the answer, after which it is mended again.
         """
-        self.scope.check([instance])
         try:
             asked = self.grid.ask(instance)
         except SimulationError as error:

@@ -168,7 +168,6 @@ class Identified(AlongTrajectory):
 
     def along(
         self,
-        case: Case,
         instance: Instance,
         p_gen: Array,
         points: Indices,
@@ -177,8 +176,8 @@ class Identified(AlongTrajectory):
     ) -> TimeVarying:
         """See `AlongTrajectory.along`; for instances at rest, on a grid of STEP_S."""
         f, g, h, by_load, reset = self._maps
-        n_gen, n = len(case.generators), len(f)
-        load = instance.p_load(case)
+        case, n = self.plant.case, len(f)
+        n_gen, load = len(case.generators), instance.p_load(case)
         load -= load[0]
         force = np.hstack([load[1:], *delayed(load, self.variant.delays)]) @ by_load
         p_set = Schedule(instance.grid[points], p_gen).at(instance.grid) - instance.p_initial(case)
@@ -260,7 +259,7 @@ def rollout(case: Case, model: AlongTrajectory, instance: Instance, schedule: Sc
     """What a model says of ω every STEP_S, (n, n_gen), rad/s."""
     known = coarse(instance) if isinstance(model, Identified) else instance
     points = case_knots(case, known)
-    told = model.along(case, known, schedule.at(known.grid[points]), points).omega
+    told = model.along(known, schedule.at(known.grid[points]), points).omega
     return told[:: round(STEP_S / known.dt_s)]
 
 

@@ -74,7 +74,7 @@ def _train_ko(a: argparse.Namespace) -> int:
 
     model = (identify_paper if is_paper else identify)(case, a.seed, a.count)
     model.save(out)
-    omega, p_slack = rollout_errors(model, Network(case), held_out(case, a.seed))
+    omega, p_slack = rollout_errors(model, held_out(case, a.seed))
     held = f"{omega / (2 * math.pi):.3g} Hz at most, P_s by {p_slack:.3g} pu rms, on held-out trajectories"
     print(f"wrote {out}: ω errs by {held}")
     return 0

@@ -21,7 +21,6 @@ from ded_bench.methods.ded import add_powers, add_ramps_and_cost, schedule_of, s
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution, Solver, answer, too_large
 from ded_bench.methods.surrogate_program import solve_on_surrogate
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.compile import SOLVERS, OnArrays, fix
@@ -177,7 +176,7 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
 
 def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
     """Give a built model the data of one instance: solvers of linear programs need no first values."""
-    psi = koopman.initial(Network(case), [instance])[0].tolist()
+    psi = koopman.initial([instance])[0].tolist()
     bound, n_gen = case.omega_bound(regime), len(case.generators)
     set_powers(m, case, instance, psi[n_gen])
     for i, k in itertools.product(range(n_gen), m.point):

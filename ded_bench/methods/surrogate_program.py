@@ -76,7 +76,7 @@ def solve_on_surrogate(
         rows = Rows(left, left, soft=True)
 
     def follow(p_gen: Array) -> TimeVarying:
-        return surrogate.along(case, instance, p_gen, points, plan is None, plan and plan.state)
+        return surrogate.along(instance, p_gen, points, plan is None, plan and plan.state)
 
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built

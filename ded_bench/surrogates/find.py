@@ -46,7 +46,6 @@ class AlongTrajectory:
 
     def along(
         self,
-        case: Case,
         instance: Instance,
         p_gen: Array,
         points: Indices,
@@ -63,7 +62,7 @@ class AlongTrajectory:
             SimulationError: the system cannot follow these powers.
         """
         schedule = Schedule(t=instance.grid[points], p=p_gen)
-        run = simulate(case, instance, schedule, self.plant, state, exact)
+        run = simulate(self.plant.case, instance, schedule, self.plant, state, exact)
         return self.plant.linearise_along(run, points)
 
 
@@ -81,7 +80,6 @@ class AtNominalPoint(AlongTrajectory):
 
     def along(
         self,
-        case: Case,
         instance: Instance,
         p_gen: Array,
         points: Indices,
@@ -94,7 +92,7 @@ class AtNominalPoint(AlongTrajectory):
         start = self.plant.initial(instance) if state is None else state
         key = points.tobytes(), start.next_s
         if key not in self._made:
-            self._made[key] = self._at_rest(case, instance, points, start.next_s)
+            self._made[key] = self._at_rest(instance, points, start.next_s)
         model, dt_s = self._made[key], instance.dt_s
         coarse = self._coarse.setdefault(dt_s, CoarsePlant(self.plant.system, dt_s))
         p_set = Schedule(instance.grid[points], p_gen).at(instance.grid)
@@ -103,9 +101,9 @@ class AtNominalPoint(AlongTrajectory):
         told = model.delivered._replace(p_gen=delivered)
         return replace(model, omega=omega, p_gen=p_gen, delivered=told)
 
-    def _at_rest(self, case: Case, instance: Instance, points: Indices, next_s: float) -> TimeVarying:
+    def _at_rest(self, instance: Instance, points: Indices, next_s: float) -> TimeVarying:
         """Maps of set-points along the nominal equilibrium."""
-        system = self.plant.system
+        case, system = self.plant.case, self.plant.system
         power = system.network.nominal().power.real[system.scheduled]
         nominal = zip(case.loads, case.load_nominal.tolist(), strict=True)
         load = {bus: LoadPoints(points=((0.0, p), (instance.horizon_s, p))) for bus, p in nominal}

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -184,7 +183,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
 
     def residuals(x: Array) -> Array:
         unit = np.append(np.full(len(network.generators), OMEGA_UNIT), SLACK_UNIT)
-        error = predict(make_model(case, unpack(start, x)), network, data) - data.outputs
+        error = predict(make_model(case, unpack(start, x)), data) - data.outputs
         return np.asarray((error[::STRIDE] / unit).ravel())
 
     result = least_squares(residuals, np.zeros(n_parameters(*start.feedthrough.shape)), max_nfev=EVALUATIONS)
@@ -214,13 +213,13 @@ def unpack(start: EnergyForm, x: Array) -> EnergyForm:
     """The form whose parameters differ from `start` by x; any x is admissible."""
     n = len(start.skew)
     strict, lower = np.tril_indices(n, -1), np.tril_indices(n)
-    skew, dissipation, energy, feed = np.split(x, np.cumsum([len(strict[0]), len(lower[0]), len(lower[0])]))
-    return EnergyForm(
-        _shifted(start.skew, strict, skew),
-        _shifted(start.dissipation, lower, dissipation),
-        _shifted(start.energy, lower, energy),
-        start.feedthrough + feed.reshape(start.feedthrough.shape),
-    )
+    places = strict, lower, lower
+    *changes, feed = np.split(x, np.cumsum([len(rows) for rows, _ in places]))
+    skew, dissipation, energy = (part.copy() for part in (start.skew, start.dissipation, start.energy))
+    for matrix, entries, change in zip((skew, dissipation, energy), places, changes, strict=True):
+        matrix[entries] += change
+    feedthrough = start.feedthrough + feed.reshape(start.feedthrough.shape)
+    return EnergyForm(skew, dissipation, energy, feedthrough)
 
 
 def n_parameters(n: int, n_in: int) -> int:
@@ -228,20 +227,14 @@ def n_parameters(n: int, n_in: int) -> int:
     return n * (n - 1) // 2 + n * (n + 1) + n * n_in
 
 
-def predict(model: Koopman, network: Network, data: Trajectories) -> Array:
+def predict(model: Koopman, data: Trajectories) -> Array:
     """The model's (ω, P_s) under the inputs of trajectories, shape (n_points, batch, n_gen + 1)."""
-    n_gen = len(network.generators)
-    psi = model.observables(network, data.theta_initial, data.omega[0], data.inputs[0, :, n_gen:])
+    n_gen = data.omega.shape[-1]
+    psi = model.observables(data.theta_initial, data.omega[0], data.inputs[0, :, n_gen:])
     return model.rollout(psi, data.inputs)[..., : n_gen + 1]
 
 
-def rollout_errors(model: Koopman, network: Network, data: Trajectories) -> tuple[float, float]:
+def rollout_errors(model: Koopman, data: Trajectories) -> tuple[float, float]:
     """Largest |Δω| (rad/s) and root mean square of ΔP_s (pu) of a model's rollouts of trajectories."""
-    error = predict(model, network, data) - data.outputs
+    error = predict(model, data) - data.outputs
     return float(np.abs(error[..., :-1]).max()), float(np.sqrt(np.square(error[..., -1]).mean()))
-
-
-def _shifted(matrix: Array, entries: tuple[Any, ...], values: Array) -> Array:
-    result = matrix.copy()
-    result[entries] += values
-    return result

@@ -16,6 +16,7 @@ where the free response has ψ_0 and the loads but no generator power (`Condense
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -45,8 +46,7 @@ class Koopman:
     """
 
     kind: str
-    case_id: str
-    case_fingerprint: str
+    case: Case
     dt_s: float
     k: Array  # (n_psi, n_psi)
     b: Array  # (n_psi, n_gen + n_load)
@@ -55,8 +55,14 @@ class Koopman:
     mlp: tuple[tuple[Array, Array], ...] = ()  # (weight, bias) of each layer
     training: dict[str, Any] = field(default_factory=dict)
 
-    def observables(self, network: Network, theta: Array, omega: Array, p_load: Array) -> Array:
+    @functools.cached_property
+    def network(self) -> Network:
+        """Of the case."""
+        return Network(self.case)
+
+    def observables(self, theta: Array, omega: Array, p_load: Array) -> Array:
         """ψ(x), shape (..., n_psi), from angles (..., n_bus), ω (..., n_gen), loads (..., n_load)."""
+        network = self.network
         injections = network.injections(theta)
         one = np.ones((*theta.shape[:-1], 1))
         psi = np.concatenate([injections, theta, omega, p_load, one], axis=-1) @ self.lift.T
@@ -69,13 +75,12 @@ class Koopman:
             psi[..., -len(bias) :] += x @ weight.T + bias
         return psi
 
-    def initial(self, network: Network, instances: Sequence[Instance]) -> Array:
+    def initial(self, instances: Sequence[Instance]) -> Array:
         """ψ(x_0) of instances, shape (batch, n_psi)."""
-        case = network.case
-        theta = np.stack([network.initial_angles(i) for i in instances])
-        omega = np.stack([i.omega_initial(case) for i in instances])
-        p_load = np.stack([i.p_load(case, np.zeros(1))[0] for i in instances])
-        return self.observables(network, theta, omega, p_load)
+        theta = np.stack([self.network.initial_angles(i) for i in instances])
+        omega = np.stack([i.omega_initial(self.case) for i in instances])
+        p_load = np.stack([i.p_load(self.case, np.zeros(1))[0] for i in instances])
+        return self.observables(theta, omega, p_load)
 
     def rollout(self, psi: Array, inputs: Array, columns: slice = slice(None), stride: int = 1) -> Array:
         """Run the model from ψ_0.
@@ -107,7 +112,6 @@ class Koopman:
 
     def along(
         self,
-        case: Case,
         instance: Instance,
         p_gen: Array,
         points: Indices,
@@ -120,7 +124,6 @@ class Koopman:
         on `p_gen` but for round-off.
 
         Args:
-            case: the grid.
             instance: x_0 and the loads.
             p_gen: powers at the knots, shape (n_knots, n_gen), pu.
             points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
@@ -130,11 +133,11 @@ class Koopman:
             InputError: the model was identified at another time step than the instance's.
         """
         self.check_step(instance)
-        n_gen, lengths = len(case.generators), np.diff(points)
-        psi = self.initial(Network(case), [instance])[0]
+        n_gen, lengths = len(self.case.generators), np.diff(points)
+        psi = self.initial([instance])[0]
         steps = np.arange(points[-1] + 1)
         powers = np.stack([np.interp(steps, points, p) for p in p_gen.T], axis=1)
-        outputs = self.rollout(psi, np.hstack([powers, instance.p_load(case)]))
+        outputs = self.rollout(psi, np.hstack([powers, instance.p_load(self.case)]))
         b, h = self.b[:, :n_gen], self.g[:, :n_gen]
         one = Hold(self.k[None], (b - self.k @ b)[None], h[None])
         kinds, kind = np.unique(lengths, return_inverse=True)
@@ -179,8 +182,8 @@ class Koopman:
         header = {
             "schema": SCHEMA,
             "kind": self.kind,
-            "case": self.case_id,
-            "case_fingerprint": self.case_fingerprint,
+            "case": self.case.id,
+            "case_fingerprint": self.case.fingerprint,
             "dt_s": self.dt_s,
             "training": self.training,
         }
@@ -203,8 +206,7 @@ class Koopman:
             mlp = tuple((arrays[f"mlp.{i}.weight"], arrays[f"mlp.{i}.bias"]) for i in range(layers))
             model = Koopman(
                 kind=plain_name(str(header["kind"])),  # it stands in rows, and in the names of files
-                case_id=case.id,
-                case_fingerprint=case.fingerprint,
+                case=case,
                 dt_s=float(header["dt_s"]),
                 training=dict(header["training"]),
                 mlp=mlp,
@@ -269,17 +271,16 @@ class CondensedRollout:
     quadrature_weights: Array  # a sum over the whole grid, taken at the points, (n_points,)
 
     @staticmethod
-    def make(case: Case, model: Koopman, grid: Array, knots: Array, stride: int = 1) -> CondensedRollout:
-        """Condense a model of a case.
+    def make(model: Koopman, grid: Array, knots: Array, stride: int = 1) -> CondensedRollout:
+        """Condense a model.
 
         Args:
-            case: gives the generators.
             model: the surrogate; its step is that of the grid.
             grid: times t_k, shape (n_grid,), s.
             knots: knot times, shape (n_knots,), s.
             stride: outputs are taken at every so many grid points; it divides the number of steps.
         """
-        n_gen, points = len(case.generators), grid[::stride]
+        n_gen, points = len(model.case.generators), grid[::stride]
         hats = hat_functions(grid, knots)
         gamma = np.empty((n_gen + 1, len(points), len(knots), n_gen))
         at_rest = np.zeros((len(knots), len(model.k)))
@@ -309,7 +310,7 @@ def free_response(model: Koopman, psi: Array, p_load: Array, stride: int = 1) ->
     Returns:
         Shape (batch, n_gen + 1, n_points): rad/s, pu.
     """
-    n_gen = model.b.shape[1] - p_load.shape[2]
+    n_gen = len(model.case.generators)
     response = model.rollout(psi, p_load.swapaxes(0, 1), slice(n_gen, None), stride)
     return np.moveaxis(response[..., : n_gen + 1], 0, 2)
 

@@ -124,15 +124,5 @@ def _in_original_units(
     lift = np.zeros((len(unit), 2 * n_bus + n_gen + len(case.loads) + 1))
     lift[:n_gen, 2 * n_bus : 2 * n_bus + n_gen] = np.eye(n_gen)
     lift[n_gen, Network(case).slack] = 1.0
-    return Koopman(
-        kind="koopman-paper",
-        case_id=case.id,
-        case_fingerprint=case.fingerprint,
-        dt_s=case.sampling.dt_s,
-        k=k,
-        b=b,
-        g=(np.eye(len(k)) - k) @ b,
-        lift=lift,
-        mlp=mlp,
-        training=training,
-    )
+    g = (np.eye(len(k)) - k) @ b
+    return Koopman("koopman-paper", case, case.sampling.dt_s, k, b, g, lift, mlp, training)

@@ -117,17 +117,7 @@ def physical_model(
     """
     dt_s, b = case.sampling.dt_s if dt_s is None else dt_s, steady_state(case)
     k, g = discretised(rates, b, feedthrough, dt_s)
-    return Koopman(
-        kind=kind,
-        case_id=case.id,
-        case_fingerprint=case.fingerprint,
-        dt_s=dt_s,
-        k=k,
-        b=b,
-        g=g,
-        lift=injection_lift(case),
-        training=training,
-    )
+    return Koopman(kind, case, dt_s, k, b, g, injection_lift(case), training=training)
 
 
 def by_angles(case: Case) -> Array:

@@ -10,7 +10,6 @@ import pytest
 from ded_bench.methods import ded_ko, ded_ko_knots
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -39,7 +38,7 @@ class Replay(NamedTuple):
 
 def replay(case: Case, koopman: Koopman, instance: Instance, schedule: Schedule) -> Replay:
     p_gen = schedule.at(instance.grid)
-    psi = koopman.initial(Network(case), [instance])[0]
+    psi = koopman.initial([instance])[0]
     out = koopman.rollout(psi, np.hstack([p_gen, instance.p_load(case)]))
     n_gen = len(case.generators)
     p_slack = out[:, n_gen]

@@ -166,7 +166,7 @@ def test_only_piqp_solves_what_is_made_for_each_instance(ninebus: Case) -> None:
 def test_a_lifted_models_knots_answer_as_its_own_rollout(case: Case) -> None:
     instance, surrogate = short(case, 1), linear_model(case)
     points = np.array([0, 40, 41, 120, 300])
-    model = surrogate.along(case, instance, slow_dispatch(case, instance, points), points)
+    model = surrogate.along(instance, slow_dispatch(case, instance, points), points)
     u = np.random.default_rng(2).normal(scale=0.02, size=model.p_gen.shape)
     u[0] = 0.0
     powers = Schedule(instance.grid[points], model.p_gen + u)

@@ -9,7 +9,6 @@ from scipy.optimize import linprog
 from ded_bench.methods import ded_ko_knots, knot_program
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import FormAnswer
@@ -25,8 +24,8 @@ class WholeProgram:
     def __init__(self, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:
         n_gen, grid, bound = len(case.generators), instance.grid, case.omega_bound(regime)
         points = knot_points(case.knot_times(grid[-1]), instance.dt_s)
-        knots, psi = grid[points], koopman.initial(Network(case), [instance])
-        condensed = CondensedRollout.make(case, koopman, grid, knots)
+        knots, psi = grid[points], koopman.initial([instance])
+        condensed = CondensedRollout.make(koopman, grid, knots)
         free = free_response(koopman, psi, instance.p_load(case)[None])[0]
         self.case, self.instance, self.points, self.n_x = case, instance, points, len(knots) * n_gen
         self.weight = np.outer(condensed.hat_weights, instance.cost_gen(case)).ravel()

@@ -101,10 +101,10 @@ def test_channels_are_what_the_paper_lists(case: Case) -> None:
 
 def sequential_loss(case, model, instance, knots, bound, ramp):
     """The paper's loss written out: step by step, in torch, one instance."""
-    network, n_gen = Network(case), len(case.generators)
+    n_gen = len(case.generators)
     k, b, g = (torch.as_tensor(a) for a in (model.k, model.b, model.g))
     times = case.knot_times(instance.horizon_s)
-    psi = torch.as_tensor(model.initial(network, [instance])[0])
+    psi = torch.as_tensor(model.initial([instance])[0])
     p_load = torch.as_tensor(instance.p_load(case))
     cost, c_s = torch.as_tensor(instance.cost_gen(case)), instance.cost_slack(case)
     total = torch.zeros(6, dtype=torch.float64)
@@ -131,7 +131,7 @@ def sequential_loss(case, model, instance, knots, bound, ramp):
 def loss_and_data(case: Case, count: int, bound: float) -> tuple[PaperLoss, Batch]:
     """In double precision."""
     model, instances = linear_model(case), some_instances(case, count)
-    condensed = CondensedRollout.make(case, model, instances[0].grid, case.knot_times(HORIZON))
+    condensed = CondensedRollout.make(model, instances[0].grid, case.knot_times(HORIZON))
     data = Batch.of(case, model, instances)
     data = Batch(*(part.double() for part in data))
     return PaperLoss(condensed, bound, case.ramp * instances[0].dt_s, dtype=torch.float64), data
@@ -163,7 +163,7 @@ def test_the_recipe_is_the_papers_and_nothing_else(threebus: Case, tmp_path: Pat
     policy = train(threebus, regime, instances, tmp_path / "p.safetensors", options)
     assert (policy.training["instances"], policy.training["held_out"]) == (10, 0)
     data = Batch.of(threebus, model, instances)
-    condensed = CondensedRollout.make(threebus, model, instances[0].grid, threebus.knot_times(HORIZON))
+    condensed = CondensedRollout.make(model, instances[0].grid, threebus.knot_times(HORIZON))
     loss = PaperLoss(condensed, threebus.omega_bound(regime), threebus.ramp * instances[0].dt_s)
     torch.manual_seed(3)
     network, order = PaperNetwork(n_channels(threebus), threebus.p_min, threebus.p_max), torch.Generator()

@@ -15,7 +15,6 @@ from ded_bench.methods.dpc.refinement import Refiner, coarse_free_response
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.training_record import policy_file
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import largest_divisor
@@ -44,8 +43,8 @@ def optimum(case: Case, regime: str, instance: Instance) -> float:
     knots = case.knot_times(instance.horizon_s)
     stride = largest_divisor(instance.steps, round(refinement.SPACING_S / instance.dt_s))
     inputs = StackedInstances.of(case, [instance])
-    free = coarse_free_response(Network(case), model, inputs, instance.grid, stride)[0]
-    condensed = CondensedRollout.make(case, model, instance.grid, knots, stride)
+    free = coarse_free_response(model, inputs, instance.grid, stride)[0]
+    condensed = CondensedRollout.make(model, instance.grid, knots, stride)
     n, n_knots = len(condensed.points), len(knots)
     slack, omega = condensed.gamma[n_gen], condensed.gamma[:n_gen].reshape(n * n_gen, -1)
     bound = case.omega_bound(regime) * (1.0 - refinement.MARGIN)
@@ -78,9 +77,9 @@ def condensed_cost(refiner: Refiner, instances: list[Instance], p_gen: np.ndarra
     """Cost of schedules on the coarse points, by the model."""
     case, inputs = refiner.case, StackedInstances.of(refiner.case, instances)
     n_gen = len(case.generators)
-    free = coarse_free_response(refiner.network, refiner.model, inputs, refiner.grid, refiner.stride)
+    free = coarse_free_response(refiner.model, inputs, refiner.grid, refiner.stride)
     knots = case.knot_times(refiner.grid[-1])
-    condensed = CondensedRollout.make(case, refiner.model, refiner.grid, knots, refiner.stride)
+    condensed = CondensedRollout.make(refiner.model, refiner.grid, knots, refiner.stride)
     p_slack = free[:, n_gen] + p_gen.reshape(len(p_gen), -1) @ condensed.gamma[n_gen].T
     generators = (np.einsum("bkg,k->bg", p_gen, condensed.hat_weights) * inputs.cost[:, 1:]).sum(axis=1)
     return generators + inputs.cost[:, 0] * (np.abs(p_slack) @ condensed.quadrature_weights)

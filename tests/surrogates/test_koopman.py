@@ -72,7 +72,7 @@ def test_models_rest_at_the_equilibria_of_the_nonlinear_system(name: str) -> Non
         p_load = case.load_nominal * rng.uniform(0.95, 1.05, len(case.loads))
         theta = network.power_flow(p_gen, p_load)
         for model in (linear_model(case), make_model(case, nominal_form(case))):
-            psi = model.observables(network, theta, np.zeros(len(p_gen)), p_load)
+            psi = model.observables(theta, np.zeros(len(p_gen)), p_load)
             np.testing.assert_allclose(psi, b @ np.concatenate([p_gen, p_load]), atol=1e-10)
             np.testing.assert_array_equal(model.b, b)
 
@@ -96,9 +96,7 @@ def test_derivatives_by_angles_are_difference_quotients(case: Case) -> None:
         moved = theta.copy()
         moved[:, bus] += [size, -size]
         moved, _ = network.solve_loads(moved, np.stack([loads, loads]))
-        psi = model.observables(
-            network, moved, np.zeros((2, len(case.generators))), np.zeros((2, len(case.loads)))
-        )
+        psi = model.observables(moved, np.zeros((2, len(case.generators))), np.zeros((2, len(case.loads))))
         np.testing.assert_allclose(found[:, g], (psi[0] - psi[1]) / (2 * size), rtol=1e-5, atol=1e-5)
 
 
@@ -143,8 +141,8 @@ def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
 def test_identified_model_beats_the_linearisation(case: Case) -> None:
     model = identify(case, seed=5, count=8)
     assert np.abs(np.linalg.eigvals(model.k)).max() < 1.0
-    network, data = Network(case), held_out(case, seed=5, count=8)
-    ours, linear = (rollout_errors(one, network, data) for one in (model, linear_model(case)))
+    data = held_out(case, seed=5, count=8)
+    ours, linear = (rollout_errors(one, data) for one in (model, linear_model(case)))
     if model.training["trajectories"] == 0:  # of a larger grid: it is the linearisation, but for EPSILON
         assert ours[0] == pytest.approx(linear[0], rel=1e-3)
         return
@@ -203,7 +201,7 @@ def test_model_files_round_trip(case: Case, tmp_path: Path) -> None:
     network = Network(case)
     theta = network.power_flow(case.p_nominal, case.load_nominal)
     state = theta, np.full(len(case.generators), 0.01), case.load_nominal
-    np.testing.assert_array_equal(loaded.observables(network, *state), model.observables(network, *state))
+    np.testing.assert_array_equal(loaded.observables(*state), model.observables(*state))
 
 
 def test_model_files_are_checked(ninebus: Case, threebus: Case, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_it_answers_as_the_plant_to_first_order(island: Case, quiet_instance: An
     for size in (1.0, 0.1):
         instance = away(island, quiet_instance, size)
         points, powers = case_knots(island, instance), moved(island, instance, size)
-        told = surrogate.along(island, instance, powers, points)
+        told = surrogate.along(instance, powers, points)
         found = simulate(island, instance, Schedule(instance.grid[points], powers))
         assert told.delivered is not None
         left.append(
@@ -59,7 +59,7 @@ def test_its_maps_are_its_rollout(island: Case, quiet_instance: Any) -> None:
     surrogate, instance = find_surrogate(island, "linear", []), away(island, quiet_instance, 1.0)
     points, powers = case_knots(island, instance), moved(island, instance, 1.0)
     still = np.tile(instance.p_initial(island), (len(points), 1))
-    rest, told = (surrogate.along(island, instance, p, points) for p in (still, powers))
+    rest, told = (surrogate.along(instance, p, points) for p in (still, powers))
     # Steps of the integrator that maps are made of leave 1e-6 of a frequency.
     np.testing.assert_allclose(
         rest.outputs(powers - still)[0], told.omega, atol=1e-6 * np.abs(told.omega).max()
@@ -71,7 +71,7 @@ def test_it_rests_where_the_plant_rests(island: Case, quiet_instance: Any) -> No
     load = {bus: ramp.model_copy(update={"rate": 0.0}) for bus, ramp in instance.load.items()}
     instance, points = instance.model_copy(update={"load": load}), case_knots(island, instance)
     still = np.tile(instance.p_initial(island), (len(points), 1))
-    told = find_surrogate(island, "linear", []).along(island, instance, still, points)
+    told = find_surrogate(island, "linear", []).along(instance, still, points)
     assert np.abs(told.omega).max() < 2 * np.pi * 1e-9
 
 

@@ -122,6 +122,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     further = policy.further(iterations) if iterations else None
 
     def answer(instance: Instance) -> Array:
-        return policy.powers(policy.problems([instance]), further)[0]
+        return np.asarray(policy.powers(policy.problems([instance]), further)[0])
 
     return as_solver(policy, answer, iterations)

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
 from ded_bench.methods.dpc.refinement import BoundKeeper, Refiner
@@ -94,6 +96,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
         if grid not in refiners:
             refiners[grid] = Refiner(case, model, regime, instance.grid, policy.knots)
         inputs = StackedInstances.of(case, [instance])
-        return refiners[grid](inputs, policy.powers(inputs), steps)[0]
+        return np.asarray(refiners[grid](inputs, policy.powers(inputs), steps)[0])
 
     return as_solver(policy, answer, steps)

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import largest_divisor
@@ -52,10 +51,10 @@ class Refiner:
 
     def __init__(self, case: Case, model: Koopman, regime: str, grid: Array, knots: Array) -> None:
         """Condense and factorise."""
-        self.case, self.network, self.model, self.grid = case, Network(case), model, grid
+        self.case, self.model, self.grid = case, model, grid
         n_gen, n_knots = len(case.generators), len(knots)
         self.stride = largest_divisor(len(grid) - 1, round(SPACING_S / model.dt_s))
-        condensed = CondensedRollout.make(case, model, grid, knots, self.stride)
+        condensed = CondensedRollout.make(model, grid, knots, self.stride)
         gamma = condensed.gamma
         self.hat_weights, self.quadrature_weights = condensed.hat_weights, condensed.quadrature_weights
         root = {name: math.sqrt(value) for name, value in WEIGHTS.items()}
@@ -99,7 +98,7 @@ class Refiner:
         """
         batch, n_knots, n_gen = p_gen.shape
         n, n_rows = self.n_slack, len(self.rows)
-        free = coarse_free_response(self.network, self.model, inputs, self.grid, self.stride)
+        free = coarse_free_response(self.model, inputs, self.grid, self.stride)
         slack_unit = math.sqrt(WEIGHTS["p_slack"])
         fixed = np.zeros((batch, n_rows), dtype=np.float32)
         fixed[:, :n] = free[:, n_gen] * slack_unit
@@ -144,16 +143,14 @@ class Refiner:
         return np.asarray(cost * (1.0 + EXCESS_PRICE * np.maximum(omega - (1.0 - 0.5 * MARGIN), 0.0)))
 
 
-def coarse_free_response(
-    network: Network, model: Koopman, inputs: StackedInstances, grid: Array, stride: int
-) -> Array32:
+def coarse_free_response(model: Koopman, inputs: StackedInstances, grid: Array, stride: int) -> Array32:
     """`koopman.free_response` of instances, (batch, n_gen + 1, n_coarse), float32."""
-    p_load = inputs.p_load(grid)
+    network, p_load = model.network, inputs.p_load(grid)
     theta = network.power_flow(inputs.p_initial, p_load[:, 0])
     if inputs.delta.any():
         theta[:, network.generators] += inputs.delta
         theta, _ = network.solve_loads(theta, network.load_injections(p_load[:, 0]))
-    psi = model.observables(network, theta, inputs.omega, p_load[:, 0])
+    psi = model.observables(theta, inputs.omega, p_load[:, 0])
     return free_response(model, psi, p_load, stride).astype(np.float32)
 
 
@@ -194,7 +191,7 @@ class BoundKeeper:
         )
         #: Of |ω| at the points, (n_points,), rad/s.
         self.limit = case.omega_bound(regime) * (1.0 - MARGIN * np.minimum(points / knots[1], 1.0))
-        gamma = CondensedRollout.make(case, linear, points, knots).gamma[:n_gen]
+        gamma = CondensedRollout.make(linear, points, knots).gamma[:n_gen]
         #: ω at the points by powers at the knots, (n_gen, n_points, n_knots, n_gen), rad/s per pu.
         self.of_power = gamma.reshape(n_gen, len(points), len(knots), n_gen)
         self.damping = DAMPING * float((self.of_power[:, :, 1:] ** 2).sum(axis=(2, 3)).max())

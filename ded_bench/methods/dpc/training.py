@@ -29,7 +29,6 @@ from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, follow_within, repeatable
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -163,17 +162,11 @@ class Pool(NamedTuple):
     coarse_free_response: Tensor  # of the surrogate, (batch, n_gen + 1, n_coarse)
 
     @staticmethod
-    def of(
-        channels: Channels,
-        inputs: StackedInstances,
-        model: Koopman,
-        network: Network,
-        grid: Array,
-    ) -> Pool:
+    def of(channels: Channels, inputs: StackedInstances, model: Koopman, grid: Array) -> Pool:
         """Convert channels, and compute free responses on a time grid; float32."""
         stride = largest_divisor(len(grid) - 1, round(SPACING_S / model.dt_s))
         parts = [inputs[start : start + CHUNK] for start in range(0, len(inputs), CHUNK)]
-        free = [coarse_free_response(network, model, part, grid, stride) for part in parts]
+        free = [coarse_free_response(model, part, grid, stride) for part in parts]
         scale = np.maximum(channels.static_cost(inputs), SMALLEST_COST) * len(grid)
         seen = channels.start, channels.free_response, channels.sequence, channels.constants
         arrays = (*seen, inputs.cost, scale, np.concatenate(free))
@@ -216,16 +209,16 @@ def train(
     Args:
         instances: choose the best weights and are never trained on; they share one time grid and horizon.
     """
-    model, first, network = options.find_model(case), instances[0], Network(case)
+    model, first = options.find_model(case), instances[0]
     scope = Scope(case, regime, first.horizon_s)
     response = Response.make(case, case.knot_times(first.horizon_s))
     fresh = FRESH if options.seconds is None else min(FRESH, math.ceil(FRESH_PER_SECOND * options.seconds))
     drawn = list(sample_instances(case, POLICY_SEED + options.seed, fresh, servable=servable))
     inputs = [StackedInstances.of(case, part) for part in (drawn, instances)]
     channels = [Channels.of(case, part, response) for part in inputs]
-    data, check = (Pool.of(c, i, model, network, first.grid) for c, i in zip(channels, inputs, strict=True))
+    data, check = (Pool.of(c, i, model, first.grid) for c, i in zip(channels, inputs, strict=True))
     stride = largest_divisor(first.steps, round(SPACING_S / model.dt_s))
-    condensed = CondensedRollout.make(case, model, first.grid, response.knots, stride)
+    condensed = CondensedRollout.make(model, first.grid, response.knots, stride)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
         staged = StagedNetwork(case, response)

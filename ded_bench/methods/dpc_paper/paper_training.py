@@ -89,7 +89,7 @@ class Batch(NamedTuple):
         network, p_load = Network(case), np.stack([i.p_load(case) for i in instances])
         arrays = (
             channels(network, instances, case.knot_times(instances[0].horizon_s)),
-            free_response(model, model.initial(network, instances), p_load),
+            free_response(model, model.initial(instances), p_load),
             np.stack([i.cost_gen(case) for i in instances]),
             np.array([i.cost_slack(case) for i in instances]),
             np.stack([i.p_initial(case) for i in instances]),
@@ -154,7 +154,7 @@ def train(
     """
     model, first = options.find_model(case), instances[0]
     data = Batch.of(case, model, instances)
-    condensed = CondensedRollout.make(case, model, first.grid, case.knot_times(first.horizon_s))
+    condensed = CondensedRollout.make(model, first.grid, case.knot_times(first.horizon_s))
     loss = PaperLoss(condensed, case.omega_bound(regime), case.ramp * first.dt_s)
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)

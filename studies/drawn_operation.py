@@ -64,8 +64,8 @@ def _one(
 ) -> tuple[int, float, Operated]:
     scenario = sample_scenario(case, SEED, index, servable, duration_s)
     found = operated(case, scenario, options, constants)
-    best = hindsight(case, scenario, REGIME).judgement.objective
-    return index, 100 * (found.objective / best - 1), found
+    _, best, _ = hindsight(case, scenario, REGIME)
+    return index, 100 * (found.objective / best.objective - 1), found
 
 
 def arguments(text: str | None) -> argparse.ArgumentParser:

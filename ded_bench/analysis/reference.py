@@ -19,16 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ded_bench.analysis.summary import (
-    GROUP,
-    HEAD,
-    head,
-    is_usual,
-    records,
-    statistics,
-    summary,
-    title,
-)
+from ded_bench.analysis.summary import GROUP, HEAD, head, records, statistics, summary, title
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record
 from ded_bench.methods.options import DEFAULT
@@ -111,7 +102,7 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
         `paper_…`, and how ours stand against them.
     """
     ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
-    usual = {key[:2]: key for key in ours if is_usual(key[2], key[3], key[1])}
+    usual = {key[:2]: key for key in ours if title(*key[1:]) == title(key[1])}
     theirs = paper.rows()
     beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in theirs.items()}
     times = {tuple(line[name] for name in GROUP): line for line in records(timing)}

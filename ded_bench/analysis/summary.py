@@ -33,11 +33,6 @@ def usual_model(method: str) -> str:
     return METHODS[method].model if method in METHODS else ""
 
 
-def is_usual(settings: str, model: str, method: str) -> bool:
-    """Whether a line has the default settings, and no surrogate but the method's usual one."""
-    return settings == DEFAULT and model in ("", usual_model(method))
-
-
 def title(method: str, settings: str = DEFAULT, model: str = "") -> str:
     """A method's name as tables print it; settings and surrogate only where they are not the usual ones."""
     name = METHODS[method].title if method in METHODS else method

@@ -72,7 +72,7 @@ class KeyedTable(Generic[K, T]):
             with open(self.path, "rb") as file:
                 mark = _mark(os.fstat(file.fileno()))
                 if self._seen is None or self._seen.mark != mark:
-                    self._read(whole_lines(file.read()), mark)
+                    self._read(file.read(), mark)
         except FileNotFoundError:
             self._forget()
         except OSError as error:
@@ -105,6 +105,9 @@ class KeyedTable(Generic[K, T]):
                 self._write_all()
 
     def _read(self, data: bytes, mark: tuple[int, int, int]) -> None:
+        # All but a torn last line, and without blank lines at the end, so that rows may follow.
+        end = len(data[: data.rfind(b"\n") + 1].rstrip(b"\r\n"))
+        data = data[: data.index(b"\n", end) + 1] if end else b""
         try:
             found = records(data.decode("utf-8"), self.path)
         except UnicodeDecodeError:
@@ -145,9 +148,3 @@ class KeyedTable(Generic[K, T]):
 def _mark(found: os.stat_result) -> tuple[int, int, int]:
     """Changes whenever a file is written to."""
     return found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def whole_lines(data: bytes) -> bytes:
-    """All but a torn last line, and without blank lines at the end, so that rows may follow."""
-    end = len(data[: data.rfind(b"\n") + 1].rstrip(b"\r\n"))
-    return data[: data.index(b"\n", end) + 1] if end else b""

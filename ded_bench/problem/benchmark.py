@@ -271,14 +271,11 @@ def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selec
 
 
 def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selection:
-    train: Sequence[str] = ()
-    test: Sequence[str] = ()
-    if (folder / "split.json").is_file():
-        split = load_split(folder)
-        train, test = split.train, split.test
+    split = load_split(folder) if (folder / "split.json").is_file() else None
+    named = {} if split is None else dict.fromkeys(split.test, "test") | dict.fromkeys(split.train, "train")
+    chosen = tuple((instance, named.get(instance.id, "none")) for instance in instances)
     manifest = load_manifest(folder)
-    named = [(i, "train" if i.id in train else "test" if i.id in test else "none") for i in instances]
-    return Selection(case, tuple(named), manifest.version if manifest else "")
+    return Selection(case, chosen, manifest.version if manifest else "")
 
 
 def check_own_name(instance: Instance, source: str | Path, problems: Path, case: Case) -> None:

@@ -19,20 +19,7 @@ from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
 from ded_bench.problem.case import Case
-from ded_bench.report.columns import (
-    CERTIFICATE,
-    DETAIL,
-    ISLAND,
-    ONLINE,
-    OTHER_RATES,
-    OUTCOME,
-    PRACTICE,
-    TABLE_V,
-    TABLE_VI,
-    TIMING,
-    TRAINING,
-    tabulate,
-)
+from ded_bench.report import columns
 from ded_bench.report.figures import panels, tradeoff
 from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, usual_first, write_page
 from ded_bench.report.sources import Sources, read_sources, trainings
@@ -126,7 +113,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     said = [*findings(found, reference.title), *_against_paper([table.frame for table in papers])]
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
-    columns = OUTCOME if case.slack else (*OUTCOME, *ISLAND)
+    printed = columns.OUTCOME if case.slack else (*columns.OUTCOME, *columns.ISLAND)
     notes = (*_problems(sources), *_makers(sources), *sources.notes)
     return [
         f"# Dynamics-aware economic dispatch on {case.id}",
@@ -134,7 +121,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         *(f"> **Note:** {text}" for text in alarms(sources)),
         bullets(said),
         *pictures["tradeoff"],
-        *usual_first(PageTable(found, columns, _methods_caption(sources), "methods"), usual),
+        *usual_first(PageTable(found, printed, _methods_caption(sources), "methods"), usual),
         *_in_operation(sources),
         *(pictures["online"] if case.slack is None else ()),
         *(block for table in papers for block in _beside_paper(table)),
@@ -162,7 +149,7 @@ def _in_operation(sources: Sources) -> Iterator[PageTable]:
             "In operation beside today's practice (ED every 60 s, AGC for the rest): means over n scenarios; "
             "ratios and costs beside practice over those where it was operated, too"
         )
-        yield PageTable(tabulate(PRACTICE, lines), PRACTICE, caption, "practice")
+        yield PageTable(columns.tabulate(columns.PRACTICE, lines), columns.PRACTICE, caption, "practice")
 
 
 def _methods_caption(sources: Sources) -> str:
@@ -181,8 +168,8 @@ def _paper_tables(sources: Sources, paper: Paper) -> list[PageTable]:
     five = f"Table V: Average Solution Time and Change in Objective ({rows})"
     six = f"Table VI: Average maximum constraint violation ({rows})"
     return [
-        PageTable(tabulate(TABLE_V, lines), TABLE_V, five, "table_v"),
-        PageTable(tabulate(TABLE_VI, scored), TABLE_VI, six, "table_vi"),
+        PageTable(columns.tabulate(columns.TABLE_V, lines), columns.TABLE_V, five, "table_v"),
+        PageTable(columns.tabulate(columns.TABLE_VI, scored), columns.TABLE_VI, six, "table_vi"),
     ]
 
 
@@ -268,7 +255,7 @@ def _makers(sources: Sources) -> Iterator[str]:
 def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """Default settings in sight, all others folded away."""
     overview, usual = sources.summary, sources.summary["settings"] == DEFAULT
-    others = OTHER_RATES if overview[["validated_asked", "confirmed_asked"]].to_numpy().any() else ()
+    others = columns.OTHER_RATES if overview[["validated_asked", "confirmed_asked"]].to_numpy().any() else ()
     for name, judge in (("carried", "validated"), ("refereed", "confirmed")) if others else ():
         counts = overview[f"{judge}_n"].astype(str) + " of " + overview[f"{judge}_asked"].astype(str)
         overview = overview.assign(**{name: counts})
@@ -276,7 +263,7 @@ def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
         f"Gap to {sources.reference.title}, % ({rows_caption(sources)}); claimed, and verified on "
         f"{idealisation(sources.case)}: shares of all rows" + f". {OTHERS}" * bool(others)
     )
-    table = PageTable(overview, (*DETAIL, *others), caption, "summary")
+    table = PageTable(overview, (*columns.DETAIL, *others), caption, "summary")
     return ["## Each method in detail", *usual_first(table, usual)]
 
 
@@ -286,7 +273,7 @@ def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
     if len(sources.timing):
         timing = titled(pd.concat([rows for *_, rows in groups(sources.timing)]))
         caption = f"Alone on {timing['host'].iloc[-1]}, one thread, warmed up: median and quartiles, s"
-        made = usual_first(PageTable(timing, TIMING, caption), timing["settings"] == DEFAULT)
+        made = usual_first(PageTable(timing, columns.TIMING, caption), timing["settings"] == DEFAULT)
     return ["## Times", *made]
 
 
@@ -299,15 +286,18 @@ def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     made: list[Block] = ["## Training"]
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()
-        columns = tuple(column for column in TRAINING if filled[column.name])
-        made.append(PageTable(frame, columns, "", "training"))
+        known = tuple(column for column in columns.TRAINING if filled[column.name])
+        made.append(PageTable(frame, known, "", "training"))
     else:
         made.append("The folder holds no policy or model; `ded-bench train-dpc` and `train-ko` make some.")
     made.append("## Certificate")
     if not sources.certificates:
         return [*made, "No certificate was made for these results; `ded-bench certify` makes one."]
     certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in sources.certificates]))
-    return [*made, PageTable(certificates, CERTIFICATE, "All that makes them up stands in certificate.json")]
+    return [
+        *made,
+        PageTable(certificates, columns.CERTIFICATE, "All that makes them up stands in certificate.json"),
+    ]
 
 
 def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
@@ -317,7 +307,7 @@ def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list
         return []
     caption = "Methods in the closed loop at their own latency, forecasts as announced"
     explained = folded("How to read the closed loop", bullets(CLOSED_LOOP))
-    table = PageTable(own, ONLINE, caption, "online_methods")
+    table = PageTable(own, columns.ONLINE, caption, "online_methods")
     pictured = pictures["online"] if sources.case.slack else ()  # of an island it stands beside practice
     return ["## The closed loop", table, *explained, *pictured]
 

@@ -28,7 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.registry import Method, get_method, registered
+from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, Solution, Solver, named
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import validation_instances
@@ -269,9 +269,7 @@ def _peak_memory_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, KiB elsewhere
 
 
-def runs_of(
-    rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method] | None = None
-) -> list[Job]:
+def runs_of(rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method]) -> list[Job]:
     """What a results table holds, to be timed, in the methods' order.
 
     Rows of other methods and of models given as a file are left out. A job all of whose rows were made with
@@ -280,9 +278,8 @@ def runs_of(
     Args:
         rows: of the table.
         settings: all but the options, the model and the time limit, which come from the rows.
-        methods: those to time, by the name that their rows carry; None: all that are registered.
+        methods: those to time, by the name that their rows carry.
     """
-    methods = registered() if methods is None else methods
     limits: dict[tuple[str, str, str, str], list[float | None]] = {}
     for row in rows:
         model = model_name(row.model)

@@ -14,7 +14,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import option
-from ded_bench.methods.registry import METHODS, Method
+from ded_bench.methods.registry import METHODS, Method, registered
 from ded_bench.methods.solution import Artifact, Settings, Solution
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
@@ -273,7 +273,7 @@ def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
         Key("c", "a", "TO", "stranger", "default"),
     }
     made = [Row(split="test", status="Optimal", **key._asdict()) for key in rows]
-    assert runs_of(made, Settings(search=(tmp_path,))) == [
+    assert runs_of(made, Settings(search=(tmp_path,)), registered()) == [
         Job("fake", "NO", Settings(search=(tmp_path,))),
         Job("fake", "TO", Settings(time_limit_s=20.0, search=(tmp_path,))),
         Job("fake", "TO", Settings("fast=on", "linear", search=(tmp_path,))),

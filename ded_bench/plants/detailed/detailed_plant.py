@@ -107,12 +107,7 @@ class DetailedPlant:
         self, state: DetailedState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
     ) -> Piece:
         """See `Plant.advance`; `states` are a DetailedRun. On an island the slack's power is zero."""
-        from ded_bench.plants.detailed.detailed_stepper import (
-            DetailedStates,
-            PlantInputs,
-            carried_voltages,
-            integrate_plant,
-        )
+        from ded_bench.plants.detailed import detailed_stepper as stepper  # and with it Numba
 
         n, control = len(p_set), self.control(state, dt_s)
         system, machines = self.system, self.system.scheduled
@@ -122,14 +117,14 @@ class DetailedPlant:
         network = system.compiled_network
         network = network if exact else network._replace(change=PLANNING_CHANGE)
         x, v = (np.empty((n, *first.shape)) for first in (state.x, state.v))
-        states = DetailedStates(x, v, np.empty(n), np.empty((n, len(system.data))))
+        states = stepper.DetailedStates(x, v, np.empty(n), np.empty((n, len(system.data))))
         states.x[0], states.v[0], states.held[0] = state.x, state.v, state.held
-        inputs = PlantInputs(p_ref, drawn, state.v_ref, dt_s)
+        inputs = stepper.PlantInputs(p_ref, drawn, state.v_ref, dt_s)
         needed = max(system.fastest * dt_s / STEP_BY_MODE, dt_s / LONGEST_S if exact else 1.0)
         steps = int(np.ceil(needed - 1e-9))
         try:
-            carried = copy.deepcopy(state.carried) or carried_voltages(network, drawn[0], states.v[0])
-            done = integrate_plant(system.data, network, inputs, control, steps, carried, states)
+            carried = copy.deepcopy(state.carried) or stepper.carried_voltages(network, drawn[0], states.v[0])
+            done = stepper.integrate_plant(system.data, network, inputs, control, steps, carried, states)
         except np.linalg.LinAlgError:
             done = 0
         if done < n or not np.isfinite(states.x[-1]).all():

@@ -75,12 +75,9 @@ class PortNetwork:
         wanted = np.zeros(len(self.ports))
         np.add.at(wanted, self.machine_port, p_machine)
         wanted -= p_drawn
-        angle, size = np.angle(self.guess if guess is None else guess), np.abs(self.guess)
-        if guess is not None:
-            size = np.abs(guess)
-            size[held] = np.abs(self.guess[held])
-        if sizes is not None:
-            size[held] = sizes[held]
+        start = self.guess if guess is None else guess
+        angle, size = np.angle(start), np.abs(start)
+        size[held] = np.abs(self.guess[held]) if sizes is None else sizes[held]
         balancing, factors, before = self.machine_port[self.balancing], None, np.inf
         for _ in range(NEWTON_STEPS):
             voltage = size * np.exp(1j * (angle - angle[balancing]))

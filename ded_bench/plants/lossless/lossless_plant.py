@@ -76,28 +76,21 @@ class LosslessPlant:
         self, state: LosslessState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
     ) -> Piece:
         """See `Plant.advance`; steps of fixed length lead from point to point, so that none spans a kink."""
-        from ded_bench.plants.lossless.stepper import (
-            DORMAND_PRINCE_8,
-            KUTTA_4,
-            Carried,
-            GridInputs,
-            carried_from,
-            integrate,
-        )
+        from ded_bench.plants.lossless import stepper  # and with it Numba: help does without
 
         network, n = self.network, len(p_set)
         theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
         theta[0], omega[0], p_slack = state.theta, state.omega, np.empty(n)
-        inputs = GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
+        inputs = stepper.GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
         steps = max(int(np.ceil(state.divisions * dt_s)), 1)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
-        tableau, past = DORMAND_PRINCE_8 if exact else KUTTA_4, state.carried
+        tableau, past = stepper.DORMAND_PRINCE_8 if exact else stepper.KUTTA_4, state.carried
         try:
             if past is None or past.recent.shape[1] != len(tableau.c):
-                carried = carried_from(tableau, grid, theta[0])
+                carried = stepper.carried_from(tableau, grid, theta[0])
             else:
-                carried = Carried(*(part.copy() for part in past))  # type: ignore[arg-type]
-            done = integrate(tableau, grid, inputs, steps, carried, theta, omega, p_slack)
+                carried = stepper.Carried(*(part.copy() for part in past))  # type: ignore[arg-type]
+            done = stepper.integrate(tableau, grid, inputs, steps, carried, theta, omega, p_slack)
         except np.linalg.LinAlgError:
             done = 0
         if done < n:

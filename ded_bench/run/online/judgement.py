@@ -6,7 +6,7 @@ windows that overlap, where it is long.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 
@@ -31,15 +31,6 @@ EPSILON_HZ, MINUTE_S = 0.018, 60.0
 
 #: What islands have in addition, as the scorer names it.
 OF_ISLANDS = tuple(f.name for f in fields(Score) if f.default is None)
-
-
-@dataclass(frozen=True)
-class Hindsight:
-    """The optimum of one scenario and regime."""
-
-    method: str
-    judgement: Judgement
-    trajectory: Trajectory
 
 
 def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regime: str) -> Judgement:
@@ -81,7 +72,9 @@ def cps1(t: Array, mean: Array) -> float:
     return float(100 * (2 - np.mean(minutes**2) / EPSILON_HZ**2))
 
 
-def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None = None) -> Hindsight:
+def hindsight(
+    case: Case, scenario: Scenario, regime: str, plant: Plant | None = None
+) -> tuple[str, Judgement, Trajectory]:
     """Optimise the whole scenario by sequential linear programs, or by collocation where they fail.
 
     Args:
@@ -89,6 +82,9 @@ def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None =
         scenario: with its true loads.
         regime: gives the bound of |ω|.
         plant: what is operated; None: the case's own.
+
+    Returns:
+        The method that found it, what it costs, and the trajectory.
 
     Raises:
         RuntimeError: neither finds a schedule.
@@ -103,12 +99,12 @@ def hindsight(case: Case, scenario: Scenario, regime: str, plant: Plant | None =
         solution = get_method(name).prepare(case, regime, Settings(options))(instance)
         if solution.schedule is not None:
             trajectory = simulate(case, instance, solution.schedule, plant)
-            return Hindsight(name, judge_operation(case, scenario, trajectory, regime), trajectory)
+            return name, judge_operation(case, scenario, trajectory, regime), trajectory
         reasons.append(solution.error)
     raise RuntimeError(f"no schedule for the whole of {scenario.id}: {reasons[-1]}")
 
 
-def _in_windows(case: Case, scenario: Scenario, regime: str) -> Hindsight:
+def _in_windows(case: Case, scenario: Scenario, regime: str) -> tuple[str, Judgement, Trajectory]:
     """Optimise windows of WINDOW_S, the next one from the middle of each on, with the case's knots."""
     interval_s = case.sampling.horizon_s / (case.n_knots - 1)
     solver = get_method("ded-slp").prepare(case, regime, Settings(f"knot_s={interval_s!r}"))
@@ -123,7 +119,7 @@ def _in_windows(case: Case, scenario: Scenario, regime: str) -> Hindsight:
     period_s = scenario.duration_s if is_whole else WINDOW_S / 2
     options = LoopOptions(period_s, forecast="perfect", horizon_s=WINDOW_S, to_end=True)
     trajectory = run_loop(case, scenario, ask, options).trajectory
-    return Hindsight("ded-slp", judge_operation(case, scenario, trajectory, regime), trajectory)
+    return "ded-slp", judge_operation(case, scenario, trajectory, regime), trajectory
 
 
 def whole_instance(case: Case, scenario: Scenario) -> Instance:

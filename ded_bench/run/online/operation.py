@@ -187,16 +187,10 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
 
 def find_hindsight(case: Case, scenario: Scenario, row: HindsightRow, files: ResultsFolder) -> HindsightRow:
     """Optimise one scenario with full knowledge in this process, and keep its trajectory."""
-    found = hindsight(case, scenario, row.regime, plant_of(case, row.plant))
-    keep_trajectory(files.hindsight_trajectory(*row.key), found.trajectory)
-    return dataclasses.replace(
-        row,
-        method=found.method,
-        method_version=get_method(found.method).version,
-        objective=found.judgement.objective,
-        max_excess_hz=found.judgement.max_excess_hz,
-        slack_travel_pu=found.judgement.slack_travel_pu,
-    )
+    method, judgement, trajectory = hindsight(case, scenario, row.regime, plant_of(case, row.plant))
+    keep_trajectory(files.hindsight_trajectory(*row.key), trajectory)
+    cells = {name: getattr(judgement, name) for name in ("objective", "max_excess_hz", "slack_travel_pu")}
+    return dataclasses.replace(row, method=method, method_version=get_method(method).version, **cells)
 
 
 def _look_back(case: Case, asked_for: Sequence[Operation], results: OnlineResults, pool: Workers) -> None:

@@ -140,7 +140,7 @@ def test_minutes_of_known_frequency_have_a_known_cps1():
 
 def test_hindsight_keeps_the_bounds_and_costs_no_more_than_who_keeps_them(island, scenario):
     """Against plans every 5 s with perfect forecasts."""
-    best = hindsight(island, scenario, "NO").judgement
+    _, best, _ = hindsight(island, scenario, "NO")
     assert best.max_excess_hz < 1e-5
     solver = get_method("ded-rti").prepare(island, "NO", Settings())
 

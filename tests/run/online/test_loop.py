@@ -120,7 +120,7 @@ def test_prediction_buys_back_latency():
         "predicted": LoopOptions(0.5, 1.0, "perfect"),
         "present": LoopOptions(0.5, 1.0, "perfect", predict=False),
     }
-    best = hindsight(case, scenario, REGIME).judgement
+    _, best, _ = hindsight(case, scenario, REGIME)
     assert best.max_excess_hz < 1e-6
     found = {
         name: judge_operation(case, scenario, run_loop(case, scenario, Asked(case), o).trajectory, REGIME)

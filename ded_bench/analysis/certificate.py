@@ -151,12 +151,6 @@ class Candidate:
         name = {"method": self.method, "settings": settings, "regime": self.regime}
         return name | {"reference": self.reference} | made_with
 
-    def rows_file(self, case: Case, folder: Path) -> Path:
-        """Where a results folder keeps the rows that its certificate counts."""
-        facts = self.facts(case)
-        names = facts["method"], facts["settings"], model_name(facts["model"]), facts["regime"]
-        return ResultsFolder(folder).certificate_rows(*names)
-
 
 def read_certificates(folder: Path) -> tuple[Certificate, ...]:
     """Read the certificates of a results folder, none if it has none; InputError if the file is wrong."""
@@ -211,7 +205,9 @@ def certify(
         InputError: unknown method or regime, a missing policy or model, or a wrong file of rows.
     """
     case.check_regimes([candidate.regime])
-    path, facts = candidate.rows_file(case, folder), candidate.facts(case)
+    facts = candidate.facts(case)
+    names = facts["method"], facts["settings"], model_name(facts["model"]), facts["regime"]
+    path = ResultsFolder(folder).certificate_rows(*names)
     versions = [str(get_method(method).version) for method, _ in candidate.pair]
     decisive = "|".join([case.fingerprint, str(seed), *versions, *facts.values()])
     fingerprint = hashlib.sha256(decisive.encode()).hexdigest()[:12]
@@ -268,7 +264,7 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
 
 def _score(case: Case, method: str, regime: str, settings: Settings, instance: Instance) -> Score | None:
     """The score of an answer; None where there is no schedule, or its plant cannot follow it."""
-    task = Task(instance, "", regime, method, settings, "")
+    task = Task(instance, "", regime, method, settings)
     verdict = solve_and_score(case, task, plant_of(case).name).verdict
     return verdict if isinstance(verdict, Score) else None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -117,6 +116,6 @@ def _static(case: Case, instance: Instance) -> Array | None:
 def _peaks(case: Case, runs: list[Array | None]) -> dict[str, Array]:
     """Largest values of what the case bounds, Hz, ascending over runs; ∞ for those that collapse."""
     bounds = case.bounds(next(iter(case.regimes)))
-    free = dataclasses.replace(bounds, limit=np.zeros_like(bounds.limit))
+    free = bounds.tightened(part=1.0)
     found = [dict.fromkeys(bounds.kinds, np.inf) if run is None else free.excess_hz(run) for run in runs]
     return {kind: np.sort([peaks[kind] for peaks in found]) for kind in dict.fromkeys(bounds.kinds)}

@@ -23,7 +23,6 @@ from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
 from ded_bench.methods.registry import get_method, trainable
 from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
-from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders

@@ -12,7 +12,7 @@ import fcntl
 import os
 from collections.abc import Hashable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import naming, write_atomically
@@ -38,13 +38,6 @@ class Keyed(Protocol):
         """Version of the method that made it."""
 
 
-class _Seen(NamedTuple):
-    """Which state of the file was read, and where its last whole line ends."""
-
-    mark: tuple[int, int, int]
-    end: int
-
-
 class KeyedTable(Generic[K, T]):
     """Rows of one file by key, in the order of their first lines.
 
@@ -58,7 +51,8 @@ class KeyedTable(Generic[K, T]):
         self._table = table
         self._header: tuple[str, ...] = table.names
         self._superseded = 0
-        self._seen: _Seen | None = None
+        self._mark: tuple[int, int, int] | None = None  # of the file when it was read
+        self._end = 0  # of its last whole line then
         self.reload()
 
     def made_from(self, key: K, fingerprint: str, version: int = 0) -> bool:
@@ -71,7 +65,7 @@ class KeyedTable(Generic[K, T]):
         try:
             with open(self.path, "rb") as file:
                 mark = _mark(os.fstat(file.fileno()))
-                if self._seen is None or self._seen.mark != mark:
+                if self._mark != mark:
                     self._read(file.read(), mark)
         except FileNotFoundError:
             self._forget()
@@ -83,19 +77,19 @@ class KeyedTable(Generic[K, T]):
         rows = list(rows)
         with self.locked():
             self.reload()
-            if self._seen is None or not set(self._table.names) <= set(self._header):
+            if self._mark is None or not set(self._table.names) <= set(self._header):
                 self._take(rows)
                 self._write_all()
                 return
             text = "".join(self._table.format_row(row, self._header) for row in rows).encode()
             with naming(self.path), open(self.path, "r+b") as file:
-                file.truncate(self._seen.end)
-                file.seek(self._seen.end)
+                file.truncate(self._end)
+                file.seek(self._end)
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
             self._take(rows)
-            self._seen = _Seen(_mark(self.path.stat()), self._seen.end + len(text))
+            self._mark, self._end = _mark(self.path.stat()), self._end + len(text)
 
     def compact(self) -> None:
         """Leave one line per key."""
@@ -115,7 +109,7 @@ class KeyedTable(Generic[K, T]):
         header = self._table.check_header(found[0][1] if found else [], self.path)
         rows = list(self._table.rows(found[1:], header, self.path))  # all of them are right, or none is taken
         self._forget()
-        self._header, self._seen = header, _Seen(mark, len(data))
+        self._header, self._mark, self._end = header, mark, len(data)
         self._take(rows)
 
     def _take(self, found: Iterable[T]) -> None:
@@ -128,13 +122,13 @@ class KeyedTable(Generic[K, T]):
 
     def _forget(self) -> None:
         self.rows, self._header = {}, self._table.names
-        self._superseded, self._seen = 0, None
+        self._superseded, self._mark = 0, None
 
     def _write_all(self) -> None:
         data = self._table.format(self.rows.values()).encode()
         write_atomically(self.path, data)
         self._header, self._superseded = self._table.names, 0
-        self._seen = _Seen(_mark(self.path.stat()), len(data))
+        self._mark, self._end = _mark(self.path.stat()), len(data)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

@@ -205,10 +205,8 @@ class Instance(Fingerprinted):
         wanted: dict[str, tuple[Mapping[str, object], tuple[str, ...]]] = {
             "cost": (self.cost, case.priced),
             "load": (self.load, case.loads),
-            "initial.power": (self.initial.power, case.generators),
-            "initial.omega": (self.initial.omega, case.generators),
         }
-        for name in ("theta", "mechanical"):
+        for name in ("power", "omega", "theta", "mechanical"):
             if (values := getattr(self.initial, name)) is not None:
                 wanted[f"initial.{name}"] = (values, case.generators)
         for field, (given, buses) in wanted.items():

@@ -144,7 +144,11 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     rows, left_out = newest(ours)
     notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
-    rows = judged_elsewhere(gaps(rows, reference.objectives), _other_judgements(paths))
+    judgements: dict[str, dict[Key, bool | None]] = {
+        "validated": {row.key[0]: row.feasible for row in VALIDATED.existing(paths.validated)},
+        "confirmed": {row.key: row.confirmed for row in REFEREE.existing(paths.referee)},
+    }
+    rows = judged_elsewhere(gaps(rows, reference.objectives), judgements)
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
@@ -161,14 +165,6 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         certificates=read_certificates(folder),
         notes=notes,
     )
-
-
-def _other_judgements(paths: ResultsFolder) -> dict[str, dict[Key, bool | None]]:
-    """What full machine models and ANDES say of kept schedules."""
-    return {
-        "validated": {row.key[0]: row.feasible for row in VALIDATED.existing(paths.validated)},
-        "confirmed": {row.key: row.confirmed for row in REFEREE.existing(paths.referee)},
-    }
 
 
 def _benchmark(case: Case, problems: Path, notes: list[str]) -> tuple[dict[str, Instance], int, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -29,16 +29,7 @@ from ded_bench.run.cluster import Cluster
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
 from ded_bench.run.scoring import scored_row
-from ded_bench.run.tasks import (
-    Answered,
-    Task,
-    failed,
-    fingerprint_of,
-    key_of,
-    pack,
-    solve_and_score,
-    trace_of,
-)
+from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score, trace_of
 from ded_bench.solvers.status import Status
 
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
@@ -78,7 +69,10 @@ def run(
     """
     todo, plant = unfinished(tasks, results), plant_of(case).name
     with Cluster(scheduler) if scheduler else Workers(workers) as pool, results.packed():
-        sent = todo if scheduler is None else _packed(todo)
+        sent: Iterable[Task] = todo
+        if scheduler:  # with the files that answers depend on, read as they are needed
+            files = functools.cache(pack)
+            sent = (dataclasses.replace(task, files=files(task.artifacts)) for task in todo)
         calls = ((solve_and_score, (case, task, plant)) for task in sent)
         limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
         with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
@@ -99,13 +93,6 @@ def run(
 def unfinished(tasks: Sequence[Task], results: Results) -> list[Task]:
     """The tasks without a finished row (see `Results.finished`)."""
     return [task for task in tasks if not results.finished(task.key, task.fingerprint, task.version)]
-
-
-def _packed(tasks: Sequence[Task]) -> Iterator[Task]:
-    """Tasks with the files that their answers depend on."""
-    files = functools.cache(pack)
-    for task in tasks:
-        yield dataclasses.replace(task, files=files(task.artifacts))
 
 
 def unscored_row(
@@ -186,9 +173,8 @@ def submit(
     for instance, split, regime in wanted:
         schedule, content, error = _read(case, folder, instance, regime)
         given = Solution(Status.FAILED if schedule is None else Status.FEASIBLE, schedule, error=error[:300])
-        key = key_of(instance, regime, name, Settings(), ())
-        fingerprint = fingerprint_of(case, instance, key, content)
-        tasks.append(Task(instance, split, regime, name, Settings(), fingerprint, given=given))
+        task = Task(instance, split, regime, name, Settings(), given=given)
+        tasks.append(task.fingerprinted(case, content))
     rows = run(case, tasks, results, workers, chosen.version)
     places = [folder, *(folder / regime for regime in regimes)]
     found = {path for place in places for suffix in SUFFIXES for path in place.glob(f"*{suffix}")}

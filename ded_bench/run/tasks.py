@@ -49,7 +49,7 @@ class Task:
     regime: str
     method: str
     settings: Settings
-    fingerprint: str
+    fingerprint: str = ""
     artifacts: tuple[Artifact, ...] = ()
     version: int = 0
     files: Files = ()  # for a worker without the results folder
@@ -58,7 +58,20 @@ class Task:
     @property
     def key(self) -> Key:
         """The row's place in the results table."""
-        return key_of(self.instance, self.regime, self.method, self.settings, self.artifacts)
+        made_with = named(self.artifacts, "model"), named(self.artifacts, "policy")
+        name = self.instance.case, self.instance.id, self.regime, self.method, self.settings.options
+        return Key(*name, *made_with, self.settings.time_limit_s)
+
+    def fingerprinted(self, case: Case, content: str = "") -> Task:
+        """The same with twelve hex digits that change with whatever decides on its answer but our own code.
+
+        Args:
+            case: of its instance.
+            content: fingerprint of what else it is made of, as a schedule that was submitted.
+        """
+        parts = [case.fingerprint, self.instance.fingerprint, *map(str, self.key[2:]), content]
+        digits = hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
+        return dataclasses.replace(self, fingerprint=digits)
 
 
 def make_tasks(
@@ -80,32 +93,9 @@ def make_tasks(
         for regime in regimes:
             artifacts = method.artifacts(case, regime, own)
             for instance, split in instances:
-                key = key_of(instance, regime, method.name, own, artifacts)
-                fingerprint = fingerprint_of(case, instance, key, named(artifacts, "code"))
-                made = fingerprint, artifacts, method.version
-                tasks.append(Task(instance, split, regime, method.name, own, *made))
+                task = Task(instance, split, regime, method.name, own, "", artifacts, method.version)
+                tasks.append(task.fingerprinted(case, named(artifacts, "code")))
     return tasks
-
-
-def key_of(
-    instance: Instance, regime: str, method: str, settings: Settings, artifacts: Iterable[Artifact]
-) -> Key:
-    """The key of a row that a method makes with some models and policies."""
-    made_with = named(artifacts, "model"), named(artifacts, "policy")
-    name = instance.case, instance.id, regime, method, settings.options
-    return Key(*name, *made_with, settings.time_limit_s)
-
-
-def fingerprint_of(case: Case, instance: Instance, key: Key, content: str = "") -> str:
-    """Twelve hex digits that change with whatever decides on an answer, except for our own code.
-
-    Args:
-        case, instance: what is solved.
-        key: the row's.
-        content: fingerprint of what else it is made of, as a schedule that was submitted.
-    """
-    parts = [case.fingerprint, instance.fingerprint, *map(str, key[2:]), content]
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:12]
 
 
 class Answered(NamedTuple):

@@ -40,14 +40,8 @@ FEW = 6
 POINTS = 1500
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Values over time: (n,), or (n, m) for several that look alike."""
-
-    t: Array  # s
-    values: Array
-    label: str
-    style: dict[str, Any]
+#: Times in s, (n,), values at them, and how these are drawn, the label included.
+Curve = tuple[Array, Array, dict[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +70,7 @@ class Shown:
     def curve(self, values: Array) -> Curve:
         """Values over time in the method's colour."""
         style = look(self.method, self.place) if self.method else {"color": GREY}
-        return Curve(self.t, values, self.label, style)
+        return self.t, values, {"label": plain(self.label), **style}
 
 
 #: Labels of frequencies by what is bounded, of a generator or of all.
@@ -118,8 +112,8 @@ def load_panel(case: Case, one: Shown) -> Panel:
     """The loads that move most, pu."""
     curves = []
     for colour, dashes, j in zip(PALETTE, DASHES, busiest([one.p_load], FEW), strict=False):
-        style = {"color": colour, "dashes": dashes, "linewidth": 0.9}
-        curves.append(Curve(one.t, one.p_load[:, j], f"load {case.loads[j]}", style))
+        style = {"color": colour, "dashes": dashes, "linewidth": 0.9, "label": f"load {case.loads[j]}"}
+        curves.append((one.t, one.p_load[:, j], style))
     return Panel("loads (pu)", curves)
 
 
@@ -138,9 +132,9 @@ def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:
     with new_figure(0.7 + (1.35 if columns == 1 else 1.8) * rows) as figure:
         axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
         for ax, panel in zip(axes, panels, strict=False):
-            for curve in panel.curves:
-                step = max(1, len(curve.t) // POINTS)
-                ax.plot(curve.t[::step], curve.values[::step], label=plain(curve.label), **curve.style)
+            for t, values, style in panel.curves:
+                step = max(1, len(t) // POINTS)
+                ax.plot(t[::step], values[::step], **style)
             for level in panel.limits:
                 ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
             ax.margins(x=0.0)

@@ -65,38 +65,33 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
     if case.slack is None:
         raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
     solver = read_options(Options, settings.options).solver
-    if solver != "piqp":
-        if not isinstance(surrogate, Koopman):
-            raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")
-        return _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
-    by_arrays = _array_solver(case, surrogate, regime, settings)
-    if not isinstance(surrogate, Koopman):
-        return by_arrays
-    by_pyomo = _pyomo_solver(case, surrogate, regime, solver, settings.time_limit_s)
+    if solver != "piqp" and not isinstance(surrogate, Koopman):
+        raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")
+
+    limit_s = settings.time_limit_s
 
     def solve(instance: Instance) -> Solution:
-        small = _entries(case, surrogate, instance.steps) <= PYOMO_ENTRIES
-        return by_pyomo(instance) if small else by_arrays(instance)
+        is_small = solver != "piqp" or _entries(case, surrogate, instance.steps) <= PYOMO_ENTRIES
+        if is_small and isinstance(surrogate, Koopman):
+            return _solve_model(case, surrogate, regime, solver, limit_s, instance)
+        most_s = TIME_LIMIT_S if limit_s is None else limit_s
+        return _solve_arrays(case, surrogate, regime, most_s, instance)
 
     return solve
 
 
-def _array_solver(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
-    """A solver that makes the arrays of each instance's program."""
-
-    def solve(instance: Instance) -> Solution:
-        points = np.arange(instance.steps + 1)
-        needed = ARRAYS_BYTES * _entries(case, surrogate, instance.steps)
-        if refusal := too_large(needed, f"the program of {len(points)} points", "`ded-ko-knots` takes fewer"):
-            return refusal
-        limit_s = TIME_LIMIT_S if settings.time_limit_s is None else settings.time_limit_s
-        # Softly, since one widening for all of thousands of intervals would be a dense column.
-        solution = solve_on_surrogate(
-            case, surrogate, instance, case.bounds(regime), points, limit_s, soft=True
-        )
-        return replace(solution, schedule=None) if solution.status == Status.INFEASIBLE else solution
-
-    return solve
+def _solve_arrays(
+    case: Case, surrogate: Surrogate, regime: str, time_limit_s: float, instance: Instance
+) -> Solution:
+    """Solve by the arrays of the instance's program."""
+    points = np.arange(instance.steps + 1)
+    needed = ARRAYS_BYTES * _entries(case, surrogate, instance.steps)
+    if refusal := too_large(needed, f"the program of {len(points)} points", "`ded-ko-knots` takes fewer"):
+        return refusal
+    # Softly, since one widening for all of thousands of intervals would be a dense column.
+    bounds = case.bounds(regime)
+    solution = solve_on_surrogate(case, surrogate, instance, bounds, points, time_limit_s, soft=True)
+    return replace(solution, schedule=None) if solution.status == Status.INFEASIBLE else solution
 
 
 def _entries(case: Case, surrogate: Surrogate, steps: int) -> int:
@@ -106,25 +101,20 @@ def _entries(case: Case, surrogate: Surrogate, steps: int) -> int:
     return steps * n_state * (n_state + 2 * n_gen + 1)
 
 
-def _pyomo_solver(
-    case: Case, koopman: Koopman, regime: str, solver: str, time_limit_s: float | None
-) -> Solver:
-    """A solver through the Pyomo model; one compiled program per process serves all instances."""
-
-    def solve(instance: Instance) -> Solution:
-        koopman.check_step(instance)
-        needed = PYOMO_BYTES * _entries(case, koopman, instance.steps)
-        if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
-            return refusal
-        started = time.perf_counter()
-        program = case, koopman, instance.steps
-        model = _built(*program)
-        set_instance(model, case, koopman, instance, regime)
-        build_s = time.perf_counter() - started
-        outcome = _compiled(*program, solver).solve(time_limit_s)
-        return answer(outcome, build_s, lambda: schedule_of(model, instance))
-
-    return solve
+def _solve_model(
+    case: Case, koopman: Koopman, regime: str, solver: str, time_limit_s: float | None, instance: Instance
+) -> Solution:
+    """Solve by the Pyomo model; one compiled program per process serves all instances."""
+    koopman.check_step(instance)
+    needed = PYOMO_BYTES * _entries(case, koopman, instance.steps)
+    if refusal := too_large(needed, "the Pyomo model", "solver=piqp makes arrays instead"):
+        return refusal
+    started = time.perf_counter()
+    model = _built(case, koopman, instance.steps)
+    set_instance(model, case, koopman, instance, regime)
+    build_s = time.perf_counter() - started
+    outcome = _compiled(case, koopman, instance.steps, solver).solve(time_limit_s)
+    return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
 
 @functools.lru_cache(maxsize=1)

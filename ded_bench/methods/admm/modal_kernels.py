@@ -337,33 +337,3 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
                 state[2, m] = v
             for m in range(used):
                 change[k + 1, first + m] = state[2, m]
-
-
-@compiled
-def modal_products(maps: Array, outputs: Array, one: Array, other: Array, found: Array) -> None:
-    """One · A_i other for the parts A_i of the matrix of `modal_change`, one for each weight.
-
-    Args:
-        maps: of the mean modes, (batch, POINTS + 1, 2, 4, n_modes).
-        outputs: see `modal_change`, (batch, 2, n_modes).
-        one: modal powers at the knots, (batch, n_knots, n_modes); likewise `other`.
-        other: to multiply it with.
-        found: receives the sums over the batch, (4,).
-    """
-    found[:] = 0.0
-    x, y = np.zeros(4), np.zeros(4)  # (q, q̇, v, v⁺)
-    for b in range(len(one)):
-        for m in range(one.shape[2]):
-            x[:], y[:] = 0.0, 0.0
-            for j in range(1, one.shape[1]):
-                x[2], x[3] = one[b, j - 1, m], one[b, j, m]
-                y[2], y[3] = other[b, j - 1, m], other[b, j, m]
-                found[0] += x[3] * y[3]
-                found[1] += (x[3] - x[2]) * (y[3] - y[2])
-                for i in range(1, maps.shape[1]):
-                    to_q, to_speed = maps[b, i, 0, :, m], maps[b, i, 1, :, m]
-                    found[2] += outputs[b, 0, m] * (to_speed * x).sum() * (to_speed * y).sum()
-                    found[3] += outputs[b, 1, m] * (to_q * x).sum() * (to_q * y).sum()
-                last_q, last_speed = maps[b, -1, 0, :, m], maps[b, -1, 1, :, m]
-                x[0], x[1] = (last_q * x).sum(), (last_speed * x).sum()
-                y[0], y[1] = (last_q * y).sum(), (last_speed * y).sum()

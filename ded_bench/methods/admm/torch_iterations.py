@@ -22,11 +22,13 @@ from ded_bench.methods.admm.admm_inference import (
     weight_shapes,
 )
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start, linear_between
-from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, modal_products, swing, swing_adjoint
+from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, swing, swing_adjoint
 from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.training_run import follow_within
 from ded_bench.problem.case import Array
 
+#: By what part of it a weight is changed for a difference quotient; all is in double precision.
+QUOTIENT = 1e-6
 #: Powers (batch, n_knots, n_gen), ω (batch, n_points, n_gen) and P_s (batch, n_points).
 Answer = tuple[Tensor, Tensor, Tensor]
 
@@ -187,19 +189,20 @@ class ModalChange(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gradient: Tensor, weights: Tensor, modes: MeanModes) -> Tensor:
         """See `modal_change`; gradient (batch, n_knots, n_gen), weights (4,), modes of `mean_modes_of`."""
-        ctx.modes, ctx.weights = modes, _double(weights)
-        ctx.change = _changes(_double(gradient), ctx.weights, modes)
+        ctx.modes, ctx.gradient, ctx.weights = modes, _double(gradient), _double(weights)
+        ctx.change = _changes(ctx.gradient, ctx.weights, modes)
         return _single(ctx.change)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Another solution with the same, symmetric, matrix; for the weights, its parts between both."""
-        modes, maps, outputs = ctx.modes
-        on_gradient = _changes(_double(gradients[0]), ctx.weights, ctx.modes)
-        back = np.linalg.inv(modes.swapaxes(1, 2))
-        on_weights = np.zeros(4)
-        modal_products(maps, outputs, on_gradient @ back, ctx.change @ back, on_weights)
-        return _single(on_gradient), _single(on_weights), None
+        """Another solution with the same, symmetric, matrix; for the weights, difference quotients."""
+        on_change, on_weights = _double(gradients[0]), np.empty(4)
+        for i, more in enumerate(QUOTIENT * ctx.weights):
+            weights = ctx.weights.copy()
+            weights[i] += more
+            change = _changes(ctx.gradient, weights, ctx.modes) - ctx.change
+            on_weights[i] = (on_change * change).sum() / more
+        return _single(_changes(on_change, ctx.weights, ctx.modes)), _single(on_weights), None
 
 
 def means_over_time(n: int) -> Tensor:

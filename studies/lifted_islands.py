@@ -350,7 +350,7 @@ def test(case: Case, count: int) -> None:
 def planned(case: Case, regime: str, surrogate: AlongTrajectory, instances: list[Instance]) -> pd.DataFrame:
     """Scores and times of what has a plan, by instance."""
     rows = {}
-    solve = ded_ko_knots.prepare_with(case, surrogate, regime, Settings())
+    solve = ded_ko_knots.KnotSolver(case, surrogate, regime)
     for instance in instances:
         answer = solve(coarse(instance) if isinstance(surrogate, Identified) else instance)
         if answer.schedule is not None:

@@ -49,14 +49,7 @@ class Options:
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return a solver of single instances on the surrogate that the settings name."""
-    return prepare_with(
-        case, find_surrogate(case, settings.model or "koopman", settings.search), regime, settings
-    )
-
-
-def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> Solver:
-    """Return a solver of single instances.
+    """Return a solver of single instances on the surrogate that the settings name.
 
     Raises:
         InputError: the case is an island; or the solver wants a lifted model, and this surrogate is none.
@@ -64,6 +57,7 @@ def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settin
     case.check_regimes([regime])
     if case.slack is None:
         raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
+    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
     solver = read_options(Options, settings.options).solver
     if solver != "piqp" and not isinstance(surrogate, Koopman):
         raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")

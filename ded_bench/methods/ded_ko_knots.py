@@ -27,13 +27,8 @@ VERSION = 1
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances on the surrogate that the settings name."""
-    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
-    return prepare_with(case, surrogate, regime, settings)
-
-
-def prepare_with(case: Case, surrogate: Surrogate, regime: str, settings: Settings) -> KnotSolver:
-    """Return a solver of single instances."""
     case.check_regimes([regime])
+    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
     return KnotSolver(case, surrogate, regime, settings.time_limit_s)
 
 

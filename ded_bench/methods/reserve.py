@@ -24,10 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
+from ded_bench.surrogates.linear import at_nominal_point
 
 
 def steady_speeds(case: Case) -> tuple[Array, Array]:
@@ -37,8 +37,7 @@ def steady_speeds(case: Case) -> tuple[Array, Array]:
         Speeds -K T under ramps of 1 pu/s of each load's injection if nobody follows, (n_load, n_gen), rad/s;
         and the compliance K, (n_gen, n_gen), rad/pu.
     """
-    network = Network(case)
-    linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
+    linear = at_nominal_point(case)
     compliance = np.asarray(np.linalg.inv(linear.stiffness), dtype=np.float64)
     return -(compliance @ linear.share).T, compliance
 

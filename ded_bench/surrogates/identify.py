@@ -16,7 +16,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import SimulationError, servable, simulate
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
@@ -173,8 +172,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     Their instances come from masters that no benchmark uses (3,000,000 + seed), under
     schedules that need no optimisation.
     """
-    network = Network(case)
-    start = energy_form(case, network.power_flow(case.p_nominal, case.load_nominal))
+    start = energy_form(case)
     if not _is_small(case):
         return make_model(case, start, {"seed": seed, "trajectories": 0})
     count = n_training(case) if count is None else count
@@ -182,7 +180,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     training: dict[str, int | float] = {"seed": seed, "trajectories": data.inputs.shape[1]}
 
     def residuals(x: Array) -> Array:
-        unit = np.append(np.full(len(network.generators), OMEGA_UNIT), SLACK_UNIT)
+        unit = np.append(np.full(len(case.generators), OMEGA_UNIT), SLACK_UNIT)
         error = predict(make_model(case, unpack(start, x)), data) - data.outputs
         return np.asarray((error[::STRIDE] / unit).ravel())
 

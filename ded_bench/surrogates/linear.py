@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.lossless.network import Linearisation, Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.surrogates.koopman import Koopman
 
@@ -66,11 +66,15 @@ def steady_state(case: Case) -> Array:
     return b
 
 
-def energy_form(case: Case, theta: Array) -> EnergyForm:
-    """The energy form of the linearisation at angles `theta`, shape (n_bus,), up to ε."""
+def at_nominal_point(case: Case) -> Linearisation:
+    """The swing equations linearised at the power flow of nominal powers and loads."""
     network = Network(case)
-    linear = network.linearise(theta)
-    n = len(case.generators)
+    return network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
+
+
+def energy_form(case: Case) -> EnergyForm:
+    """The energy form of the linearisation at the nominal point, up to ε."""
+    linear, n = at_nominal_point(case), len(case.generators)
     mix = injections_from_generators(n)
     hessian = np.linalg.inv(mix @ linear.stiffness @ mix.T)
     skew = np.zeros((2 * n, 2 * n))
@@ -122,19 +126,17 @@ def physical_model(
 
 def by_angles(case: Case) -> Array:
     """By how much ψ changes at the nominal point with the generators' angles, (2 n_gen, n_gen), per rad."""
-    network, n = Network(case), len(case.generators)
-    linear = network.linearise(network.power_flow(case.p_nominal, case.load_nominal))
-    return np.vstack([np.zeros((n, n)), injections_from_generators(n) @ linear.stiffness])
+    n = len(case.generators)
+    mix = injections_from_generators(n)
+    return np.vstack([np.zeros((n, n)), mix @ at_nominal_point(case).stiffness])
 
 
 def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
     """The surrogate `linear`: the linearisation at the nominal point; `dt_s` as in `physical_model`."""
-    network, n = Network(case), len(case.generators)
-    theta = network.power_flow(case.p_nominal, case.load_nominal)
-    linear = network.linearise(theta)
+    linear, n = at_nominal_point(case), len(case.generators)
     rates = np.zeros((2 * n, 2 * n))
     rates[:, :n] = by_angles(case)
     rates[:n, :n] -= np.diag(linear.d / linear.m)
     rates[:n, n:] = -np.linalg.inv(injections_from_generators(n)) / linear.m[:, None]
     facts = {"source": "linearisation at the nominal point"}
-    return physical_model(case, "linear", rates, energy_form(case, theta).feedthrough, facts, dt_s)
+    return physical_model(case, "linear", rates, energy_form(case).feedthrough, facts, dt_s)

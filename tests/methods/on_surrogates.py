@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ded_bench.methods import ded_ko, ded_ko_knots
-from ded_bench.methods.solution import Solution
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surrogate_program import OMEGA_TOLERANCE
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -58,3 +58,10 @@ def check_limits(case: Case, koopman: Koopman, instance: Instance, solution: Sol
     assert (case.p_min - p_gen).max() <= 1e-8
     assert p_gen[0].tolist() == instance.p_initial(case).tolist()
     return model
+
+
+def prepared(method, case: Case, surrogate, regime: str, settings: Settings | None = None):
+    """A method's solver on a surrogate that lies in no file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(method, "find_surrogate", lambda *_: surrogate)
+        return method.prepare(case, regime, settings or Settings())

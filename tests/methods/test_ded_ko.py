@@ -20,7 +20,7 @@ from ded_bench.solvers.compile import SOLVERS, OnArrays
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import linear_model
-from tests.methods.on_surrogates import METHODS, check_limits, replay, short
+from tests.methods.on_surrogates import METHODS, check_limits, prepared, replay, short
 
 NAMES = ("ded-ko", "ded-ko-knots")
 
@@ -35,7 +35,7 @@ def test_solvers_agree_and_their_solution_replays_on_the_model(
     case: Case, koopman: Koopman, regime: str
 ) -> None:
     instance = short(case, 3)
-    solve = [ded_ko.prepare_with(case, koopman, regime, Settings(f"solver={slug}")) for slug in SOLVERS]
+    solve = [prepared(ded_ko, case, koopman, regime, Settings(f"solver={slug}")) for slug in SOLVERS]
     solutions = [each(instance) for each in solve]
     for solution in solutions:
         check_limits(case, koopman, instance, solution, regime)
@@ -49,7 +49,7 @@ def test_solvers_agree_and_their_solution_replays_on_the_model(
 def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case, koopman: Koopman, slug: str) -> None:
     """One built model serves all instances."""
     first, last = (short(case, index, horizon_s=1.0) for index in range(2))
-    solve = ded_ko.prepare_with(case, koopman, "TO", Settings(f"solver={slug}"))
+    solve = prepared(ded_ko, case, koopman, "TO", Settings(f"solver={slug}"))
     solve(first)
     again = solve(last)
     model = build_ded_ko(case, koopman, last.steps)
@@ -74,9 +74,7 @@ def test_models_of_other_forms_serve_as_well(method, case: Case, koopman: Koopma
         g=np.vstack([koopman.g, np.zeros((1, koopman.g.shape[1]))]),
         lift=np.vstack([koopman.lift, np.ones((1, koopman.lift.shape[1]))]),
     )
-    own, plain, more = (
-        method.prepare_with(case, model, "NO", Settings())(instance) for model in (paper, koopman, wider)
-    )
+    own, plain, more = (prepared(method, case, model, "NO")(instance) for model in (paper, koopman, wider))
     check_limits(case, paper, instance, own, "NO")
     assert more.solver_objective == pytest.approx(plain.solver_objective, rel=1e-7)
     assert own.solver_objective != pytest.approx(plain.solver_objective, rel=1e-7)
@@ -90,12 +88,12 @@ def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: 
     spinning = dict.fromkeys(case.generators, 2.0)
     fast = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": spinning})})
     for bad, options in [(bad, options) for bad in (far, fast) for options in ways(method)]:
-        solution = method.prepare_with(case, koopman, "NO", Settings(options))(bad)
+        solution = prepared(method, case, koopman, "NO", Settings(options))(bad)
         assert solution.status == Status.INFEASIBLE
         assert solution.schedule is None
         assert solution.solver_objective is None
         assert solution.error
-    again = method.prepare_with(case, koopman, "NO", Settings())(instance)
+    again = prepared(method, case, koopman, "NO")(instance)
     assert again.status == Status.OPTIMAL
 
 
@@ -104,7 +102,7 @@ def test_what_is_only_just_impossible_is_infeasible_too(method, ninebus: Case) -
     """On a model that answers loads a step late, this instance's frequency cannot be held in time."""
     late = linear_model(ninebus)
     late = dataclasses.replace(late, g=np.zeros_like(late.g))
-    solution = method.prepare_with(ninebus, late, "TO", Settings())(short(ninebus, 2))
+    solution = prepared(method, ninebus, late, "TO")(short(ninebus, 2))
     assert solution.status == Status.INFEASIBLE
 
 
@@ -115,7 +113,7 @@ def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, k
     step = case.ramp_pu_per_s * instance.dt_s
     just = dict(zip(case.generators, (case.p_max + 0.5 * step).tolist(), strict=True))
     near = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": just})})
-    solution = method.prepare_with(case, koopman, "NO", Settings())(near)
+    solution = prepared(method, case, koopman, "NO")(near)
     assert solution.status == Status.OPTIMAL
     p_gen = solution.schedule.at(instance.grid)
     assert p_gen[0].tolist() == near.p_initial(case).tolist()
@@ -125,9 +123,9 @@ def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, k
 @pytest.mark.parametrize("method", METHODS)
 def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> None:
     with pytest.raises(InputError, match="unknown regime"):
-        method.prepare_with(case, koopman, "XX", Settings())
+        prepared(method, case, koopman, "XX")
     with pytest.raises(InputError, match=r"identified at 0\.01"):
-        method.prepare_with(case, koopman, "NO", Settings())(short(case, 0, dt_s=0.02))
+        prepared(method, case, koopman, "NO")(short(case, 0, dt_s=0.02))
     with pytest.raises(InputError, match="no such model"):
         method.prepare(case, "NO", Settings(model="nowhere"))
 

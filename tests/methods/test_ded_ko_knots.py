@@ -15,7 +15,7 @@ from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import linear_model
-from tests.methods.on_surrogates import HORIZON, check_limits, replay, short
+from tests.methods.on_surrogates import HORIZON, check_limits, prepared, replay, short
 
 
 class WholeProgram:
@@ -78,7 +78,7 @@ def test_knots_reach_the_optimum_of_the_program_with_all_rows(
     case: Case, koopman: Koopman, regime: str, index: int
 ) -> None:
     instance = short(case, index)
-    solution = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
+    solution = prepared(ded_ko_knots, case, koopman, regime)(instance)
     check_limits(case, koopman, instance, solution, regime)
     every_row = knots_with_all_rows(case, koopman, instance, regime)
     # Where P_s has both signs within a piece, the program's cost is too low there and its answer a little
@@ -94,7 +94,7 @@ def test_in_operation_what_is_infeasible_is_exceeded_least(ninebus: Case) -> Non
     instance, bound = short(ninebus, 0), ninebus.omega_bound("TO")
     omega = {bus: 1.2 * bound for bus in ninebus.generators}
     instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"omega": omega})})
-    solver = ded_ko_knots.prepare_with(ninebus, koopman, "TO", Settings())
+    solver = prepared(ded_ko_knots, ninebus, koopman, "TO")
     refused = solver(instance)
     assert (refused.status, refused.schedule) == (Status.INFEASIBLE, None)
     solution = solver.solve(instance)

@@ -21,7 +21,7 @@ from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 from ded_bench.run.bench import timed
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.linear import linear_model
-from tests.methods.on_surrogates import replay, short
+from tests.methods.on_surrogates import prepared, replay, short
 from tests.methods.test_ded_ko_knots import least_excess
 
 #: Between rows |ω| may pass the bound by SOFT_TOLERANCE of it, which saves at most this part of the cost.
@@ -46,7 +46,7 @@ def test_soft_limits_do_not_change_the_optimum(case: Case, koopman, regime: str)
     """A lifted model is the same along every plan; where limits can hold, the penalty is exact."""
     for index in range(3):
         instance = at_rest(case, short(case, index))
-        hard = ded_ko_knots.prepare_with(case, koopman, regime, Settings())(instance)
+        hard = prepared(ded_ko_knots, case, koopman, regime)(instance)
         soft = RealTimeSolver(case, koopman, regime)(instance)
         assert (hard.status, soft.status) == (Status.OPTIMAL, Status.FEASIBLE)
         assert soft.solver_objective == pytest.approx(hard.solver_objective, rel=SAVED)

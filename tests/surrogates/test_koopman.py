@@ -40,13 +40,8 @@ from ded_bench.surrogates.linear import (
 from tests.methods.on_surrogates import replay
 
 
-def nominal_form(case: Case):
-    network = Network(case)
-    return energy_form(case, network.power_flow(case.p_nominal, case.load_nominal))
-
-
 def test_every_parameter_value_is_stable_with_exact_equilibria(case: Case) -> None:
-    form, b, dt = nominal_form(case), steady_state(case), case.sampling.dt_s
+    form, b, dt = energy_form(case), steady_state(case), case.sampling.dt_s
     rng = np.random.default_rng(1)
     n_gen, n_in = len(case.generators), b.shape[1]
     for draw in range(1000):
@@ -71,14 +66,14 @@ def test_models_rest_at_the_equilibria_of_the_nonlinear_system(name: str) -> Non
         p_gen = rng.uniform(case.p_min, case.p_max)
         p_load = case.load_nominal * rng.uniform(0.95, 1.05, len(case.loads))
         theta = network.power_flow(p_gen, p_load)
-        for model in (linear_model(case), make_model(case, nominal_form(case))):
+        for model in (linear_model(case), make_model(case, energy_form(case))):
             psi = model.observables(theta, np.zeros(len(p_gen)), p_load)
             np.testing.assert_allclose(psi, b @ np.concatenate([p_gen, p_load]), atol=1e-10)
             np.testing.assert_array_equal(model.b, b)
 
 
 def test_energy_form_starts_at_the_linearisation(case: Case) -> None:
-    linear, model = linear_model(case), make_model(case, nominal_form(case))
+    linear, model = linear_model(case), make_model(case, energy_form(case))
     # The forms differ by the stability floor only, whose rates are a few EPSILON per second.
     np.testing.assert_allclose(model.k, linear.k, atol=10 * EPSILON * linear.dt_s)
     np.testing.assert_allclose(model.g, linear.g, atol=10 * EPSILON * linear.dt_s)

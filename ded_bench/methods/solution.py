@@ -74,11 +74,10 @@ def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> 
         InputError: there is no such model, or its file is wrong.
     """
     name = settings.model or default
-    from ded_bench.surrogates.find import find_model_file, find_surrogate  # and SciPy: the door does without
+    from ded_bench.surrogates.find import find_surrogate  # and SciPy: the door does without
 
     model = find_surrogate(case, name, settings.search)
-    path = find_model_file(case, name, settings.search)
-    return Artifact("model", model.kind, model.fingerprint, path)
+    return Artifact("model", model.kind, model.fingerprint, getattr(model, "path", None))
 
 
 def named(artifacts: Iterable[Artifact], kind: str) -> str:

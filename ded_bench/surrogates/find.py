@@ -122,46 +122,36 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
     """Return a surrogate by its kind, from the first folder that has it, or by its file's path.
 
     Raises:
-        InputError: there is no such model yet (names the command that makes it), or its file is wrong.
+        InputError: there is no such model yet (names the command that makes it), its file is wrong, or there
+            is none of this kind on the case's plant.
     """
     if name == TRAJECTORY:
         return AlongTrajectory(plant_of(case))
     if name == "linear" and case.plant_name == "detailed" and case.slack is None:
         return AtNominalPoint(plant_of(case))  # type: ignore[arg-type]
-    return find_model(case, name, search)
-
-
-def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
-    """Return a lifted model by its kind, from the first folder that has it, or by its file's path.
-
-    Raises:
-        InputError: there is no such model yet (names the command that makes it), its file is wrong, or the
-            surrogate of this name is made for each instance, or for lossless grids only.
-    """
-    if name == TRAJECTORY:
-        raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")
     if name in MODELS and case.plant_name != "lossless":
         known = f"linear or {TRAJECTORY}" if case.slack is None else TRAJECTORY
         problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {known}"
         raise InputError("--model", name, problem)
-    path = find_model_file(case, name, search)
-    return linear_model(case) if path is None else Koopman.load(path, case)
+    if name == "linear":
+        return linear_model(case)
+    files, problem = [Path(name)], f"no such file and no such model (known: {', '.join(MODELS)})"
+    if name in TRAINED:
+        files = [ResultsFolder(folder).model(name) for folder in search]
+        problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
+    for file in files:
+        if file.is_file():
+            return Koopman.load(file, case)
+    raise InputError("--model", name, problem)
 
 
-def find_model_file(case: Case, name: str, search: Sequence[Path]) -> Path | None:
-    """The file that a model is read or derived from; None if it follows from the case.
+def find_model(case: Case, name: str, search: Sequence[Path]) -> Koopman:
+    """Return a lifted model, as `find_surrogate` does.
 
     Raises:
-        InputError: there is no such model yet (names the command that makes it).
+        InputError: as there, or the surrogate of this name is made for each instance.
     """
-    if name in ("linear", TRAJECTORY):
-        return None
-    if name in TRAINED:
-        for path in (ResultsFolder(folder).model(name) for folder in search):
-            if path.is_file():
-                return path
-        problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
-        raise InputError("--model", name, problem)
-    if Path(name).is_file():
-        return Path(name)
-    raise InputError("--model", name, f"no such file and no such model (known: {', '.join(MODELS)})")
+    found = find_surrogate(case, name, search)
+    if isinstance(found, Koopman):
+        return found
+    raise InputError("--model", name, "has no K for all instances; `ded-ko` and `ded-ko-knots` know it")

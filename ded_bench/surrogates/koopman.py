@@ -54,6 +54,7 @@ class Koopman:
     lift: Array  # (n_psi, 2 n_bus + n_gen + n_load + 1)
     mlp: tuple[tuple[Array, Array], ...] = ()  # (weight, bias) of each layer
     training: dict[str, Any] = field(default_factory=dict)
+    path: Path | None = None  # the file that it was read from
 
     @functools.cached_property
     def network(self) -> Network:
@@ -209,6 +210,7 @@ class Koopman:
                 case=case,
                 dt_s=float(header["dt_s"]),
                 training=dict(header["training"]),
+                path=Path(path),
                 mlp=mlp,
                 **{name: arrays[name] for name in ("k", "b", "g", "lift")},
             )

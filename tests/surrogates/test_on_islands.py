@@ -76,6 +76,6 @@ def test_it_rests_where_the_plant_rests(island: Case, quiet_instance: Any) -> No
 
 
 def test_no_lifted_model_of_an_island_is_found(island: Case) -> None:
-    for name in ("linear", "koopman"):
-        with pytest.raises(InputError, match="use linear or trajectory"):
+    for name, told in (("linear", "no K for all"), ("koopman", "use linear or trajectory")):
+        with pytest.raises(InputError, match=told):
             find_model(island, name, [])

@@ -31,7 +31,6 @@ from ded_bench.methods.solution import Settings, named
 from ded_bench.plants.plant import plant_of, servable
 from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.legacy import upgraded
@@ -256,17 +255,13 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
     rows = []
     for index in indices:
         instance = next(sample_instances(case, CERTIFICATE_SEED + seed, 1, index, servable))
-        own, other = (_score(case, m, candidate.regime, s, instance) for m, s in candidate.pair)
+        tasks = [Task(instance, "", candidate.regime, *one) for one in candidate.pair]
+        verdicts = [solve_and_score(case, task, plant_of(case).name).verdict for task in tasks]
+        # None where there is no schedule, or its plant cannot follow it.
+        own, other = (verdict if isinstance(verdict, Score) else None for verdict in verdicts)
         cells = {name: getattr(own, name) for name in SCORES} if own else {}
         rows.append(CertificateRow(index, "", reference=other.objective if other else None, **cells))
     return rows
-
-
-def _score(case: Case, method: str, regime: str, settings: Settings, instance: Instance) -> Score | None:
-    """The score of an answer; None where there is no schedule, or its plant cannot follow it."""
-    task = Task(instance, "", regime, method, settings)
-    verdict = solve_and_score(case, task, plant_of(case).name).verdict
-    return verdict if isinstance(verdict, Score) else None
 
 
 def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:

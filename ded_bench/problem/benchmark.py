@@ -14,7 +14,6 @@ from pydantic import Field
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record, write_atomically, write_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
-from ded_bench.problem.detailed_case import DetailedCase
 from ded_bench.problem.grid_files import GRID_FILES
 from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.quantities import Name
@@ -135,7 +134,7 @@ def write_benchmark(
     write_record(draw_split(list(written), seed, n_test), folder / "split.json")
     names = [f"instances/{name}.json" for name in written]
     _remove_others(folder / "instances", names)
-    own = ["case.json", *GRID_FILES] if isinstance(case, DetailedCase) else ["case.json"]
+    own = ["case.json", *(GRID_FILES if case.needs_grid else ())]
     return _write_manifest(folder, [*own, "split.json", *names], sum(written.values()))
 
 

@@ -62,7 +62,8 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
 
 def _solve(case: Case, regime: str, time_limit_s: float | None, instance: Instance) -> Solution:
     """IPOPT on the whole program."""
-    if refusal := too_large(program_bytes(case, instance), "the Pyomo model", "`ded-slp` takes less"):
+    needed = BYTES_PER_FLOW * len(lossless(case).lines) * (instance.steps + 1)
+    if refusal := too_large(needed, "the Pyomo model", "`ded-slp` takes less"):
         return refusal
     started = time.perf_counter()
     model = _built(case, instance.steps, instance.dt_s)
@@ -92,11 +93,6 @@ def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: 
         solve_s=(verdict.solve_s or 0.0) + spent_s,
         solver_version=f"{found.solver_version}, {verdict.solver_version}".removeprefix(", "),
     )
-
-
-def program_bytes(case: Case, instance: Instance) -> int:
-    """About the memory that the model and IPOPT take, bytes."""
-    return BYTES_PER_FLOW * len(lossless(case).lines) * (instance.steps + 1)
 
 
 @functools.lru_cache(maxsize=1)

@@ -25,14 +25,14 @@ from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.ipopt import CasadiIpopt
+from ded_bench.solvers.ipopt import CasadiIpopt, run_ipopt
 from ded_bench.solvers.status import Status
 
 #: Raised when answers change.
 VERSION = 1
 #: Longest mean element where none is given, s and in periods of the fastest mode (validation draws).
 LONGEST_S, LONGEST_PERIODS = 0.1, 0.125
-#: Memory that IPOPT takes for an entry of `program_bytes`. Measured as the peak of a
+#: Memory that IPOPT takes for an entry of all elements' blocks. Measured as the peak of a
 #: process that solves one instance, less what imports take: 16 bytes on 39bus (0.7 GiB in all), 11 on
 #: 68bus (1.3 GiB); on 9bus 93 and on two-area 56, but 0.3 GiB in all. Larger grids are extrapolated.
 BYTES_PER_ENTRY = 17
@@ -64,14 +64,15 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()
         elements = element_count(case, instance, length_s)
-        needed = program_bytes(case, elements)
+        columns = len(POINTS) * (len(case.generators) + case.n_bus + 1) + len(case.generators)
+        needed = BYTES_PER_ENTRY * elements * columns**2  # as if each element were a dense block
         if refusal := too_large(needed, f"the program of {elements} elements", "`ded-slp` takes less"):
             return refusal
         ends = element_ends(instance, elements)
         program = _program(case, elements, settings.time_limit_s)
         arguments = program.arguments(instance, regime, ends)
         build_s = time.perf_counter() - started
-        outcome, x = program.solve(arguments)
+        outcome, x = run_ipopt(program.solver, arguments, 0.0)
         return answer(outcome, build_s, lambda: None if x is None else program.schedule(x, instance, ends))
 
     return solve
@@ -104,13 +105,6 @@ def _on_detailed(
 @functools.lru_cache(maxsize=1)
 def _program(case: Case, elements: int, limit_s: float | None) -> RadauProgram:
     return RadauProgram(case, elements, limit_s)
-
-
-def program_bytes(case: Case, elements: int) -> int:
-    """About the memory that IPOPT takes for so many elements, bytes, as if each were a dense block."""
-    n_gen, n_bus = len(case.generators), case.n_bus
-    columns = len(POINTS) * (n_gen + n_bus + 1) + n_gen  # as in `RadauProgram`
-    return BYTES_PER_ENTRY * elements * columns**2
 
 
 def default_element(case: Case) -> float:

@@ -18,8 +18,7 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
-from ded_bench.solvers.ipopt import make_ipopt, run_ipopt
-from ded_bench.solvers.status import Outcome
+from ded_bench.solvers.ipopt import make_ipopt
 
 #: Collocation points of the Radau IIA method with three stages, as fractions of an element, and the
 #: weights of its quadrature (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.5).
@@ -78,7 +77,8 @@ class RadauProgram:
         points = columns[:, :-n_gen].reshape(elements, n_point, -1)
         self.angle, self.slack, self.theta, self.omega = np.split(points, self._cuts[1:-1], axis=2)
         self.initial, self.p_gen = initial, np.vstack([initial[-n_gen:], columns[:, -n_gen:]])
-        self._solver = self._make(np.hstack([columns[:, :1] - 3 * n_gen + initial, columns]), limit_s)
+        #: IPOPT; each solve starts from its own arguments.
+        self.solver = self._make(np.hstack([columns[:, :1] - 3 * n_gen + initial, columns]), limit_s)
 
     def _element(self) -> tuple[casadi.SX, casadi.SX, casadi.SX]:
         """One element: the columns that it sees, its length, s, and its rows."""
@@ -176,10 +176,6 @@ class RadauProgram:
             "ubg": np.hstack([right, limit]).ravel(),
             "p": np.concatenate([steps * instance.dt_s, cost, [weight[0] * abs(p_slack)]]),
         }
-
-    def solve(self, arguments: dict[str, Array]) -> tuple[Outcome, Array | None]:
-        """What IPOPT reports, and x if there is one; each solve starts from its own arguments."""
-        return run_ipopt(self._solver, arguments, 0.0)
 
     def schedule(self, x: Array, instance: Instance, ends: NDArray[np.int_]) -> Schedule:
         """The generator powers of a solution, with one row per element end.

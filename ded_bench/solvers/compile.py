@@ -45,22 +45,22 @@ class OnArrays:
             ValueError: two variables that are free multiply each other.
         """
         started = time.perf_counter()
-        now = self._program.now()
+        form, values, constant = self._program.now()
         setup = self._setup_s + time.perf_counter() - started
         self._setup_s = 0.0  # paid once, by the first solve
         started = time.perf_counter()
         left = np.inf if time_limit_s is None else time_limit_s
-        answer = SOLVERS[self._solver](now.form, left)
+        answer = SOLVERS[self._solver](form, left)
         if answer.status == Status.FAILED and self._solver == "piqp":
             spent = time.perf_counter() - started
-            other = ipopt.solve_form(now.form, max(left - spent, 1e-3))  # IPOPT wants some
+            other = ipopt.solve_form(form, max(left - spent, 1e-3))  # IPOPT wants some
             version, message = f"{answer.version}, {other.version}", f"{answer.message}, {other.message}"
             answer = dataclasses.replace(other, version=version, message=message)
         elapsed, objective = time.perf_counter() - started, None
         if answer.status in (Status.OPTIMAL, Status.FEASIBLE):
-            now.values[now.free] = answer.x
-            assign(self._program.columns, now.values)
-            objective = float(now.form.cost @ answer.x) + now.constant
+            values[np.isnan(values)] = answer.x
+            assign(self._program.columns, values)
+            objective = float(form.cost @ answer.x) + constant
         said = answer.iterations, setup, elapsed, objective, answer.version, answer.message
         return Outcome(answer.status, *said)
 

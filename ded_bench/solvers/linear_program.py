@@ -105,15 +105,6 @@ def told(form: FreeForm, answer: FormAnswer) -> FormAnswer:
     return answer
 
 
-class Instantiated(NamedTuple):
-    """One instance of a Pyomo model."""
-
-    form: FreeForm
-    values: Array  # of all columns, zero where they are free
-    free: NDArray[np.bool_]
-    constant: float  # what the form's objective leaves out
-
-
 @dataclass(frozen=True, eq=False)
 class LinearProgram:
     """row_lower <= a x <= row_upper, and an objective linear in x once the data are known."""
@@ -126,8 +117,12 @@ class LinearProgram:
     bilinear: sp.csr_matrix  # (n_columns, n_columns), symmetric: objective ½ xᵀ Q x + linear·x
     constant: float
 
-    def now(self) -> Instantiated:
+    def now(self) -> tuple[FreeForm, Array, float]:
         """The program under the current bounds of the Pyomo variables.
+
+        Returns:
+            The program of the free columns; values of all, not a number where they are free; and what its
+            objective leaves out.
 
         Raises:
             ValueError: two variables that are free multiply each other.
@@ -149,7 +144,8 @@ class LinearProgram:
             lower=lower[free],
             upper=upper[free],
         )
-        return Instantiated(form, data, free, self.constant + float(data @ (self.linear + 0.5 * slope)))
+        constant = self.constant + float(data @ (self.linear + 0.5 * slope))
+        return form, np.where(free, np.nan, data), constant
 
 
 def bounds(columns: Sequence[Any]) -> Array:

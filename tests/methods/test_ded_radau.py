@@ -16,6 +16,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.ipopt import run_ipopt
 from ded_bench.solvers.status import Status
 
 HORIZON = 2.0
@@ -94,7 +95,7 @@ def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> 
         lower, upper = arguments["lbx"], arguments["ubx"]
         lower[program.p_gen] = upper[program.p_gen] = schedule.at(instance.grid[ends])
         lower[program.omega], upper[program.omega] = -np.inf, np.inf
-        outcome, x = program.solve(arguments)
+        outcome, x = run_ipopt(program.solver, arguments, 0.0)
         assert outcome.status == Status.OPTIMAL
         errors.append(np.abs(x[program.omega[:, -1]] - truth.omega[ends[1:]]).max())
         cost = truth.p_gen @ instance.cost_gen(case)
@@ -116,7 +117,7 @@ def test_derivatives_of_all_elements_are_casadis(case: Case) -> None:
     rng = np.random.default_rng(0)
     at, weights = given["x0"] + rng.normal(0, 0.1, given["x0"].shape), rng.normal(size=given["lbg"].shape)
     rows, slopes, curvature = (
-        program._solver.get_function(name) for name in ("nlp_g", "nlp_jac_g", "nlp_hess_l")
+        program.solver.get_function(name) for name in ("nlp_g", "nlp_jac_g", "nlp_hess_l")
     )
     x = casadi.MX.sym("x", len(at))
     g = rows(x, given["p"])
@@ -153,7 +154,7 @@ def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_inst
         again = solve(instance)
         ends = element_ends(instance, len(again.schedule.t) - 1)
         fresh = RadauProgram(case, len(ends) - 1)
-        outcome, x = fresh.solve(fresh.arguments(instance, "TO", ends))
+        outcome, x = run_ipopt(fresh.solver, fresh.arguments(instance, "TO", ends), 0.0)
         assert again.status == outcome.status == Status.OPTIMAL
         assert again.solver_objective == pytest.approx(outcome.objective, rel=1e-12)
         np.testing.assert_allclose(again.schedule.p, fresh.schedule(x, instance, ends).p, atol=1e-12)

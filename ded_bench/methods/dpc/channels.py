@@ -105,7 +105,7 @@ class Channels:
     """
 
     sequence: Array  # loads, their bends, static dispatch, its slack power, (batch, n_knots, n_sequence)
-    constants: Array  # see `_constants`, (batch, n_constants)
+    constants: Array  # see `fill_machines`, (batch, n_constants)
     start: Array  # schedule to correct: it follows the static dispatch, (batch, n_knots, n_gen), pu
     free_response: Array32  # see `Response.free_response`
 
@@ -145,17 +145,38 @@ def n_channels(case: Case) -> tuple[int, int]:
 def fill_loads(load: Array, nodes: Array, p_load: Array, sequence: Array) -> None:
     """Loads of a batch at the nodes, then at the knots and their bends.
 
+    Every second node is a knot. A bend is how far a load's mean between two knots is off the chord, pu: it
+    tells where between them the load changes its slope.
+
     Args:
         load: see `StackedInstances`.
         nodes: (n_nodes,), s.
         p_load: receives loads at the nodes, (batch, n_load, n_nodes), pu.
         sequence: receives the first channels, (batch, n_sequence, n_knots).
     """
-    n_load = p_load.shape[1]
+    n_load, n_segments, spacing = p_load.shape[1], load.shape[2], nodes[2] - nodes[0]
     for b in range(len(p_load)):
         for i in range(n_load):
-            at_knots, bends = sequence[b, i], sequence[b, n_load + i]
-            _loads_and_bends(load[b, i], nodes, p_load[b, i], at_knots, bends)
+            segments, at_knots, bends = load[b, i], sequence[b, i], sequence[b, n_load + i]
+            initial = segments[0, 1]
+            following, before = 0, 0.0  # next segment, and ∫ (load - initial) dt up to the start of this one
+            start = rise = slope = area_before = rise_before = 0.0
+            for k in range(len(nodes)):
+                while following < n_segments and segments[following, 0] <= nodes[k]:
+                    width = segments[following, 0] - start
+                    before += width * (rise + 0.5 * slope * width)
+                    start, slope = segments[following, 0], segments[following, 2]
+                    rise = segments[following, 1] - initial
+                    following += 1
+                since = nodes[k] - start
+                change = rise + slope * since
+                p_load[b, i, k] = initial + change
+                if k % 2 == 0:
+                    area = before + 0.5 * since * (rise + change)
+                    at_knots[k // 2] = p_load[b, i, k]
+                    chord = 0.5 * (change + rise_before)
+                    bends[k // 2] = (area - area_before) / spacing - chord if k else 0.0
+                    area_before, rise_before = area, change
 
 
 @compiled
@@ -169,6 +190,9 @@ def fill_machines(
     start: Array,
 ) -> None:
     """What else a batch's channels hold, instance by instance; see `Channels`.
+
+    Constants are ratios of costs, then P_0 and ω(0). The ratios: each cost in all costs, each generator's in
+    its and the slack's, and of each pair of generators the difference in the sum.
 
     Args:
         cost: see `StackedInstances`; likewise `p_initial` and `omega`.
@@ -190,54 +214,18 @@ def fill_machines(
                 sequence[b, 2 * n_load + g, j] = start[b, g, j] = p_gen
             sequence[b, 2 * n_load + n_gen, j] = p_slack
         start[b, :, 0] = p_initial[b]
-        _constants(cost[b], p_initial[b], omega[b], constants[b])
-
-
-@compiled
-def _loads_and_bends(segments: Array, nodes: Array, p_load: Array, at_knots: Array, bends: Array) -> None:
-    """A load at the nodes and at the knots, and how far its mean between two knots is off the chord; pu.
-
-    Every second node is a knot. The bend tells where between two knots the load changes its slope.
-    """
-    n_segments, initial, spacing = len(segments), segments[0, 1], nodes[2] - nodes[0]
-    following, before = 0, 0.0  # next segment, and ∫ (load - initial) dt up to the start of this one
-    start = rise = slope = area_before = rise_before = 0.0
-    for k in range(len(nodes)):
-        while following < n_segments and segments[following, 0] <= nodes[k]:
-            width = segments[following, 0] - start
-            before += width * (rise + 0.5 * slope * width)
-            start, slope = segments[following, 0], segments[following, 2]
-            rise = segments[following, 1] - initial
-            following += 1
-        since = nodes[k] - start
-        change = rise + slope * since
-        p_load[k] = initial + change
-        if k % 2 == 0:
-            area = before + 0.5 * since * (rise + change)
-            at_knots[k // 2] = p_load[k]
-            bends[k // 2] = (area - area_before) / spacing - 0.5 * (change + rise_before) if k else 0.0
-            area_before, rise_before = area, change
-
-
-@compiled
-def _constants(cost: Array, p_initial: Array, omega: Array, constants: Array) -> None:
-    """Ratios of costs, then P_0 and ω(0).
-
-    Each cost in all costs, each generator's in its and the slack's, and of each pair of generators the
-    difference in the sum.
-    """
-    n_gen, k, total = len(p_initial), 0, 0.0
-    for i in range(1 + n_gen):
-        total += cost[i]
-    for i in range(1 + n_gen):
-        constants[k] = cost[i] / max(total, SMALLEST_SUM)
-        k += 1
-    for i in range(1, 1 + n_gen):
-        constants[k] = cost[i] / max(cost[i] + cost[0], SMALLEST_SUM)
-        k += 1
-    for i in range(1, 1 + n_gen):
-        for j in range(i + 1, 1 + n_gen):
-            constants[k] = (cost[i] - cost[j]) / max(cost[i] + cost[j], SMALLEST_SUM)
+        own, of, k, total = cost[b], constants[b], 0, 0.0
+        for i in range(1 + n_gen):
+            total += own[i]
+        for i in range(1 + n_gen):
+            of[k] = own[i] / max(total, SMALLEST_SUM)
             k += 1
-    for g in range(n_gen):
-        constants[k + g], constants[k + n_gen + g] = p_initial[g], omega[g]
+        for i in range(1, 1 + n_gen):
+            of[k] = own[i] / max(own[i] + own[0], SMALLEST_SUM)
+            k += 1
+        for i in range(1, 1 + n_gen):
+            for j in range(i + 1, 1 + n_gen):
+                of[k] = (own[i] - own[j]) / max(own[i] + own[j], SMALLEST_SUM)
+                k += 1
+        for g in range(n_gen):
+            of[k + g], of[k + n_gen + g] = p_initial[b, g], omega[b, g]

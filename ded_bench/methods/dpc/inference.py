@@ -43,7 +43,7 @@ class CompiledStages:
 
     def __init__(self, case: Case, response: Response, state: Mapping[str, np.ndarray]) -> None:
         half = 0.5 * (case.p_max - case.p_min)
-        stages = [_matrices(_part(state, f"stages.{i}."), half) for i in range(STAGES)]
+        stages = [_matrices(state, f"stages.{i}.", half) for i in range(STAGES)]
         self._weights = StageWeights(
             *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
         )
@@ -86,16 +86,15 @@ def weight_shapes(case: Case) -> dict[str, tuple[int, ...]]:
     return {f"stages.{i}.{name}": shape for i in range(STAGES) for name, shape in stage.items()}
 
 
-def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
-def _matrices(state: Mapping[str, np.ndarray], half: Array) -> StageWeights:
-    """The weights of one stage, from a ResidualNetwork's state; normalisation is part of them.
+def _matrices(weights: Mapping[str, np.ndarray], stage: str, half: Array) -> StageWeights:
+    """The weights of one stage, from those of all; normalisation is part of them.
 
     Args:
+        weights: by name.
+        stage: how names of its own begin.
         half: half of each generator's range, pu.
     """
+    state = {name.removeprefix(stage): value for name, value in weights.items() if name.startswith(stage)}
     blocks = range(len(DILATIONS))
     enter = state["embed.0.weight"] / state["constants_scale"]
     biases = np.concatenate([state["first.bias"], *(state[f"spread.{i}.bias"] for i in blocks)])
@@ -185,7 +184,10 @@ def add_corrections(
         for i in range(len(dilations)):
             _gather(hidden, dilations[i], columns)
             np.dot(spread[s, i], columns, inner)
-            _add_and_rectify(inner, bias[(1 + i) * width : (2 + i) * width])
+            for o in range(width):
+                row, own = inner[o], bias[(1 + i) * width + o]
+                for j in range(n):
+                    row[j] = max(row[j] + own, np.float32(0.0))
             np.dot(mix[s, i], inner, change)
             for o in range(width):
                 row = hidden[o, margin : margin + n]
@@ -220,12 +222,3 @@ def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
         at = first + tap * dilation
         for i in range(n_channels):
             _copy(padded[i, at : at + n], columns[tap * n_channels + i])
-
-
-@compiled
-def _add_and_rectify(values: Array32, bias: Array32) -> None:
-    """ReLU(values + bias), in place."""
-    for o in range(len(values)):
-        row, own = values[o], bias[o]
-        for j in range(len(row)):
-            row[j] = max(row[j] + own, np.float32(0.0))

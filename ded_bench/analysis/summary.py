@@ -264,19 +264,13 @@ def largest_violation(rows: pd.DataFrame) -> str:
     scored = rows.dropna(subset=["objective"])
     if not len(scored):
         return "–"
-    shares = _shares(scored).max()
+    units = scored[list(FEASIBLE)].astype(float) / pd.Series(FEASIBLE)
+    units["freq_violation_hz"] *= np.where(scored["excess_mean_hz"].notna(), FEASIBLE_HZ / ISLAND_HZ, 1.0)
+    shares = units.fillna(-1.0).max()
     name = str(shares.idxmax())
     if shares[name] <= 1:
         return "none"
     return f"{scored[name].max():.2g} {'Hz' if name == VIOLATIONS[0] else 'pu'} ({LIMITS[name]})"
-
-
-def _shares(rows: pd.DataFrame) -> pd.DataFrame:
-    """Every violation in units of the scorer's tolerance."""
-    shares = rows[list(FEASIBLE)].astype(float) / pd.Series(FEASIBLE)
-    is_island = rows["excess_mean_hz"].notna()
-    shares["freq_violation_hz"] *= np.where(is_island, FEASIBLE_HZ / ISLAND_HZ, 1.0)
-    return shares.fillna(-1.0)
 
 
 def outcome(frame: pd.DataFrame, timing: pd.DataFrame | None = None) -> pd.DataFrame:

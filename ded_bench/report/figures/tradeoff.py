@@ -13,7 +13,6 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import Bbox
 
-from ded_bench.analysis.reference import Paper
 from ded_bench.analysis.summary import title
 from ded_bench.methods.options import DEFAULT
 from ded_bench.report.figures.style import GREY, colour, legend_below, marker, new_figure, placed, plain
@@ -43,18 +42,15 @@ def draw(sources: Sources) -> Iterator[Picture]:
         "surrogates. Hollow: some schedules are infeasible; with an asterisk: timed under parallel load, not "
         f"by `ded-bench bench`{grey}. The vertical scale is linear within ±0.01 %."
     )
-    papers = paper_points(sources.paper) if sources.paper else pd.DataFrame(columns=["regime"])
+    paper, rows = sources.paper, []
+    if paper:  # the gap of its reference is zero
+        rows = [
+            (regime, paper.methods[name][0], name, row.increase_percent or 0.0, row.solve_s)
+            for regime, methods in paper.regimes.items()
+            for name, row in methods.items()
+        ]
+    papers = pd.DataFrame(rows, columns=["regime", "method", "name", "gap_percent", "seconds"])
     yield placed(tradeoff_figure(points, sources.reference.title, papers), sources, "tradeoff", caption)
-
-
-def paper_points(paper: Paper) -> pd.DataFrame:
-    """The paper's gaps and times; that of its reference is zero."""
-    rows = [
-        (regime, paper.methods[name][0], name, row.increase_percent or 0.0, row.solve_s)
-        for regime, methods in paper.regimes.items()
-        for name, row in methods.items()
-    ]
-    return pd.DataFrame(rows, columns=["regime", "method", "name", "gap_percent", "seconds"])
 
 
 def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) -> Figure:
@@ -63,7 +59,7 @@ def tradeoff_figure(points: pd.DataFrame, reference: str, papers: pd.DataFrame) 
     Args:
         points: see `summary.outcome`. Hollow markers: some schedules are infeasible.
         reference: its title.
-        papers: see `paper_points`; drawn in grey.
+        papers: `gap_percent` and `seconds` of a paper by regime, method and name; drawn in grey.
     """
     regimes = sorted(points["regime"].unique())
     with new_figure(0.5 + 2.9 * len(regimes)) as figure:

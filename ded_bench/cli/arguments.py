@@ -87,12 +87,8 @@ class WithDefaults(argparse.RawDescriptionHelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         default = action.default
-        if (
-            default is None
-            or default is False
-            or default == argparse.SUPPRESS
-            or "default:" in str(action.help)
-        ):
+        is_none = default is None or default is False or default == argparse.SUPPRESS
+        if is_none or "default:" in str(action.help):
             return action.help
         value = ",".join(default) if isinstance(default, tuple) else default
         return f"{action.help} (default: {value})"

@@ -159,10 +159,8 @@ def _score_one(a: argparse.Namespace) -> int:
     except SimulationError as error:
         print(f"ded-bench: {a.schedule}: {error}", file=sys.stderr)
         return 1
-    facts = dataclasses.asdict(verdict) | {
-        "feasible": verdict.feasible,
-        "feasible_strict": verdict.feasible_strict,
-    }
+    facts = dataclasses.asdict(verdict)
+    facts |= {name: getattr(verdict, name) for name in ("feasible", "feasible_strict")}
     if a.json:
         print(json.dumps({"instance": instance.id, "regime": regime} | facts))
     else:

@@ -70,7 +70,14 @@ def read_text(path: str | Path, largest: int = MAX_BYTES) -> str:
     Raises:
         InputError: it cannot be read, is no regular file, or larger than `largest`, also when unpacked.
     """
-    check_readable(path, largest)
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        found = None  # whoever opens it says why it cannot be
+    if found and not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+        raise InputError(path, "", "is no regular file")
+    if found and found.st_size > largest:
+        raise InputError(path, "", f"is larger than {largest >> 20} MiB")
     try:
         opened: Any = gzip.open if str(path).endswith(".gz") else open
         with opened(path, "rt", encoding="utf-8") as file:
@@ -83,18 +90,6 @@ def read_text(path: str | Path, largest: int = MAX_BYTES) -> str:
     if len(text) > largest:
         raise InputError(path, "", f"is larger than {largest >> 20} MiB")
     return text
-
-
-def check_readable(path: str | Path, largest: int = MAX_BYTES) -> None:
-    """Raise InputError where `path` is there but no regular file, or larger than `largest` bytes."""
-    try:
-        found = os.stat(path)
-    except (OSError, ValueError):
-        return  # whoever opens it says why it cannot be
-    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
-        raise InputError(path, "", "is no regular file")
-    if found.st_size > largest:
-        raise InputError(path, "", f"is larger than {largest >> 20} MiB")
 
 
 def parse_record(kind: type[R], text: str, source: str | Path) -> R:

@@ -28,9 +28,9 @@ from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, os
 from ded_bench.methods.admm.problems import POINTS, problems_of
 from ded_bench.methods.admm.torch_iterations import (
     ModalChange,
-    ScheduleLoss,
     TorchIterations,
     Transposed,
+    judged,
 )
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
@@ -166,14 +166,15 @@ def test_weights_move_settings_within_their_range(ninebus: Case) -> None:
 def test_compiled_iterations_are_those_of_torch(case: Case) -> None:
     """Every answer is that of torch, or the first schedule where that has less loss."""
     grid = modal_grid(case)
-    (start, linear), network, loss = started(grid), torch_iterations(grid), ScheduleLoss(grid)
+    (start, linear), network = started(grid), torch_iterations(grid)
     with torch.no_grad():
         last = network(start)[0].double().numpy()
     losses = []
     for powers in (start.schedule, last):
         outcome = [torch.as_tensor(o, dtype=torch.float32) for o in grid.respond(powers, start, linear)[1:]]
-        judged = loss(start, (torch.as_tensor(powers, dtype=torch.float32), outcome[0], outcome[1]))
-        losses.append((judged.cost + PRICE * judged.penalty).numpy())
+        answer = torch.as_tensor(powers, dtype=torch.float32), outcome[0], outcome[1]
+        cost, penalty, _ = judged(grid, start, answer)
+        losses.append((cost + PRICE * penalty).numpy())
     policy = random_policy("ded-admm", case)
     better = losses[1] <= losses[0]
     assert better.any()
@@ -189,13 +190,12 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     start = grid.start(problems_of(ninebus, [instance], grid.points))
     outcome = grid.respond(start.schedule, start, grid.along_first(start))
     tensors = [torch.as_tensor(part, dtype=torch.float32) for part in (start.schedule, *outcome[1:])]
-    loss = ScheduleLoss(grid)
-    judged = loss(start, (tensors[0], tensors[1], tensors[2]))
+    found, _, most = judged(grid, start, (tensors[0], tensors[1], tensors[2]))
     truth = score(ninebus, instance, Schedule(grid.knots, start.schedule[0]), "TO")
-    cost = float(judged.cost[0] * start.scale[0]) * len(instance.grid)
+    cost = float(found[0] * start.scale[0]) * len(instance.grid)
     assert cost == pytest.approx(truth.objective, rel=5e-4)
     excess = truth.freq_violation_hz * 2 * np.pi / grid.bound
-    assert float(judged.excess[0]) == pytest.approx(excess, abs=0.02)
+    assert float(most[0]) == pytest.approx(excess, abs=0.02)
 
 
 def test_training_starts_from_weights_of_another_grid(ninebus: Case, threebus: Case, tmp_path: Path) -> None:

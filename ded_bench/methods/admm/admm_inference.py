@@ -323,7 +323,7 @@ def _improve(
 def _loss(
     p: Array, omega: Array32, p_slack: Array32, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes
 ) -> float:
-    """Cost as a part of `Start.scale`, and the penalty; see `ScheduleLoss`."""
+    """Cost as a part of `Start.scale`, and the penalty; see `torch_iterations.judged`."""
     cost, penalty, (n, n_gen), n_points = 0.0, 0.0, p.shape, len(p_slack)
     for j in range(n):
         for g in range(n_gen):

@@ -18,7 +18,7 @@ from ded_bench.methods.admm.admm_inference import PRICE, weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, Start
 from ded_bench.methods.admm.problems import draw, problems_of
-from ded_bench.methods.admm.torch_iterations import ScheduleLoss, TorchIterations
+from ded_bench.methods.admm.torch_iterations import TorchIterations, judged
 from ded_bench.methods.island.island_training import train as train_on_island
 from ded_bench.methods.trained_policy import (
     Scope,
@@ -122,7 +122,6 @@ class _AdmmTraining(TrainingRun):
         case = network.grid.case
         self.grid, self.check, self.seed = network.grid, check, seed
         self.batch = max(SMALLEST_BATCH, ROWS // (len(case.generators) * case.n_knots))
-        self.judge = ScheduleLoss(network.grid)
 
     def batches(self) -> Sequence[int]:
         """Seeds of the steps: a training that goes on draws what it would have drawn."""
@@ -132,19 +131,19 @@ class _AdmmTraining(TrainingRun):
         """Cost and priced penalty of fresh draws."""
         grid, drawn = self.grid, (POLICY_SEED + self.seed, step * self.batch, self.batch)
         start = grid.start(draw(grid.case, grid.bound, grid.points, *drawn))
-        judged = self.judge(start, self.network(start), MARGIN)
+        cost, penalty, _ = judged(grid, start, self.network(start), MARGIN)
         used = torch.as_tensor(start.served)
-        penalty = PRICE * judged.penalty
-        return (judged.cost + penalty / (1.0 + penalty / HOPELESS))[used].mean() if used.any() else None
+        penalty = PRICE * penalty
+        return (cost + penalty / (1.0 + penalty / HOPELESS))[used].mean() if used.any() else None
 
     def look(self) -> dict[str, float]:
         """Loss of the average, its cost, and what it exceeds, Hz."""
         answer = self.average(self.check)
-        tight, own = (self.judge(self.check, answer, margin) for margin in (MARGIN, 0.0))
-        hertz = own.excess * self.grid.bound / (2 * math.pi)
+        cost, penalty, _ = judged(self.grid, self.check, answer, MARGIN)
+        hertz = judged(self.grid, self.check, answer)[2] * self.grid.bound / (2 * math.pi)
         return {
-            "held out": float((tight.cost + PRICE * tight.penalty).mean()),
-            "cost": float(own.cost.mean()),
+            "held out": float((cost + PRICE * penalty).mean()),
+            "cost": float(cost.mean()),
             "mean excess": float(hertz.mean()),
             "max excess": float(hertz.max()),
         }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -113,36 +112,30 @@ class TorchIterations(nn.Module):
         return p, omega, p_slack
 
 
-class ScheduleLoss:
-    """Judges schedules by what they do: relative cost, and a penalty on |ω| out of its bound.
+def judged(
+    grid: ModalGrid, start: Start, answer: Answer, margin: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Judge answers to problems by what they do; everything but the bound on |ω| holds by construction.
 
-    Everything but the bound holds by construction.
+    Args:
+        grid: has the bound.
+        start: of the problems.
+        answer: to them.
+        margin: by what part of it the bound is tightened.
+
+    Returns:
+        Cost as a part of `Start.scale`, penalty, and largest relative excess of |ω|, (batch,) each.
     """
-
-    def __init__(self, grid: ModalGrid) -> None:
-        self.grid, self.spacing = grid, float(grid.points[1])
-        self.at_points, self.at_knots = means_over_time(len(grid.points)), means_over_time(len(grid.knots))
-
-    def __call__(self, start: Start, answer: Answer, margin: float = 0.0) -> Judged:
-        """Judge the answers to problems; the bound is tightened by a fraction."""
-        powers, omega, p_slack = answer
-        cost = torch.as_tensor(start.problems.cost, dtype=torch.float32)
-        generators = ((powers * cost[:, None, 1:]).sum(dim=2) * self.at_knots).sum(dim=1)
-        total = generators + cost[:, 0] * (p_slack.abs() * self.at_points).sum(dim=1)
-        excess = (omega.abs() / self.grid.bound - (1.0 - margin)).relu()
-        bent = excess.clamp_max(STRAIGHT)
-        penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * self.spacing
-        scale = torch.as_tensor(start.scale, dtype=torch.float32)
-        return Judged(total / scale, penalty, excess.amax(dim=(1, 2)))
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """Cost as a part of `Start.scale`, penalty, and largest relative excess of |ω|, each (batch,)."""
-
-    cost: Tensor
-    penalty: Tensor
-    excess: Tensor
+    powers, omega, p_slack = answer
+    cost = torch.as_tensor(start.problems.cost, dtype=torch.float32)
+    at_knots, at_points = means_over_time(powers.shape[1]), means_over_time(p_slack.shape[1])
+    generators = ((powers * cost[:, None, 1:]).sum(dim=2) * at_knots).sum(dim=1)
+    total = generators + cost[:, 0] * (p_slack.abs() * at_points).sum(dim=1)
+    excess = (omega.abs() / grid.bound - (1.0 - margin)).relu()
+    bent = excess.clamp_max(STRAIGHT)
+    penalty = (excess + (excess - 0.5 * bent) * bent / DOUBLING).sum(dim=(1, 2)) * float(grid.points[1])
+    scale = torch.as_tensor(start.scale, dtype=torch.float32)
+    return total / scale, penalty, excess.amax(dim=(1, 2))
 
 
 class Respond(torch.autograd.Function):

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.knots import knot_points
+from ded_bench.methods.knots import knot_points, track
 from ded_bench.methods.options import option, read_options
-from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings, Solution, Solver
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.plants.time_varying import Indices

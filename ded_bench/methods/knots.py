@@ -1,4 +1,4 @@
-"""Knots on the grid of time: where they lie, what they weigh, what limits powers at them."""
+"""Knots on the grid of time: where they lie, what they weigh, what limits powers, and how those follow."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance
 
 #: In operation under secondary control, knots are as close as the case's so far ahead, s: on three drawn
@@ -118,3 +119,26 @@ def transfer_room(case: Case, instance: Instance, points: Indices) -> Array:
         largest = np.maximum.reduceat(short, points[:-1])
         column -= np.maximum(largest, np.append(largest[1:], 0.0))
     return room
+
+
+@compiled
+def track(p_gen: Array, low: Array, high: Array, step: Array) -> None:
+    """Turn the targets of a batch into powers that follow them as fast as bounds and ramps allow, in place.
+
+        p_0 = P_0,   p_{j+1} = min(max(clip(target_{j+1}), p_j - step), p_j + step)
+
+    By induction p stays within the generator bounds if P_0 is. Between knots a schedule is linear, so no two
+    neighbouring grid points differ by more than the ramp limit.
+
+    Args:
+        p_gen: P_0, then the targets, shape (batch, n_knots, n_gen), pu.
+        low: lower bounds, (n_gen,), pu; likewise `high`.
+        high: upper bounds.
+        step: largest change between two knots, the ramp limit times their spacing, (n_gen,), pu.
+    """
+    for b in range(p_gen.shape[0]):
+        for j in range(1, p_gen.shape[1]):
+            for g in range(p_gen.shape[2]):
+                before = p_gen[b, j - 1, g]
+                target = min(max(p_gen[b, j, g], low[g]), high[g])
+                p_gen[b, j, g] = min(max(target, before - step[g]), before + step[g])

@@ -172,7 +172,7 @@ def repeatable() -> Iterator[None]:
 
 
 def follow_within(targets: Tensor, p_initial: Tensor, low: Tensor, high: Tensor, step: Tensor) -> Tensor:
-    """Clip targets to bounds and follow them within ramps; see `ramp_follower.track`.
+    """Clip targets to bounds and follow them within ramps; see `knots.track`.
 
     Args:
         targets: shape (batch, n_knots - 1, n_gen), pu.

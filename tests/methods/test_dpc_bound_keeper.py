@@ -7,7 +7,7 @@ import pytest
 
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.refinement import PARTS, BoundKeeper, predict
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.score import score

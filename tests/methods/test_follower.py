@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.methods.training_run import follow_within
 from ded_bench.problem.compiled import compiled
 

@@ -29,7 +29,7 @@ from ded_bench.methods.admm.modal_kernels import (
     swing_adjoint,
 )
 from ded_bench.methods.admm.problems import POINTS
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
 

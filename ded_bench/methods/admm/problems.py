@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled

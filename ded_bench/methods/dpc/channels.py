@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ded_bench.methods.dpc.channels import Array32, Channels, Response, n_channels
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 

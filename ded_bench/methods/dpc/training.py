@@ -6,7 +6,7 @@ convolutions over the knots. Constants of the instance (costs, P_0, ω(0)) enter
 layer. Here it is in torch; `inference` is the same function for answers.
 
 The loss is the cost and an exact penalty on the frequency bound, both by a surrogate at every tenth of a
-second; everything else holds by construction (see `ramp_follower`).
+second; everything else holds by construction (see `knots.track`).
 """
 
 from __future__ import annotations

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.knots import knot_points, transfer_room
-from ded_bench.methods.ramp_follower import track
+from ded_bench.methods.knots import knot_points, track, transfer_room
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case

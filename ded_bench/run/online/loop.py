@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ded_bench.methods.knots import track
 from ded_bench.methods.plugin import accept
-from ded_bench.methods.ramp_follower import track
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
 from ded_bench.plants.score import AGC_COLUMN

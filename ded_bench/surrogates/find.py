@@ -45,12 +45,7 @@ class AlongTrajectory:
         return hashlib.sha256(f"{self.kind}|{self.plant.fingerprint}".encode()).hexdigest()[:12]
 
     def along(
-        self,
-        instance: Instance,
-        p_gen: Array,
-        points: Indices,
-        exact: bool = True,
-        state: PlantState = None,
+        self, instance: Instance, p_gen: Array, points: Indices, exact: bool = True, state: PlantState = None
     ) -> TimeVarying:
         """The plant linearised along the simulation of powers at the knots; see `Koopman.along`.
 
@@ -79,12 +74,7 @@ class AtNominalPoint(AlongTrajectory):
     _coarse: dict[float, CoarsePlant] = field(default_factory=dict, compare=False, repr=False)
 
     def along(
-        self,
-        instance: Instance,
-        p_gen: Array,
-        points: Indices,
-        exact: bool = True,
-        state: PlantState = None,
+        self, instance: Instance, p_gen: Array, points: Indices, exact: bool = True, state: PlantState = None
     ) -> TimeVarying:
         """See `AlongTrajectory.along`; what is followed is the linear model itself."""
         from ded_bench.plants.detailed.coarse import CoarsePlant  # and with it Numba

@@ -29,7 +29,6 @@ from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import plain_name
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, repeated
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -111,14 +110,7 @@ class Koopman:
         increments = np.broadcast_to(increments, (len(increments), *start.shape))
         return linear_recurrence(power, start, increments) + steady
 
-    def along(
-        self,
-        instance: Instance,
-        p_gen: Array,
-        points: Indices,
-        exact: bool = True,
-        state: PlantState = None,
-    ) -> TimeVarying:
+    def along(self, instance: Instance, p_gen: Array, points: Indices, *_: object) -> TimeVarying:
         """The linear model of one instance by which it answers to schedules linear between knots.
 
         It is made around its own rollout, with K, B and G those of all intervals: answers do not depend
@@ -128,7 +120,7 @@ class Koopman:
             instance: x_0 and the loads.
             p_gen: powers at the knots, shape (n_knots, n_gen), pu.
             points: grid points of the knots, strictly increasing from 0 to the last, shape (n_knots,).
-            exact: of no meaning here; likewise `state`.
+            _: what else other surrogates take.
 
         Raises:
             InputError: the model was identified at another time step than the instance's.

@@ -24,7 +24,6 @@ from ded_bench.problem.benchmark import problem_folder, select_split, validation
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
 from ded_bench.solvers.status import Status
-from ded_bench.surrogates.find import MODELS
 
 
 def add_commands(commands: Any) -> None:
@@ -75,8 +74,10 @@ def add_commands(commands: Any) -> None:
 
 
 def _bench(a: argparse.Namespace) -> int:
+    from ded_bench.analysis.summary import title
     from ded_bench.results.rows import Results
     from ded_bench.results.timing import model_name, timing_summary
+    from ded_bench.run.bench import bench, choose_sample, not_timed, runs_of
 
     chosen = select_split(a.case)
     case = chosen.case
@@ -86,19 +87,17 @@ def _bench(a: argparse.Namespace) -> int:
     skipped = {name: "no method has this name" for name in known if not a.method and name not in methods}
     skipped |= {name: "the results hold no rows of it" for name in methods if a.method and name not in known}
     for key in results.rows:
-        if key.method in methods and (model := model_name(key.model)) not in ("", *MODELS):
-            skipped[f"{key.method} on {model}"] = "its model was given as a file"
+        if key.method in methods and (reason := not_timed(key, methods[key.method])):
+            skipped[title(key.method, key.settings, model_name(key.model))] = reason
     for name, reason in sorted(skipped.items()):
         say(f"{name}: not timed, since {reason}")
-    if not known & set(methods):
+    jobs = runs_of(results.rows.values(), Settings(search=search_folders(case, results.folder)), methods)
+    if not jobs:
         raise InputError(
             results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
         )
-    timed = ", ".join(sorted(known & set(methods)))
+    timed = ", ".join(sorted({job.method for job in jobs}))
     say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
-    from ded_bench.run.bench import bench, choose_sample, runs_of
-
-    jobs = runs_of(results.rows.values(), Settings(search=search_folders(case, results.folder)), methods)
     rows = bench(
         case,
         choose_sample([instance for instance, _ in chosen.instances], a.instances),

@@ -34,7 +34,7 @@ from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import validation_instances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
-from ded_bench.results.rows import Row
+from ded_bench.results.rows import Key, Row
 from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
@@ -272,8 +272,8 @@ def _peak_memory_mib() -> float:
 def runs_of(rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method]) -> list[Job]:
     """What a results table holds, to be timed, in the methods' order.
 
-    Rows of other methods and of models given as a file are left out. A job all of whose rows were made with
-    a time limit has it, here as there: without it a call might take hours.
+    Rows of other methods and those `not_timed` are left out. A job all of whose rows were made with a time
+    limit has it, here as there: without it a call might take hours.
 
     Args:
         rows: of the table.
@@ -282,8 +282,8 @@ def runs_of(rows: Iterable[Row], settings: Settings, methods: Mapping[str, Metho
     """
     limits: dict[tuple[str, str, str, str], list[float | None]] = {}
     for row in rows:
-        model = model_name(row.model)
-        if row.method in methods and model in ("", *MODELS):
+        if row.method in methods and not not_timed(row.key, methods[row.method]):
+            model = model_name(row.model)
             own = dataclasses.replace(settings, options=row.settings, model=model)
             options = methods[row.method].canonical(own).options
             limits.setdefault((row.method, options, model, row.regime), []).append(row.time_limit_s)
@@ -296,6 +296,17 @@ def runs_of(rows: Iterable[Row], settings: Settings, methods: Mapping[str, Metho
         own = dataclasses.replace(settings, options=options, model=model, time_limit_s=limit)
         jobs.append(Job(method, regime, own))
     return jobs
+
+
+def not_timed(key: Key, method: Method) -> str:
+    """Why what made a row cannot be timed, empty if it can; rows may be of another version."""
+    if model_name(key.model) not in ("", *MODELS):
+        return "its model was given as a file"
+    try:
+        method.canonical(Settings(key.settings))
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def choose_sample(instances: Sequence[Instance], count: int = SAMPLE) -> list[Instance]:

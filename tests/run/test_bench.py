@@ -262,7 +262,7 @@ def test_full_ded_in_a_process_of_its_own(threebus: Case, tmp_path: Path) -> Non
 
 
 def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
-    """Settings and limits of the time come back from the rows; strangers and models from files do not."""
+    """Settings and limits of the time come back from the rows; what is unknown today does not."""
     rows = {
         Key("c", "a", "TO", "fake", "default", time_limit_s=9.0),
         Key("c", "b", "TO", "fake", "default", time_limit_s=20.0),
@@ -270,6 +270,7 @@ def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
         Key("c", "c", "NO", "fake", "default", time_limit_s=9.0),
         Key("c", "a", "TO", "fake", "fast=on", "linear@f00"),
         Key("c", "a", "TO", "fake", "default", "myfile@f00"),
+        Key("c", "a", "TO", "fake", "of=old"),
         Key("c", "a", "TO", "stranger", "default"),
     }
     made = [Row(split="test", status="Optimal", **key._asdict()) for key in rows]

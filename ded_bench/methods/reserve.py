@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg import expm
 
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
@@ -40,6 +41,30 @@ def steady_speeds(case: Case) -> tuple[Array, Array]:
     linear = at_nominal_point(case)
     compliance = np.asarray(np.linalg.inv(linear.stiffness), dtype=np.float64)
     return -(compliance @ linear.share).T, compliance
+
+
+def sudden_speeds(case: Case, t: Array) -> Array:
+    """How far machines of a lossless grid swing from rest after a ramp begins that nobody follows.
+
+    Args:
+        case: the grid, at its nominal point.
+        t: equally spaced, from 0, s.
+
+    Returns:
+        The largest |ω| until each time under a ramp of 1 pu/s of each load's injection,
+        (n_t, n_load, n_gen), rad/s.
+    """
+    linear, n = at_nominal_point(case), len(case.generators)
+    steady, compliance = steady_speeds(case)
+    a = np.zeros((2 * n, 2 * n))
+    a[:n, n:], a[n:, :n] = np.eye(n), -linear.stiffness / linear.m[:, None]
+    a[n:, n:] = -np.diag(linear.d / linear.m)
+    # Speeds are the steady ones and a free response, of angles and speeds, that begins where they cancel.
+    step, free = expm(a * t[1]), [np.vstack([compliance @ (linear.d[:, None] * steady.T), -steady.T])]
+    for _ in t[1:]:
+        free.append(step @ free[-1])
+    speeds = steady + np.swapaxes(np.array(free)[:, n:], 1, 2)
+    return np.asarray(np.maximum.accumulate(np.abs(speeds)))
 
 
 @dataclass(frozen=True, eq=False)

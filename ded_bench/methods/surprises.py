@@ -8,6 +8,8 @@ five are announced, with a start and a rate that err. So a planner that remember
   generators follow a ramp that is not there;
 * the start of a ramp is uncertain: about when it is announced. Plans leave more room there.
 
+Machines may be so slow that a plan comes before a ramp moves them far: then there is less to leave free.
+
 A plan is made when what is forecast is news, or the last plan is old.
 """
 
@@ -15,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.methods.reserve import Room, steady_speeds
+from ded_bench.methods.reserve import Room, steady_speeds, sudden_speeds
 from ded_bench.methods.state_estimate import passed_s
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, LoadPoints, LoadRamp
@@ -29,13 +31,16 @@ OLD_S, NEWS_S = 1.0, 2.0
 LOOK_S = 0.25
 #: No plan counts on a ramp that has not begun sooner than so many seconds from now.
 WAIT_S = 0.5
-#: Parts of the bound that plans leave free: always, and where a ramp's start is uncertain.
-ALWAYS, UNCERTAIN = 0.3, 0.5
+#: Parts of the bound that plans leave free: always, and where a ramp's start is uncertain; but no more than
+#: the steepest ramp moves any machine until a plan has effect, so long after the planner is asked again, s.
+ALWAYS, UNCERTAIN, EFFECT_S = 0.3, 0.5, 0.4
+#: Times at which that is known, s.
+REACTION_S = np.arange(0.0, OLD_S + EFFECT_S + 0.025, 0.05)
 #: Room for surprises at knots so far ahead, s; what may be left of the bound; how far a sudden ramp swings
 #: machines, in steady speeds, and how long, s; how long a ramp lasts, s; the price of a shortage.
 AHEAD_S, LIMIT, SWING, SWING_S, LASTS_S, PRICE = 15.0, 0.85, 3.0, 3.0, 16.0, 5.0
 #: A sudden ramp asks for room if so many times its steady speed, the swing without damping, is beyond the
-#: bound; another, if its steady speed is.
+#: bound, and plans come too late for it; another, if its steady speed is.
 OVERSHOOT = 2.0
 
 
@@ -52,13 +57,18 @@ class Surprises:
         #: Steady speeds by loads' ramps, and the compliance; None where no network tells.
         self._speeds = steady_speeds(case) if isinstance(case, LosslessCase) else None
         self._steepest = np.abs(case.load_rate).max(axis=0)
+        #: How far the steepest ramps move machines until each of REACTION_S, rad/s.
+        self._moved = np.full(len(REACTION_S), np.inf)
+        if isinstance(case, LosslessCase):
+            speeds = sudden_speeds(case, REACTION_S) * self._steepest[:, None]
+            self._moved = speeds.max(axis=(1, 2))
         #: Slower changes are no ramps, pu/s.
         self._slow = 0.5 * float(np.abs(case.load_rate).min())
         self._schedule: Schedule | None = None
         self._forget()
 
     def _forget(self) -> None:
-        self.now_s, self._planned_s = 0.0, 0.0
+        self.now_s, self._planned_s, self._between_s = 0.0, 0.0, OLD_S
         self._forecast: Instance | None = None  # that of the last plan
         self._known: set[tuple[int, int]] = set()  # stretches and loads whose ramp is known
         self._present, self._ramps = None, np.zeros(len(self._case.loads), dtype=bool)
@@ -74,6 +84,7 @@ class Surprises:
         if passed is None:
             self._forget()
         self.now_s += passed or 0.0
+        self._between_s = min(passed or OLD_S, OLD_S)
         self._look(instance, passed or 0.0)
         later = {
             bus: _delayed(instance.load[bus], at, WAIT_S - at, instance.horizon_s)
@@ -126,7 +137,11 @@ class Surprises:
         about = 2.0 * START_ERROR_S
         starts = np.array([at for at, _ in self._next])
         unsure = (np.abs(t[:, None] - np.maximum(starts, 0.0)) <= about).any(axis=1)
-        return np.where(unsure, UNCERTAIN, ALWAYS) * self._bound
+        return np.minimum(np.where(unsure, UNCERTAIN, ALWAYS) * self._bound, self._until_a_plan())
+
+    def _until_a_plan(self) -> float:
+        """How far a ramp may move machines until a plan has effect, rad/s."""
+        return float(np.interp(self._between_s + EFFECT_S, REACTION_S, self._moved))
 
     def room(self, t: Array) -> Room | None:
         """Room for all surprises at knots, but the first, of the next AHEAD_S.
@@ -144,6 +159,8 @@ class Surprises:
         speeds = np.array([rate * by_load[load] for _, load, rate, _ in found])
         is_sudden = np.array([one[-1] for one in found])
         asks = np.where(is_sudden, OVERSHOOT, 1.0) * np.abs(speeds).max(axis=1) > self._bound
+        if self._until_a_plan() < ALWAYS * self._bound:
+            asks &= ~is_sudden
         if not asks.any():
             return None
         return Room(

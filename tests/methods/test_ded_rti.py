@@ -9,15 +9,17 @@ from scipy.optimize import linprog
 from ded_bench.methods import ded_ko_knots, surprises
 from ded_bench.methods.ded_rti import NEAR_S, RealTimeSolver
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.reserve import steady_speeds
+from ded_bench.methods.reserve import steady_speeds, sudden_speeds
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surprises import AHEAD_S, ALWAYS, LASTS_S, LIMIT, Surprises
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.lossless.network import Network
+from ded_bench.plants.plant import simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
+from ded_bench.problem.schedule import Schedule
 from ded_bench.run.bench import timed
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.linear import linear_model
@@ -109,6 +111,39 @@ def test_speeds_are_those_of_the_power_flow(case: Case) -> None:
         ]
         # What is left of the central difference is of second order, and the digits of the power flow.
         assert np.allclose(one, (ends[1] - ends[0]) / tiny, rtol=1e-5, atol=1e-6)
+
+
+def test_machines_swing_under_a_sudden_ramp_as_they_do_on_the_plant(case: Case) -> None:
+    """From the nominal point at rest, a ramp of one load that no generator follows."""
+    instance, t = steady(case, sample_instance(case, 77, 0)), np.arange(0.0, 3.01, 0.05)
+    largest, rate = sudden_speeds(case, t), 1e-4
+    power = dict(zip(case.generators, case.p_nominal.tolist(), strict=True))
+    initial = instance.initial.model_copy(update={"power": power})
+    stay = Schedule(np.array([0.0, instance.horizon_s]), np.tile(case.p_nominal, (2, 1)))
+    for number, bus in enumerate(case.loads):
+        start = float(case.load_nominal[number])
+        ramp = LoadPoints(points=((0.0, start), (instance.horizon_s, start + rate * instance.horizon_s)))
+        given = instance.model_copy(update={"initial": initial, "load": instance.load | {bus: ramp}})
+        found = simulate(case, given, stay)
+        near = found.t <= 3.0
+        omega = np.maximum.accumulate(np.abs(found.omega[near]))
+        expected = rate * np.transpose([np.interp(found.t[near], t, one) for one in largest[:, number].T])
+        # Between points 0.05 s apart a swing of 1.5 Hz is linear to 3 % of its size.
+        assert np.allclose(omega, expected, rtol=0.02, atol=0.03 * expected.max())
+
+
+def test_machines_that_are_slow_need_less_margin_and_no_room(
+    ninebus: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked ten times a second, plans on 9bus come before a ramp moves a machine by a tenth of the bound."""
+    instance, t = steady(ninebus, sample_instance(ninebus, 77, 0)), np.arange(1.0, 15.0)
+    known = Surprises(ninebus, bound := ninebus.omega_bound("TO"))
+    known.expected(instance, None)
+    assert known.margin(t).min() >= surprises.ALWAYS * bound
+    assert known.room(t) is not None
+    monkeypatch.setattr(known, "_between_s", 0.1)
+    assert known.margin(t).max() < 0.1 * bound
+    assert known.room(t) is None
 
 
 def shortage(case: Case, power: Array) -> float:

@@ -26,7 +26,7 @@ BLACK, GREY = "#000000", "#7f7f7f"
 #: Colours that the colour-blind can distinguish (Okabe and Ito's first).
 PALETTE = (
     *("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"),
-    *("#882255", "#332288", "#117733", "#999933", "#7f7f7f"),
+    *("#882255", "#332288", "#661100", "#999933", "#7f7f7f"),
 )
 DASHES: tuple[tuple[float | None, ...], ...] = (
     (None, None),

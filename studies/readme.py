@@ -42,7 +42,6 @@ def paper() -> str:
     sources = run("9bus")
     both = result_lines(sources.shown, sources.timing, sources.paper, sources.reference.method)
     both = both[both["paper_solve_s"].notna() & (both["settings"] == "default")]
-    both = both.rename(columns=lambda name: name.removesuffix("_mean"))
     names = ("increase_percent", "solve_s", "freq_violation_hz", "ramp_violation")
     rows = [
         [line["regime"], line["title"], *(number(line[p + name]) for name in names for p in ("", "paper_"))]

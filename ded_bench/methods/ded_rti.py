@@ -27,12 +27,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ded_bench.methods.knot_program import Plan
 from ded_bench.methods.knots import case_knots, knots_in_operation, knots_on_clock
 from ded_bench.methods.options import NoOptions
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surprises import Surprises
-from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, Plan, solve_on_surrogate
+from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, solve_on_surrogate
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

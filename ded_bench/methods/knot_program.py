@@ -32,10 +32,12 @@ import scipy.sparse as sp
 from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows
 from ded_bench.methods.knots import divided, knot_weights
 from ded_bench.methods.reserve import Room
+from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
+from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.highs import solve_form as solve_by_highs
 from ded_bench.solvers.linear_program import FormAnswer, FreeForm, with_empty_columns
 from ded_bench.solvers.piqp import solve_form
@@ -74,19 +76,28 @@ class Prediction:
     objective: float  # with |P_s| at every point
 
 
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A plan to correct, by a program whose excess over bounds has a price."""
+
+    last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
+    room: Room | None = None  # for surprises
+    state: PlantState = None  # of the plant at t = 0; None: the instance's
+    margin: Array | None = None  # by how much bounds are tighter at every grid point, (n_points,), rad/s
+
+
 class KnotProgram:
     """The program around one trajectory. P_0 and x_0 are given: the first knot has no columns.
 
     After an interval's columns (`knot_columns`) come, where limits of outputs may be exceeded, how much, then
-    what a reserve needs.
+    what room for surprises needs.
 
     Args:
         case: the grid.
         instance: costs and P_0.
         bounds: of outputs of ω.
         model: a linear model along a trajectory that starts at P_0.
-        reserve: that programs with priced excess keep, if any.
-        margin: by how much bounds are tighter at every grid point, (n_points,), rad/s; None: nothing.
+        plan: to correct, if any: its margin, and its room where excess has a price.
         radius: most that a set-point may move, pu (trust region).
         condensed: whether states are substituted; None: on islands.
         before: the program along the trajectory before, near whose end to start.
@@ -98,15 +109,14 @@ class KnotProgram:
         instance: Instance,
         bounds: Bounds,
         model: TimeVarying,
-        reserve: Room | None = None,
-        margin: Array | None = None,
+        plan: Plan | None = None,
         radius: float = np.inf,
         condensed: bool | None = None,
         before: KnotProgram | None = None,
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
-        self.bounds, self._reserve, self._radius = bounds, reserve, radius
-        self._margin = np.zeros(len(model.omega)) if margin is None else margin
+        self.bounds, self._radius, self._surprises = bounds, radius, plan.room if plan else None
+        self._margin = np.zeros(len(model.omega)) if plan is None or plan.margin is None else plan.margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
         self._columns = KnotColumns(case, instance, model, self.condensed)
@@ -182,7 +192,7 @@ class KnotProgram:
         return self._at_all_knots(once, time_limit_s), widest
 
     def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with a priced excess of outputs in every interval, and with the reserve.
+        """Solve with a priced excess of outputs in every interval, and with room for surprises.
 
         Args:
             limits, time_limit_s: see `solve`.
@@ -195,8 +205,8 @@ class KnotProgram:
             return self._at_all_knots(functools.partial(self._soft_condensed, limits), time_limit_s)
         deadline = time.perf_counter() + time_limit_s
         form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-        if self._reserve is not None:
-            form, moved = self._with_reserve(self._reserve, form, place, excess)
+        if self._surprises is not None:
+            form, moved = self._with_room(self._surprises, form, place, excess)
             place = moved[place]
         answer = solve_form(form, time_limit_s, True, REGULARISATION, RESIDUAL)
         if answer.status == Status.FAILED:
@@ -332,17 +342,17 @@ class KnotProgram:
         rows = sp.vstack([outputs - widening, -outputs - widening])
         return form.with_rows(rows, np.append(below, below), np.append(high, -low)), place, new
 
-    def _with_reserve(
-        self, reserve: Room, form: FreeForm, place: Indices, excess: Indices
+    def _with_room(
+        self, room: Room, form: FreeForm, place: Indices, excess: Indices
     ) -> tuple[FreeForm, Indices]:
         """A program with room to follow ramps at the next knots, and where its columns stand then."""
         mean = float(np.mean(list(self._instance.cost.values())))
-        shortage = reserve.price * mean * knot_weights(self.model.lengths)[1:] / reserve.limit
+        shortage = room.price * mean * knot_weights(self.model.lengths)[1:] / room.limit
         points, x = self.model.points[1:], self._columns.u  # no surprise asks for ω
         if isinstance(self.model.speed, slice):
             x = self._columns.x[:, self.model.speed]
         at = self.model.p_gen[1:], self.model.omega[points]
-        return reserve.required(form, (place[self._columns.u], place[x]), at, excess, shortage)
+        return room.required(form, (place[self._columns.u], place[x]), at, excess, shortage)
 
     def _room(self, points: Indices, outputs: Indices | None = None) -> tuple[Array, Array]:
         """How far outputs may go down and up: at points of all of them, or at pairs of both; rad/s."""

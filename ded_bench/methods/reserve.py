@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import expm
+from scipy.signal import lsim
 
 from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.case import Array, Case
@@ -55,15 +55,13 @@ def sudden_speeds(case: Case, t: Array) -> Array:
         (n_t, n_load, n_gen), rad/s.
     """
     linear, n = at_nominal_point(case), len(case.generators)
-    steady, compliance = steady_speeds(case)
     a = np.zeros((2 * n, 2 * n))
     a[:n, n:], a[n:, :n] = np.eye(n), -linear.stiffness / linear.m[:, None]
     a[n:, n:] = -np.diag(linear.d / linear.m)
-    # Speeds are the steady ones and a free response, of angles and speeds, that begins where they cancel.
-    step, free = expm(a * t[1]), [np.vstack([compliance @ (linear.d[:, None] * steady.T), -steady.T])]
-    for _ in t[1:]:
-        free.append(step @ free[-1])
-    speeds = steady + np.swapaxes(np.array(free)[:, n:], 1, 2)
+    by_load = np.vstack([np.zeros_like(linear.share), -linear.share / linear.m[:, None]])
+    to_speed, direct = np.eye(n, 2 * n, n), np.zeros((n, 1))
+    found = [lsim((a, one[:, None], to_speed, direct), t, t)[1] for one in by_load.T]
+    speeds = np.stack([one.reshape(len(t), n) for one in found], axis=1)
     return np.asarray(np.maximum.accumulate(np.abs(speeds)))
 
 

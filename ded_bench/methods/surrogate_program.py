@@ -6,17 +6,14 @@ What it claims is what the surrogate says: no answer is simulated.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from ded_bench.methods.ed import first_schedules, slow_dispatch, within_ramps
-from ded_bench.methods.knot_program import KnotProgram, Prediction
+from ded_bench.methods.knot_program import KnotProgram, Plan, Prediction
 from ded_bench.methods.knots import is_reachable
-from ded_bench.methods.reserve import Room
 from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
-from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import Indices, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -29,16 +26,6 @@ from ded_bench.surrogates.find import Surrogate
 OMEGA_TOLERANCE = 2 * np.pi * 5e-7
 #: With priced excess: excess that is left open, as a part of the bound.
 SOFT_TOLERANCE = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A plan to correct, by a program whose excess over bounds has a price."""
-
-    last: Schedule | None  # the plan in force, on the time of the instance; None: the static dispatch
-    reserve: Room | None = None
-    state: PlantState = None  # of the plant at t = 0; None: the instance's
-    margin: Array | None = None  # by how much bounds are tighter at every grid point, (n_points,), rad/s
 
 
 def solve_on_surrogate(
@@ -80,8 +67,7 @@ def solve_on_surrogate(
 
     def solve(model: TimeVarying, _: int) -> Attempt[Prediction]:
         nonlocal built
-        extra = (None, None) if plan is None else (plan.reserve, plan.margin)
-        program = KnotProgram(case, instance, bounds, model, *extra)
+        program = KnotProgram(case, instance, bounds, model, plan)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
         limits = program.near(program.model.omega) if is_near else set()

@@ -11,6 +11,7 @@ machine, never enter it.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import gc
 import hashlib
@@ -108,13 +109,14 @@ def bench(
         return there
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
     kept = [] if force else [row for row in TIMING.existing(partial) if row.run == run]
-    rows, pools = {row.key: row for row in kept}, {job: Workers(1) for job in jobs}
+    rows = {row.key: row for row in kept}
 
     def rounds_for(job: Job) -> int:
         first = [row for row in rows.values() if row.round == 1 and row.job == own[job].job]
         return rounds or (rounds_of(first) if first else 1)
 
-    try:
+    with contextlib.ExitStack() as stack:
+        pools = {job: stack.enter_context(contextlib.closing(Workers(1))) for job in jobs}
         for round_ in itertools.count(1):
             present = [job for job in jobs if round_ <= rounds_for(job)]
             if not present:
@@ -129,9 +131,6 @@ def bench(
                     TIMING.write(partial, rows.values())
                 if round_ >= rounds_for(job):
                     pools[job].close()  # on large grids a process holds gigabytes
-    finally:
-        for pool in pools.values():
-            pool.close()
     TIMING.write(path, rows.values())
     partial.unlink(missing_ok=True)
     return list(rows.values())

@@ -322,18 +322,25 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
             for r in range(4):
                 for m in range(LANES):
                     gains[k, r, m] = gain[r, m]
-        change[0, first : first + used] = 0.0
-        for k in range(n - 1):
-            for r in range(4):
-                for m in range(LANES):
-                    gain[r, m] = gains[k, r, m]
+        _roll_out(gains, to_q, to_speed, state, change, first)
+
+
+@compiled
+def _roll_out(gains: Array, to_q: Array, to_speed: Array, state: Array, change: Array, first: int) -> None:
+    """Follow the gains from knot to knot; `change` receives v of LANES modes from the first on."""
+    gain, used = np.empty((4, LANES)), min(LANES, change.shape[1] - first)
+    change[0, first : first + used] = 0.0
+    for k in range(len(gains)):
+        for r in range(4):
             for m in range(LANES):
-                q, speed, before = state[0, m], state[1, m], state[2, m]
-                v = -(gain[0, m] * q + gain[1, m] * speed + gain[2, m] * before) - gain[3, m]
-                state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
-                state[1, m] = (
-                    to_speed[0, m] * q + to_speed[1, m] * speed + to_speed[2, m] * before + to_speed[3, m] * v
-                )
-                state[2, m] = v
-            for m in range(used):
-                change[k + 1, first + m] = state[2, m]
+                gain[r, m] = gains[k, r, m]
+        for m in range(LANES):
+            q, speed, before = state[0, m], state[1, m], state[2, m]
+            v = -(gain[0, m] * q + gain[1, m] * speed + gain[2, m] * before) - gain[3, m]
+            state[0, m] = to_q[0, m] * q + to_q[1, m] * speed + to_q[2, m] * before + to_q[3, m] * v
+            state[1, m] = (
+                to_speed[0, m] * q + to_speed[1, m] * speed + to_speed[2, m] * before + to_speed[3, m] * v
+            )
+            state[2, m] = v
+        for m in range(used):
+            change[k + 1, first + m] = state[2, m]

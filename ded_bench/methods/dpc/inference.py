@@ -121,6 +121,22 @@ def _windows(weight: np.ndarray) -> np.ndarray:
 
 
 @compiled
+def _see(p_gen: Array, sequence: Array, free_response: Array32, of_power: Array32, inputs: Array32) -> None:
+    """Set what a stage sees: the schedule so far, its response and the instance, (n_inputs, n_knots)."""
+    n_gen, n = p_gen.shape
+    n_outputs, p32 = len(free_response), np.empty(n_gen * n, np.float32)
+    for g in range(n_gen):
+        _copy(p_gen[g], p32[g * n : (g + 1) * n])
+        _copy(p_gen[g], inputs[g])
+    forced = np.dot(p32, of_power)
+    for i in range(n_outputs):
+        for j in range(n):
+            inputs[n_gen + i, j] = free_response[i, j] + forced[i * n + j]
+    for i in range(len(sequence)):
+        _copy(sequence[i], inputs[n_gen + n_outputs + i])
+
+
+@compiled
 def add_corrections(
     p_gen: Array,
     s: int,
@@ -146,8 +162,7 @@ def add_corrections(
     mean, enter, enter_bias, embed, embed_bias, first, spread, mix, mix_bias, last, last_bias = weights
     _, n_gen, n = p_gen.shape
     width, n_in = first.shape[1], mean.shape[1]
-    n_seen, margin = n_gen + free_response.shape[1], dilations.max()
-    p32, forced = np.empty(n_gen * n, np.float32), np.empty(of_power.shape[1], np.float32)
+    margin = dilations.max()
     inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
     input_columns, columns = np.empty((3 * n_in, n), np.float32), np.empty((3 * width, n), np.float32)
     inner, change = np.empty((width, n), np.float32), np.empty((width, n), np.float32)
@@ -160,21 +175,9 @@ def add_corrections(
         np.dot(embed[s], embedded, bias)
         for i in range(len(bias)):
             bias[i] += embed_bias[s, i]
-        # what the stage sees: the schedule so far, its response, the instance
         for i in range(n_in):
             inputs[i, 0] = inputs[i, n + 1] = mean[s, i]
-        for g in range(n_gen):
-            _copy(p_gen[b, g], p32[g * n : (g + 1) * n])
-            _copy(p_gen[b, g], inputs[g, 1 : n + 1])
-        np.dot(p32, of_power, forced)
-        for i in range(n_gen, n_seen):
-            row, output = inputs[i, 1 : n + 1], i - n_gen
-            free, due = free_response[b, output], forced[output * n :]
-            for j in range(n):
-                row[j] = free[j] + due[j]
-        for i in range(n_seen, n_in):
-            _copy(sequence[b, i - n_seen], inputs[i, 1 : n + 1])
-        # its corrections
+        _see(p_gen[b], sequence[b], free_response[b], of_power, inputs[:, 1 : n + 1])
         _gather(inputs, 1, input_columns)
         np.dot(first[s], input_columns, change)
         for o in range(width):

@@ -84,6 +84,32 @@ def carried_voltages(network: CompiledNetwork, drawn: Array, v: Array) -> Carrie
 
 
 @compiled
+def _next_voltages(
+    network: CompiledNetwork, drawn: Array, source: Array, carried: CarriedVoltages, s: int, v: Array
+) -> bool:
+    """Find the voltages of stage s, predicted from those at the same stage of the last four steps.
+
+    Slopes are renewed where they are old; tells whether there is a solution. See `solve_voltages`.
+    """
+    recent, load, age = carried.recent, carried.load, carried.age
+    n = recent.shape[2]
+    for i in range(n):
+        v[i] = 4.0 * (recent[0, s, i] + recent[2, s, i]) - 6.0 * recent[1, s, i] - recent[3, s, i]
+    needed = solve_voltages(network, drawn, source, load, v, FIXED_POINT_STEPS)
+    if needed > FIXED_POINT_STEPS:
+        v[:n] = recent[0, s]  # those of the step before
+        if not solve_afresh(network, drawn, source, load, v):
+            return False
+        age[0] = 0
+    elif needed > SLOW and age[0] > RENEWED_AFTER:
+        renew(network, drawn, v, load)
+        age[0] = 0
+    recent[3, s], recent[2, s], recent[1, s] = recent[2, s], recent[1, s], recent[0, s]
+    recent[0, s] = v[:n]
+    return True
+
+
+@compiled
 def integrate_plant(
     data: MachineArrays,
     network: CompiledNetwork,
@@ -114,18 +140,16 @@ def integrate_plant(
     stage, rates, total = x.copy(), np.zeros_like(x), np.zeros_like(x)
     p_ref, drawn, p_e = np.empty(n_machine), inputs.drawn[0].copy(), np.empty(n_machine)
     source = np.empty(len(v))
-    # Voltages at the same stage of the last four steps predict those of the next.
-    recent, load, age = carried.recent, carried.load, carried.age[0]
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
-            carried.age[0] = age
-            recent, load = recent.copy(), LoadSlopes(load.slopes.copy(), load.answer.copy())
+            load = LoadSlopes(carried.load.slopes.copy(), carried.load.answer.copy())
+            carried = CarriedVoltages(carried.recent.copy(), load, carried.age.copy())
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
         states.held[k] = held
         after = min(k + 1, n - 1)
         for j in range(steps):
-            age += 1
+            carried.age[0] += 1
             for s in range(4):
                 inside = (j + node[s]) / steps
                 for q in range(N_STATES):
@@ -137,20 +161,8 @@ def integrate_plant(
                 for i in range(n_load):
                     drawn[i] = inputs.drawn[k, i] + inside * (inputs.drawn[after, i] - inputs.drawn[k, i])
                 sources(data, stage, source)
-                for i in range(2 * n_load):
-                    ahead = 4.0 * (recent[0, s, i] + recent[2, s, i])
-                    v[i] = ahead - 6.0 * recent[1, s, i] - recent[3, s, i]
-                needed = solve_voltages(network, drawn, source, load, v, FIXED_POINT_STEPS)
-                if needed > FIXED_POINT_STEPS:
-                    v[: 2 * n_load] = recent[0, s]  # those of the step before
-                    if not solve_afresh(network, drawn, source, load, v):
-                        return k
-                    age = 0
-                elif needed > SLOW and age > RENEWED_AFTER:
-                    renew(network, drawn, v, load)
-                    age = 0
-                recent[3, s], recent[2, s], recent[1, s] = recent[2, s], recent[1, s], recent[0, s]
-                recent[0, s] = v[: 2 * n_load]
+                if not _next_voltages(network, drawn, source, carried, s, v):
+                    return k
                 machine_rates(data, stage, v, p_ref, inputs.v_ref, rates, p_e)
                 if s == 0 and j == 0:
                     states.x[k], states.v[k], states.p_e[k] = x, v, p_e

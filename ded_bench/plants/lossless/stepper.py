@@ -133,14 +133,7 @@ def integrate(
         state[0, g], state[1, g] = angle[grid.generators[g]], omega[0, g]
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
-            carried = Carried(
-                carried.recent.copy(),
-                carried.inverse.copy(),
-                carried.ahead,
-                carried.past,
-                carried.counts,
-                carried.slope,
-            )
+            carried = _set_apart(carried)
         elif _bends(inputs, k, carried.slope):
             carried.counts[0] = 0
         for j in range(steps):
@@ -173,6 +166,13 @@ def integrate(
             _extrapolate(grid, carried.recent[:, 0], angle)
             carried.ahead[:] = angle[grid.algebraic]
     return n
+
+
+@compiled
+def _set_apart(carried: Carried) -> Carried:
+    """With angles and Jacobian of its own, which a step at the last point may change."""
+    recent, inverse, ahead, past, counts, slope = carried
+    return Carried(recent.copy(), inverse.copy(), ahead, past, counts, slope)
 
 
 @compiled

@@ -49,7 +49,6 @@ def solve_form(
     if staged:
         solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
     solver.settings.max_iter = MAX_ITERATIONS
-    solver.settings.preconditioner_scale_cost = True
     solver.settings.eps_duality_gap_rel = GAP
     if residual is not None:
         solver.settings.eps_abs = solver.settings.eps_rel = residual

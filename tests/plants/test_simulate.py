@@ -7,10 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ded_bench.methods import ed
-from ded_bench.plants.lossless import stepper
+from ded_bench.plants.lossless import lossless_plant, stepper
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.lossless.stepper import KUTTA_4
-from ded_bench.plants.plant import SimulationError, simulate
+from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
@@ -49,9 +48,8 @@ def energy(case, trajectory) -> np.ndarray:
 def test_energy_is_conserved_without_damping(case, alter, quiet_instance, constant):
     """With D = 0 and constant inputs, H = kinetic + line - P·θ - L·θ is a first integral.
 
-    Tolerance: on steps of h = 0.01 s a fifth-order method errs by about (ν h)^6 / 720 ~ 1e-14 per step
-    for the fastest mode here, ν = 1.5 rad/s, and Newton stops at 1e-12 pu; over 1000 steps both stay
-    below 1e-9 of the energy of the swing.
+    Tolerance: a step errs by about (ν h)^6 / 720 ~ 1e-11 for the fastest mode here, ν = 4.5 rad/s, and Newton
+    stops at 1e-12 pu; over 1000 steps both stay below 1e-8 of the energy of the swing.
     """
     machines = {g: {**machine.model_dump(), "d": 0.0} for g, machine in case.machines.items()}
     frictionless = alter(case, machines=machines)
@@ -60,7 +58,7 @@ def test_energy_is_conserved_without_damping(case, alter, quiet_instance, consta
     total = energy(frictionless, trajectory)
     m = np.array([case.machines[g].m for g in case.generators])
     swing = 0.5 * 0.3**2 * m.sum()
-    assert np.abs(total - total[0]).max() < 1e-9 * swing
+    assert np.abs(total - total[0]).max() < 1e-8 * swing
     kinetic = 0.5 * trajectory.omega**2 @ m
     assert kinetic.max() - kinetic.min() > 0.5 * swing  # it swings: energy does go back and forth
 
@@ -70,7 +68,7 @@ def test_energy_is_conserved_without_damping(case, alter, quiet_instance, consta
 
 @pytest.mark.parametrize(
     ("p_start", "p_end", "rate", "angle", "atol"),
-    [(0.6, 0.9, -0.05, 0.5, 1e-10), (15.0, 15.0, 0.0, 12 * np.pi, 1e-5)],
+    [(0.6, 0.9, -0.05, 0.5, 1e-10), (15.0, 15.0, 0.0, 12 * np.pi, 3e-5)],
     ids=["large swings", "slipping poles"],
 )
 def test_chain_follows_its_scalar_swing_equation(threebus, quiet_instance, p_start, p_end, rate, angle, atol):
@@ -121,34 +119,34 @@ def test_planning_is_exact_within_a_microhertz(name: str) -> None:
     np.testing.assert_array_equal(plan.p_gen, truth.p_gen)
 
 
-def test_planning_has_order_four() -> None:
-    """The conditions of order, by sums over rooted trees (Hairer, Norsett and Wanner, table II.2.2)."""
-    _, a, b, c = KUTTA_4
-    np.testing.assert_allclose(a.sum(axis=1), c)
-    trees = [np.ones(4), c, c**2, a @ c, c**3, c * (a @ c), a @ c**2, a @ a @ c]
-    np.testing.assert_allclose(
-        [b @ tree for tree in trees], [1, 1 / 2, 1 / 3, 1 / 6, 1 / 4, 1 / 8, 1 / 12, 1 / 24]
-    )
+def test_weights_have_their_order() -> None:
+    """Runge-Kutta: conditions of order five, by sums over some rooted trees (Hairer et al., table II.2.2).
 
-
-def test_multistep_weights_have_order_eight() -> None:
-    """They integrate from 0 to 1 what powers of time are at the points before, and for the corrector at 1."""
-    degree = np.arange(8)[:, None]
+    Adams: from 0 to 1 they integrate what powers of time are at points before, and for the corrector at 1.
+    """
+    b, c = stepper.WEIGHTS, stepper.NODES
+    a = np.hstack([stepper.STAGES, np.zeros((len(c), 1))])
+    np.testing.assert_allclose(a.sum(axis=1), c, atol=1e-15)
+    trees = [c**0, c, c**2, a @ c, c**3, c * (a @ c), a @ c**2, a @ a @ c, c**4, a @ a @ a @ c]
+    known = [1, 1 / 2, 1 / 3, 1 / 6, 1 / 4, 1 / 8, 1 / 12, 1 / 24, 1 / 5, 1 / 120]
+    np.testing.assert_allclose([b @ tree for tree in trees], known)
+    degree = np.arange(6)[:, None]
     for weights, first in ((stepper.BASHFORTH, 0.0), (stepper.MOULTON, 1.0)):
-        points = first - np.arange(8)
+        points = first - np.arange(6)
         np.testing.assert_allclose((weights * points**degree).sum(axis=1), 1 / (degree[:, 0] + 1), rtol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["9bus", "two-area", "39bus", "140bus"])
-def test_multistep_is_as_exact_as_one_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["9bus", "two-area", "39bus", "68bus", "140bus"])
+def test_shorter_steps_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A schedule with two kinks a second: within 1e-9 Hz, a thousandth of what strict feasibility leaves."""
     case = Case.load(name)
     instance = sample_instance(case, 77, 0).model_copy(update={"horizon_s": 20.0})
     schedule = ed.dispatch(case, instance, 1.0)
     found = simulate(case, instance, schedule)
-    monkeypatch.setattr(stepper, "DORMAND_PRINCE_8", stepper.DORMAND_PRINCE_8._replace(order=0))
+    fastest = np.abs(plant_of(case).nominal().modes).max()
+    monkeypatch.setattr(lossless_plant, "STEP_BY_MODE", fastest * instance.dt_s / 8)  # so many a point
     known = simulate(case, instance, schedule)
-    assert not np.array_equal(found.omega, known.omega)  # Adams steps were taken
+    assert not np.array_equal(found.omega, known.omega)
     np.testing.assert_allclose(found.omega, known.omega, rtol=0, atol=2 * np.pi * 1e-9)
 
 

@@ -1,8 +1,8 @@
 """The index-1 swing DAE, integrated with steps of fixed length; compiled.
 
-Steps are those of an explicit Runge-Kutta method, whatever tableau is given. Where powers and loads have been
-linear for eight steps, one of order 8 is followed by Adams's predictor and corrector of the same order, which
-need two evaluations a step. Where these two differ too much, a Runge-Kutta step is taken.
+Steps are those of an explicit Runge-Kutta method of order 5. Where powers and loads have been linear for six
+steps, it is followed by Adams's predictor and corrector of order 6, which need two evaluations a step. Where
+these two differ too much, a Runge-Kutta step is taken.
 
 At every evaluation the angles of load and junction buses are solved for (`algebraic`).
 """
@@ -12,36 +12,21 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import DOP853
+from scipy.integrate import RK45
 
 from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, invert, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
-
-class Tableau(NamedTuple):
-    """Coefficients of an explicit Runge-Kutta method with s stages."""
-
-    order: int
-    a: Array  # (s, s), strictly lower triangular
-    b: Array  # (s,)
-    c: Array  # (s,)
-
-
-#: Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential
-#: Equations I, II.5), with SciPy's coefficients.
-DORMAND_PRINCE_8 = Tableau(8, DOP853.A.copy(), DOP853.B.copy(), DOP853.C.copy())
-#: Kutta's method of order 4 (ibid., II.1).
-KUTTA_4 = Tableau(
-    order=4,
-    a=np.diag([0.5, 0.5, 1.0], -1),
-    b=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0,
-    c=np.array([0.0, 0.5, 0.5, 1.0]),
-)
-#: Adams's methods of order 8 (ibid., III.1): the predictor weighs the last derivatives, the newest first; the
+#: Coefficients a, b, c of Dormand and Prince's method of order 5 (Hairer, Norsett and Wanner, Solving
+#: Ordinary Differential Equations I, II.5): SciPy's.
+STAGES, WEIGHTS, NODES = RK45.A.copy(), RK45.B.copy(), RK45.C.copy()
+#: Adams's methods of order 6 (ibid., III.1): the predictor weighs the last derivatives, the newest first; the
 #: corrector has the predicted one before them.
-BASHFORTH = np.array([434241, -1152169, 2183877, -2664477, 2102243, -1041723, 295767, -36799]) / 120960
-MOULTON = np.array([36799, 139849, -121797, 123133, -88547, 41499, -11351, 1375]) / 120960
+BASHFORTH = np.array([4277, -7923, 9982, -7298, 2877, -475]) / 1440
+MOULTON = np.array([475, 1427, -798, 482, -173, 27]) / 1440
+#: Steps whose algebraic angles a guess of others goes through.
+RECENT = 5
 #: Largest difference of predicted and corrected angles, rad, and frequencies, rad/s, of an Adams step: its
 #: error is a thirtieth of that.
 ADAMS_TOLERANCE = 3e-10
@@ -60,11 +45,11 @@ class GridInputs(NamedTuple):
 class Carried(NamedTuple):
     """What goes on from piece to piece, so that pieces are the whole to the last bit."""
 
-    recent: Array  # angles at each stage of the last four steps, (4, n_stages, n_algebraic), rad
+    recent: Array  # algebraic angles at the last steps, newest first, (RECENT, n_algebraic), rad
     inverse: Array  # of the Jacobian, (n_algebraic, n_algebraic), rad/pu
     ahead: Array  # the algebraic angles where the next step begins, nearly, (n_algebraic,), rad
-    past: Array  # derivatives of angles and frequencies at the last steps, newest first, (8, 2, n_gen)
-    counts: Indices  # steps that powers and loads have been linear for; Adams steps since another one; (2,)
+    past: Array  # derivatives of angles and frequencies at the last steps, newest first, (6, 2, n_gen)
+    linear: Indices  # steps that powers and loads have been linear for, (1,)
     slope: Array  # change of powers and injections in the last interval, (n_gen + n_algebraic,), pu
 
 
@@ -79,26 +64,25 @@ class Work(NamedTuple):
 
 
 @compiled
-def carried_from(tableau: Tableau, grid: CompiledGrid, theta: Array) -> Carried:
+def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
     """What a state without a past has, at angles (n_bus,); LinAlgError if the Jacobian is singular."""
     n, n_gen = len(grid.algebraic), len(grid.generators)
     carried = Carried(
-        recent=np.empty((4, len(tableau.c), n)),
+        recent=np.empty((RECENT, n)),
         inverse=np.empty((n, n)),
         ahead=np.empty(n),
         past=np.zeros((len(BASHFORTH), 2, n_gen)),
-        counts=np.zeros(2, np.int_),
+        linear=np.zeros(1, np.int_),
         slope=np.zeros(n_gen + n),
     )
     for i in range(n):
-        carried.recent[:, :, i] = carried.ahead[i] = theta[grid.algebraic[i]]
+        carried.recent[:, i] = carried.ahead[i] = theta[grid.algebraic[i]]
     invert(grid, theta, carried.inverse)
     return carried
 
 
 @compiled
 def integrate(
-    tableau: Tableau,
     grid: CompiledGrid,
     inputs: GridInputs,
     steps: int,
@@ -110,7 +94,6 @@ def integrate(
     """Integrate from the first point of time to the last.
 
     Args:
-        tableau: the Runge-Kutta method.
         grid: the network.
         inputs: powers at n points of time.
         steps: steps from one point to the next.
@@ -124,7 +107,7 @@ def integrate(
     """
     n: int = len(omega)
     n_gen, n_bus = omega.shape[1], theta.shape[1]
-    n_stages = len(tableau.c)
+    n_stages = len(NODES)
     h = inputs.dt / steps
     state, stage, rates = np.empty((2, n_gen)), np.empty((2, n_gen)), np.empty((n_stages, 2, n_gen))
     angle, f = theta[0].copy(), np.empty(n_bus)
@@ -135,7 +118,7 @@ def integrate(
         if k == n - 1:  # the next piece does this point once more
             carried = _set_apart(carried)
         elif _bends(inputs, k, carried.slope):
-            carried.counts[0] = 0
+            carried.linear[0] = 0
         for j in range(steps):
             angle[grid.algebraic] = carried.ahead
             if not _evaluate(grid, inputs, (k, j / steps), carried, 0, state, work):
@@ -144,26 +127,22 @@ def integrate(
                 theta[k], omega[k], p_slack[k] = angle, state[1], f[grid.slack]
                 if k == n - 1:
                     return n
-            if tableau.order == len(BASHFORTH) and _adams(
-                grid, inputs, (k, (j + 1) / steps), h, carried, work
-            ):
+            if _adams(grid, inputs, (k, (j + 1) / steps), h, carried, work):
                 continue
-            if carried.counts[1] > 0:  # of stages that Adams steps left out there is no past
-                carried.recent[:, 1:], carried.counts[1] = carried.recent[0, 0], 0
             for s in range(1, n_stages):
                 stage[:] = state
                 for r in range(s):
                     for q in range(2):
                         for g in range(n_gen):
-                            stage[q, g] += h * tableau.a[s, r] * rates[r, q, g]
-                _extrapolate(grid, carried.recent[:, s], angle)
-                if not _evaluate(grid, inputs, (k, (j + tableau.c[s]) / steps), carried, s, stage, work):
+                            stage[q, g] += h * STAGES[s, r] * rates[r, q, g]
+                _extrapolate(grid, carried.recent, NODES[s], angle)
+                if not _evaluate(grid, inputs, (k, (j + NODES[s]) / steps), carried, s, stage, work):
                     return k
             for s in range(n_stages):
                 for q in range(2):
                     for g in range(n_gen):
-                        state[q, g] += h * tableau.b[s] * rates[s, q, g]
-            _extrapolate(grid, carried.recent[:, 0], angle)
+                        state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
+            _extrapolate(grid, carried.recent, 1.0, angle)
             carried.ahead[:] = angle[grid.algebraic]
     return n
 
@@ -171,8 +150,8 @@ def integrate(
 @compiled
 def _set_apart(carried: Carried) -> Carried:
     """With angles and Jacobian of its own, which a step at the last point may change."""
-    recent, inverse, ahead, past, counts, slope = carried
-    return Carried(recent.copy(), inverse.copy(), ahead, past, counts, slope)
+    recent, inverse, ahead, past, linear, slope = carried
+    return Carried(recent.copy(), inverse.copy(), ahead, past, linear, slope)
 
 
 @compiled
@@ -196,15 +175,15 @@ def _adams(
     for i in range(len(past) - 1, 0, -1):
         past[i] = past[i - 1]
     past[0] = work.rates[0]
-    carried.counts[0] += 1
-    if carried.counts[0] < len(past):
+    carried.linear[0] += 1
+    if carried.linear[0] < len(past):
         return False
     predicted[:] = work.state
     for i in range(len(past)):
         for q in range(2):
             for g in range(predicted.shape[1]):
                 predicted[q, g] += h * BASHFORTH[i] * past[i, q, g]
-    _extrapolate(grid, carried.recent[:, 0], work.angle)
+    _extrapolate(grid, carried.recent, 1.0, work.angle)
     if not _evaluate(grid, inputs, end, carried, -1, predicted, work):
         return False
     off = 0.0
@@ -220,7 +199,6 @@ def _adams(
         return False
     work.state[:] = predicted
     carried.ahead[:] = work.angle[grid.algebraic]
-    carried.counts[1] += 1
     return True
 
 
@@ -238,12 +216,17 @@ def _bends(inputs: GridInputs, k: int, slope: Array) -> bool:
 
 
 @inlined
-def _extrapolate(grid: CompiledGrid, recent: Array, angle: Array) -> None:
-    """Guess the algebraic angles of the next step from those of the last four, (4, n_algebraic)."""
+def _extrapolate(grid: CompiledGrid, recent: Array, ahead: float, angle: Array) -> None:
+    """Guess algebraic angles some steps ahead of the newest by Lagrange's polynomial through the recent."""
     for i in range(recent.shape[1]):
-        ahead = 4.0 * (recent[0, i] + recent[2, i])
-        ahead -= 6.0 * recent[1, i] + recent[3, i]
-        angle[grid.algebraic[i]] = ahead
+        angle[grid.algebraic[i]] = 0.0
+    for j in range(len(recent)):
+        weight = 1.0
+        for m in range(len(recent)):
+            if m != j:
+                weight *= (ahead + m) / (m - j)
+        for i in range(recent.shape[1]):
+            angle[grid.algebraic[i]] += weight * recent[j, i]
 
 
 @compiled
@@ -262,7 +245,7 @@ def _evaluate(
         grid: the network.
         inputs: what drives it.
         moment: a point of time, and the part of the interval after it that has gone by.
-        carried: gives the inverse, and receives the algebraic angles as a stage's latest.
+        carried: gives the inverse, and receives the algebraic angles where a step begins.
         s: the stage whose derivatives they are; -1: no stage.
         state: where.
         work: guesses of algebraic angles become answers; receives injections and derivatives.
@@ -272,7 +255,7 @@ def _evaluate(
     """
     (k, inside), angle = moment, work.angle
     n_gen, n_algebraic, after = state.shape[1], len(grid.algebraic), min(k + 1, len(inputs.p_gen) - 1)
-    recent, wanted = carried.recent[:, max(s, 0)], np.empty(n_algebraic)
+    recent, wanted = carried.recent, np.empty(n_algebraic)
     for g in range(n_gen):
         angle[grid.generators[g]] = state[0, g]
     for i in range(n_algebraic):
@@ -285,9 +268,10 @@ def _evaluate(
         solved = solve_algebraic(grid, wanted, carried.inverse, angle, work.f)
     if not solved:
         return False
-    if s >= 0:
+    if s == 0:
         for i in range(n_algebraic):
-            recent[3, i], recent[2, i], recent[1, i] = recent[2, i], recent[1, i], recent[0, i]
+            for j in range(len(recent) - 1, 0, -1):
+                recent[j, i] = recent[j - 1, i]
             recent[0, i] = angle[grid.algebraic[i]]
     for g in range(n_gen):
         power = inputs.p_gen[k, g] + inside * (inputs.p_gen[after, g] - inputs.p_gen[k, g])

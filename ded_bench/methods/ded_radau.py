@@ -38,8 +38,8 @@ LONGEST_S, LONGEST_PERIODS = 0.1, 0.125
 BYTES_PER_ENTRY = 17
 #: Longest element on the detailed plant, s, and the memory of its Pyomo model and IPOPT (two-area-agc).
 DETAILED_S, BYTES_PER_DETAILED_ENTRY = 1.0, 300
-#: Tolerance of IPOPT as a part of the cost. With four times as much it ends, on some processors, 4e-5 above the
-#: optimum (a test's island); with less nothing changes by more than 1e-6, for as many iterations.
+#: Tolerance of IPOPT as a part of the cost. With four times as much it ends, on some processors, 3e-5 above
+#: the optimum of a test's island; with less the cost changes by 1e-6 at most, in as many iterations.
 CLOSE = 5e-8
 
 

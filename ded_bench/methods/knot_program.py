@@ -43,17 +43,13 @@ from ded_bench.solvers.linear_program import FormAnswer, FreeForm, with_empty_co
 from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 
-#: Whether PIQP factorises dense blocks, and its regularisation; the next where one stalls. A sparse matrix is
-#: faster with a knot at every point, and fewer than LONG columns for each. Chosen on validation draws.
-SPARSE, DENSE = ((False, 1e-10), (True, 1e-11)), ((True, 1e-10), (True, 1e-9), (True, 1e-11))
+#: PIQP factorises dense blocks; but with a knot at every point, and fewer than so many columns for each, a
+#: sparse matrix is faster.
 LONG = 20
 #: What widening limits of outputs by 1 rad/s costs, in sums of all columns' costs: where they are widened as
 #: little as possible, and where a program prices every excess from the start: an exact penalty above nearly
 #: all multipliers of the limits.
 LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
-#: Of programs with priced excess: residuals that are small enough, and regularisation, chosen on validation
-#: draws. Looser ones save a third of the iterations, but then a processor's last digit moves ω by 1e-5 Hz.
-RESIDUAL, REGULARISATION = 1e-8, 1e-9
 #: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval.
 NEAR, PARTS = 0.9, 8
 #: A row of a condensed program is dense: at knots a limit has one if the trajectory exceeds this part of the
@@ -208,9 +204,7 @@ class KnotProgram:
         if self._surprises is not None:
             form, moved = self._with_room(self._surprises, form, place, excess)
             place = moved[place]
-        answer = solve_form(form, time_limit_s, True, REGULARISATION, RESIDUAL)
-        if answer.status == Status.FAILED:
-            answer = self._answer(form, deadline - time.perf_counter())
+        answer = solve_form(form, time_limit_s, staged=True)
         if answer.status == Status.FAILED:
             answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
         return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
@@ -309,18 +303,11 @@ class KnotProgram:
         )
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        """PIQP's, by the next factorisation where one stalls."""
+        """HiGHS's of a condensed program, else PIQP's."""
         if self.condensed:
             return solve_by_highs(form, max(time_limit_s, 0.0))
-        deadline, iterations = time.perf_counter() + time_limit_s, 0
         is_short = self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
-        for staged, regularisation in SPARSE if is_short else DENSE:
-            answer = solve_form(form, deadline - time.perf_counter(), staged, regularisation)
-            iterations += answer.iterations
-            stalled = answer.status == Status.FAILED and "INFEASIBLE" not in answer.message
-            if not stalled or time.perf_counter() > deadline:
-                break
-        return replace(answer, iterations=iterations)
+        return solve_form(form, time_limit_s, staged=not is_short)
 
     def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ded_bench.methods import ded_slp, ed, knot_program
+from ded_bench.methods import ded_slp, ed
 from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.slp import Parts
@@ -59,31 +58,6 @@ def test_program_is_the_model_with_every_point(case, index):
     assert outcome.objective <= prediction.objective * (1 + 1e-8)
     assert prediction.objective == pytest.approx(outcome.objective, rel=2e-4)
     assert bounds.beyond(prediction.outputs)[1:].max() <= 1e-7
-
-
-@pytest.mark.parametrize("message", ["PIQP_MAX_ITER_REACHED", "PIQP_PRIMAL_INFEASIBLE"])
-@pytest.mark.parametrize("interval", [1, 20])
-def test_another_factorisation_follows_where_one_stalled(case, monkeypatch, message, interval):
-    """With a knot at every point, or at some. What is shown to be infeasible is not tried again."""
-    made = program(case, short(case, 0), case.bounds("NO"), np.arange(0, 401, interval))
-    none, solve, attempts = np.empty((0, 2), dtype=int), knot_program.solve_form, []
-    direct = made.solve(none, np.inf)
-
-    def stalling(*arguments):
-        attempts.append(solve(*arguments))
-        return (
-            attempts[-1] if len(attempts) > 1 else replace(attempts[0], status=Status.FAILED, message=message)
-        )
-
-    monkeypatch.setattr(knot_program, "solve_form", stalling)
-    answer = made.solve(none, np.inf)
-    if "INFEASIBLE" in message:
-        assert (answer.status, len(attempts)) == (Status.FAILED, 1)
-        return
-    assert answer.status == direct.status == Status.OPTIMAL
-    assert made.predict(answer.x).objective == pytest.approx(made.predict(direct.x).objective, rel=1e-6)
-    assert answer.iterations == sum(a.iterations for a in attempts)
-    assert len(attempts) == 2
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

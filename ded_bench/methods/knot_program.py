@@ -58,8 +58,8 @@ NEAR, PARTS = 0.9, 8
 #: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
 HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
 
-#: (output, grid point) of a limit between knots.
-Limit = tuple[int, int]
+#: Output, grid point, and the sign of the bound that it comes near, of a limit between knots.
+Limit = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +128,13 @@ class KnotProgram:
             self._held, self._basis = self._held | before._held, before._basis
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with outputs limited at all knots and at the points chosen.
+        """Solve with outputs limited, either way, at all knots and at the points chosen.
 
         Args:
-            limits: (output, grid point) of the limits between knots, shape (n_limits, 2).
+            limits: those between knots, rows of `Limit`, shape (n_limits, 3).
             time_limit_s: see `piqp.solve_form`.
         """
+        limits = np.unique(limits[:, :2], axis=0)
 
         def once(left_s: float) -> tuple[FormAnswer, Array]:
             form = self._columns.program(self._radius)
@@ -151,11 +152,11 @@ class KnotProgram:
                 return self._answer(form, left_s), none
             return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
 
-        return self._at_all_knots(once, time_limit_s)
+        return self._at_all_knots(once, time_limit_s)[0]
 
     def solve_relaxed(
         self, limits: Indices, time_limit_s: float, by_interval: bool = False
-    ) -> tuple[FormAnswer, float]:
+    ) -> tuple[FormAnswer, Array]:
         """Solve with limits of outputs widened as little as possible; what PIQP does not solve HiGHS does.
 
         The cost counts, but so little that the widening is the least one but for round-off.
@@ -165,36 +166,31 @@ class KnotProgram:
                 have the same.
 
         Returns:
-            The answer, and the largest widening in rad/s.
+            The answer, and how far limits are widened in each interval, (n_intervals,), rad/s.
         """
-        widest = np.inf
+        pairs = np.unique(limits[:, :2], axis=0)
+        either_way = np.vstack([np.insert(pairs, 2, sign, axis=1) for sign in (1, -1)])
 
         def once(left_s: float) -> tuple[FormAnswer, Array]:
-            nonlocal widest
             started = time.perf_counter()
-            form, place, widening = self._relaxed(limits, by_interval, LEAST_PRICE)
+            form, place, widening = self._relaxed(either_way, by_interval, LEAST_PRICE)
             answer = self._answer(form, left_s)
             if answer.status == Status.FAILED:
                 other = solve_by_highs(form, max(left_s - (time.perf_counter() - started), 0.0))
                 version = f"{answer.version}, {other.version}"
                 answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
-            if answer.status != Status.OPTIMAL:
-                widest = np.inf
-                return answer, np.zeros(self._n)
-            widened = answer.x[widening]
-            widest = float(widened.max())
-            return replace(answer, x=answer.x[place]), np.broadcast_to(widened, self._n)
+            return self._widened(answer, place, widening)
 
-        return self._at_all_knots(once, time_limit_s), widest
+        return self._at_all_knots(once, time_limit_s)
 
-    def solve_soft(self, limits: Indices, time_limit_s: float) -> FormAnswer:
+    def solve_soft(self, limits: Indices, time_limit_s: float) -> tuple[FormAnswer, Array]:
         """Solve with a priced excess of outputs in every interval, and with room for surprises.
 
         Args:
-            limits, time_limit_s: see `solve`.
+            limits, time_limit_s: see `solve`; limits between knots have rows for their own sign only.
 
         Returns:
-            As `solve`; the objective is not that of the plan alone.
+            As `solve_relaxed`; the objective is not that of the plan alone.
         """
 
         if self.condensed:
@@ -203,20 +199,24 @@ class KnotProgram:
         form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
         if self._surprises is not None:
             form, moved = self._with_room(self._surprises, form, place, excess)
-            place = moved[place]
+            place, excess = moved[place], moved[excess]
         answer = solve_form(form, time_limit_s, staged=True)
         if answer.status == Status.FAILED:
             answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
-        return replace(answer, x=answer.x[place]) if answer.status == Status.OPTIMAL else answer
+        return self._widened(answer, place, excess)
 
     def _soft_condensed(self, limits: Indices, left_s: float) -> tuple[FormAnswer, Array]:
         """The program with priced excess, from where the last one ended; how far limits are widened."""
         form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-        places = self._output_rows.places(self._held, limits)
-        answer = self._by_simplex(form, np.append(places, -1 - places), left_s)
+        places, (up, down) = self._output_rows.places(self._held, limits), self._sides(limits)
+        answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
+        return self._widened(answer, place, excess)
+
+    def _widened(self, answer: FormAnswer, place: Indices, widening: Indices) -> tuple[FormAnswer, Array]:
+        """An answer of a program with widenings in its own columns, and these, (n_intervals,)."""
         if answer.status != Status.OPTIMAL:
             return answer, np.zeros(self._n)
-        return replace(answer, x=answer.x[place]), answer.x[excess]
+        return replace(answer, x=answer.x[place]), np.broadcast_to(answer.x[widening], self._n)
 
     def _by_simplex(self, form: FreeForm, places: Indices, left_s: float) -> FormAnswer:
         """HiGHS's, from where the last program ended; `places` are those of the last rows."""
@@ -228,8 +228,8 @@ class KnotProgram:
 
     def _at_all_knots(
         self, once: Callable[[float], tuple[FormAnswer, Array]], time_limit_s: float
-    ) -> FormAnswer:
-        """Solve until limits at knots that have no row yet are kept, too.
+    ) -> tuple[FormAnswer, Array]:
+        """Solve until limits at knots that have no row yet are kept, too; and how far they are widened.
 
         Args:
             once: solves in a time, s, with rows for those held; how far limits are widened at each knot but
@@ -246,7 +246,7 @@ class KnotProgram:
                 if (beyond[missing] > 0.0).any():
                     self._held = self._held | missing
                     continue
-            return replace(answer, iterations=iterations)
+            return replace(answer, iterations=iterations), widened
 
     def _beyond_at_knots(self, columns: Array) -> Array:
         """How far outputs are beyond their bounds at all knots but the first, (n_intervals, n_out), rad/s."""
@@ -255,18 +255,19 @@ class KnotProgram:
         change = self.model.states(u)[1:] @ self.model.output.T
         return np.abs(self.model.omega[self.model.points[1:]] + change) - self.bounds.limit
 
-    def near(self, outputs: Array, left_open: float = 0.0) -> set[Limit]:
+    def near(self, outputs: Array, left_open: float = 0.0, widened: Array | None = None) -> set[Limit]:
         """Points between knots at which an output comes near its bound.
 
         Args:
             outputs: shape (n_points, n_out), rad/s.
             left_open: excess that needs no row, rad/s.
+            widened: how far limits are widened in each interval, (n_intervals,), rad/s; None: not at all.
         """
         parts = FEW_PARTS if self.condensed else PARTS
         least = left_open if self.condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
-        size, points, beyond = np.abs(outputs.T), self.model.points, self._beyond(outputs).T
-        chosen = np.zeros(size.shape, dtype=bool)
-        peak = (size[:, 1:-1] >= size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+        points, beyond = self.model.points, self._beyond(outputs, widened).T
+        chosen = np.zeros(beyond.shape, dtype=bool)
+        peak = (beyond[:, 1:-1] >= beyond[:, :-2]) & (beyond[:, 1:-1] >= beyond[:, 2:])
         chosen[:, 1:-1] = peak
         # A peak that is cut off moves to the points beside it.
         over = peak & (beyond[:, 1:-1] > 0.0)
@@ -274,17 +275,23 @@ class KnotProgram:
             chosen[:, :-2] |= over
             chosen[:, 2:] |= over
         chosen[:, divided(points, np.full(len(points) - 1, parts))] = True
+        # Where outputs come back from beyond a bound, an interval exceeds it most where it begins.
+        chosen[:, points[:-1] + 1] |= beyond[:, points[:-1] + 1] > 0.0
         chosen[:, points] = False
         of, k = np.nonzero(chosen & (beyond > least))
-        return set(zip(of.tolist(), k.tolist(), strict=True))
+        sign = np.where(outputs[k, of] < 0.0, -1, 1)
+        return set(zip(of.tolist(), k.tolist(), sign.tolist(), strict=True))
 
-    def excess(self, outputs: Array) -> float:
-        """Largest excess over a bound after t_0: x_0 is given, wherever it lies; rad/s."""
-        return float(self._beyond(outputs)[1:].max())
+    def excess(self, outputs: Array, widened: Array | None = None) -> float:
+        """Largest excess over a bound after t_0: x_0 is given, wherever it lies; rad/s. See `near`."""
+        return float(self._beyond(outputs, widened)[1:].max())
 
-    def _beyond(self, outputs: Array) -> Array:
-        """How far outputs are beyond what margins leave of their bounds, (n_points, n_out), rad/s."""
-        return self.bounds.beyond(outputs) + self._margin[:, None]
+    def _beyond(self, outputs: Array, widened: Array | None) -> Array:
+        """How far outputs are beyond what margins leave of widened bounds, (n_points, n_out), rad/s."""
+        beyond = self.bounds.beyond(outputs) + self._margin[:, None]
+        if widened is not None:
+            beyond[1:] -= np.repeat(widened, self.model.lengths)[:, None]
+        return beyond
 
     def predict(self, columns: Array) -> Prediction:
         """All grid points at a solution, shape (n_columns,)."""
@@ -322,12 +329,18 @@ class KnotProgram:
         of_limit = new[own] if by_interval else np.full(len(own), new[0])
         outputs = with_empty_columns(self._rows_held(limits), after)
         one = np.ones(len(own)), (np.arange(len(own)), of_limit)
-        widening = sp.csc_matrix(one, outputs.shape)
+        widening = sp.csr_matrix(one, outputs.shape)
         ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])
         low, high = (np.append(knots[held], chosen) for knots, chosen in zip(*ends, strict=True))
-        below = np.full(len(own), -np.inf)
-        rows = sp.vstack([outputs - widening, -outputs - widening])
-        return form.with_rows(rows, np.append(below, below), np.append(high, -low)), place, new
+        up, down = self._sides(limits)
+        rows = sp.vstack([(outputs - widening)[up], (-outputs - widening)[down]])
+        most = np.append(high[up], -low[down])
+        return form.with_rows(rows, np.full(len(most), -np.inf), most), place, new
+
+    def _sides(self, limits: Indices) -> tuple[Indices, Indices]:
+        """Rows of outputs that may not go up, and not down: at knots both, between them by their signs."""
+        sign = np.append(np.zeros(np.count_nonzero(self._held), dtype=int), limits[:, 2])
+        return np.flatnonzero(sign >= 0), np.flatnonzero(sign <= 0)
 
     def _with_room(
         self, room: Room, form: FreeForm, place: Indices, excess: Indices

@@ -151,26 +151,28 @@ def solve_with_rows_added(
     """
     iterations, infeasible, prediction, excess = 0, False, None, 0.0
     for _ in range(MAX_SOFT_PROGRAMS if rows.soft else MAX_PROGRAMS):
-        places, widening = np.array(sorted(limits), dtype=int).reshape(-1, 2), 0.0
+        places, widened = np.array(sorted(limits), dtype=int).reshape(-1, 3), None
         if rows.soft:
-            answer = program.solve_soft(places, deadline - time.perf_counter())
+            answer, widened = program.solve_soft(places, deadline - time.perf_counter())
         elif not infeasible:
             answer = program.solve(places, deadline - time.perf_counter())
         has_none = answer.status in (Status.FAILED, Status.INFEASIBLE)  # or PIQP finds none
         if not rows.soft and (infeasible or has_none):
             iterations += 0 if infeasible else answer.iterations
             left = deadline - time.perf_counter()
-            answer, widening = program.solve_relaxed(places, left, rows.by_interval)
+            answer, widened = program.solve_relaxed(places, left, rows.by_interval)
+            infeasible = infeasible or float(widened.max()) > rows.open
         iterations += answer.iterations
         if answer.status != Status.OPTIMAL:
             break
         prediction = program.predict(answer.x)
         excess = program.excess(prediction.outputs)
+        # What the answer pays for, or cannot avoid, asks for no further rows.
+        left_open = program.excess(prediction.outputs, widened)
         least = (rows.enough if np.isfinite(rows.enough) else rows.open) / 2
-        added = program.near(prediction.outputs, least) - limits
+        added = program.near(prediction.outputs, least, widened) - limits
         limits |= added if excess > rows.open else set()
-        infeasible = infeasible or widening > rows.open
-        if not added or (not rows.by_interval if infeasible else excess <= rows.enough):
+        if not added or left_open <= rows.enough or (infeasible and not rows.by_interval):
             break
     if answer.status != Status.OPTIMAL and not (rows.soft and prediction is not None):
         return Attempt(answer.status, None, None, iterations, answer.version, answer.message)

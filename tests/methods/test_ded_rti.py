@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
 from ded_bench.methods import ded_ko_knots, surprises
 from ded_bench.methods.ded_rti import NEAR_S, RealTimeSolver
+from ded_bench.methods.ed import static_dispatch
+from ded_bench.methods.knot_program import KnotProgram, Plan
+from ded_bench.methods.knots import case_knots
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.reserve import steady_speeds, sudden_speeds
+from ded_bench.methods.slp import MAX_SOFT_PROGRAMS
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.surprises import AHEAD_S, ALWAYS, LASTS_S, LIMIT, Surprises
-from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
+from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, solve_on_surrogate
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import simulate
 from ded_bench.plants.score import score
@@ -21,7 +27,9 @@ from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.bench import timed
+from ded_bench.solvers.linear_program import FormAnswer
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import TRAJECTORY, find_surrogate
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.on_surrogates import prepared, replay, short
 from tests.methods.test_ded_ko_knots import least_excess
@@ -75,6 +83,31 @@ def test_what_is_infeasible_is_exceeded_little(ninebus: Case) -> None:
     over = np.abs(replay(ninebus, koopman, instance, plan.schedule).omega).max(axis=1) - bound
     total = np.maximum(np.maximum.reduceat(over[1:], first), 0.0).sum()
     assert total == pytest.approx(least_excess(ninebus, koopman, instance, "TO"), rel=0.02)
+
+
+def test_what_is_paid_for_asks_for_no_further_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start beyond a bound that is tighter for a while, which ends between two knots."""
+    case, left = Case.load("two-area"), []
+    bounds, instance = case.bounds("TO"), sample_instance(case, VALIDATION_SEED, 0)
+    fast = dict.fromkeys(case.generators, 1.1 * case.omega_bound("TO"))
+    beyond = instance.initial.model_copy(update={"omega": fast})
+    instance = instance.model_copy(update={"initial": beyond})
+    solve_soft = KnotProgram.solve_soft
+
+    def counted(program: KnotProgram, *args: Any) -> tuple[FormAnswer, Array]:
+        answer, widened = solve_soft(program, *args)
+        left.append(program.excess(program.predict(answer.x).outputs, widened))
+        assert widened[0] > 0.1 * bounds.limit.min()
+        return answer, widened
+
+    monkeypatch.setattr(KnotProgram, "solve_soft", counted)
+    margin = np.where(instance.grid < 0.8, 0.5, 0.0) * bounds.limit.min()
+    knots, plan = case_knots(case, instance), Plan(static_dispatch(case, instance), margin=margin)
+    surrogate = find_surrogate(case, TRAJECTORY, ())
+    found = solve_on_surrogate(case, surrogate, instance, bounds, knots, plan=plan)
+    assert found.status == Status.INFEASIBLE
+    assert len(left) < MAX_SOFT_PROGRAMS
+    assert left[-1] <= SOFT_TOLERANCE * bounds.limit.min()
 
 
 def test_the_plan_in_force_saves_programs_and_model_error() -> None:

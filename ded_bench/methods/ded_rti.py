@@ -45,7 +45,7 @@ from ded_bench.surrogates.koopman import Koopman
 
 Options = NoOptions
 #: Raised when answers change.
-VERSION = 3
+VERSION = 4
 #: Beside a slack, plans are made for so many seconds, and their ends stay: on drawn scenarios of two-area
 #: plans of 60 s cost as much, and those of 20 s follow steep ramps too late.
 NEAR_S = 30.0

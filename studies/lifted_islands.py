@@ -30,7 +30,15 @@ from ded_bench.methods.knots import case_knots
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import plant_of, servable, simulate
 from ded_bench.plants.score import score
-from ded_bench.plants.time_varying import Delivered, Hold, Indices, Reset, TimeVarying, across_intervals
+from ded_bench.plants.time_varying import (
+    Delivered,
+    Hold,
+    Indices,
+    Reset,
+    TimeVarying,
+    across_intervals,
+    doubled,
+)
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
 from ded_bench.surrogates.find import AlongTrajectory, find_surrogate
@@ -190,7 +198,7 @@ class Identified(AlongTrajectory):
         n_maps = len(points) - 1
         step = Hold(*(np.broadcast_to(part, (n_maps, *part.shape)) for part in (f, g, h)))
         at = np.flatnonzero((points[:-1] > 0) & (points[:-1] % period == 0))
-        across = across_intervals(step, np.diff(points))
+        across = across_intervals(doubled(step, np.diff(points)), np.diff(points))
         across.f[at] = across.f[at] @ reset
         c = np.zeros((n_gen, n))
         c[:, n_gen : 2 * n_gen] = np.eye(n_gen)

@@ -18,7 +18,7 @@ import pytest
 
 from ded_bench.plants.lossless.lossless_plant import LosslessPlant, LosslessState
 from ded_bench.plants.plant import PLANTS, Piece
-from ded_bench.plants.time_varying import Delivered, Hold, Indices, TimeVarying, across_intervals
+from ded_bench.plants.time_varying import Delivered, Hold, Indices, TimeVarying, across_intervals, doubled
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import LosslessCase
@@ -104,7 +104,7 @@ class LaggedPlant:
         return dataclasses.replace(
             model,
             step=step,
-            across=across_intervals(step, model.lengths),
+            across=across_intervals(doubled(step, model.lengths), model.lengths),
             slack=np.concatenate([model.slack, np.zeros((n, n_gen))], axis=1),
             delivered=Delivered(c_p, np.zeros((n, n_gen, n_gen)), trajectory.p_gen),
         )

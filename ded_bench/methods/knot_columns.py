@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ded_bench.methods.knots import divided, knot_weights, power_limits, transfer_room
-from ded_bench.plants.time_varying import Hold, Indices, LocalRows, TimeVarying
+from ded_bench.plants.time_varying import Indices, LocalRows, TimeVarying
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import Basis, FreeForm
@@ -36,7 +36,6 @@ class OutputRows:
     def __init__(self, model: TimeVarying) -> None:
         self._model, self._n_out = model, len(model.output)
         self._in_set_points: dict[int, Array] = {}
-        self._known: dict[int, list[Hold]] = {}
 
     def places(self, held: NDArray[np.bool_], limits: Indices) -> Indices:
         """Of limits at knots that are held, (n_intervals, n_out), and of (output, grid point) between."""
@@ -62,9 +61,9 @@ class OutputRows:
         steps, x = point - model.points[interval], model.output[output]
         on_start, on_slope = np.zeros((2, len(places), model.p_gen.shape[1]))
         for j in np.unique(interval[steps > 0]).tolist():
-            for bit, power in enumerate(self._powers(j)):
+            for bit, power in enumerate(model.doubled):
                 chosen = (interval == j) & (steps >> bit & 1 == 1)
-                f, g, h = (x[chosen] @ part[0] for part in power)
+                f, g, h = (x[chosen] @ part[j] for part in power)
                 on_slope[chosen] += 2**bit * on_start[chosen] + h
                 on_start[chosen] += g
                 x[chosen] = f
@@ -72,14 +71,6 @@ class OutputRows:
         x[between] = model.before_reset(x[between], interval[between])
         on_slope[between] /= model.lengths[interval[between], None]
         return LocalRows(interval, x, on_start - on_slope, on_slope)
-
-    def _powers(self, j: int) -> list[Hold]:
-        """The map of an interval over one grid step, two, four and so on."""
-        if j not in self._known:
-            powers = self._known[j] = [self._model.step.take(np.array([j]))]
-            while 2 ** len(powers) < self._model.lengths[j]:
-                powers.append(powers[-1].then(powers[-1], 2 ** (len(powers) - 1)))
-        return self._known[j]
 
 
 class BasisByPlaces(NamedTuple):

@@ -64,6 +64,19 @@ class LocalRows(NamedTuple):
         return LocalRows(interval, self.x[chosen], self.start[chosen], self.end[chosen])
 
 
+class Sums(NamedTuple):
+    """Sums over grid points as rows in x, u and Δu per step at the first of them, one for each interval."""
+
+    x: Array  # (n_intervals, n_state)
+    u: Array  # (n_intervals, n_gen)
+    slope: Array  # (n_intervals, n_gen)
+
+    def after(self, first: Hold, steps: int) -> Sums:
+        """As rows in what is `steps` steps earlier, the map over which is `first`."""
+        x, u, slope = ((self.x[:, None] @ part)[:, 0] for part in first)
+        return Sums(x, u + self.u, slope + steps * self.u + self.slope)
+
+
 class Delivered(NamedTuple):
     """What generators deliver where that is not their set-points."""
 
@@ -97,6 +110,7 @@ class TimeVarying:
     delivered: Delivered | None = None  # None: the set-points are delivered
     reset: Reset | None = None
     matrix: Array | None = None  # (n_out, n_gen): outputs by ω; None: ω
+    powers: tuple[Hold, ...] = ()  # of the maps over one grid step, by `doubled`; none: not found yet
 
     def monitored(self, matrix: Array) -> TimeVarying:
         """The same model with outputs y = matrix @ ω in the place of ω, matrix of shape (n_out, n_gen)."""
@@ -115,6 +129,11 @@ class TimeVarying:
     def lengths(self) -> Indices:
         """Grid steps of each interval, shape (n_intervals,)."""
         return np.diff(self.points)
+
+    @functools.cached_property
+    def doubled(self) -> tuple[Hold, ...]:
+        """Maps over 1, 2, 4, ... grid steps, see `doubled`."""
+        return self.powers or doubled(self.step, self.lengths)
 
     def states(self, u: Array) -> Array:
         """Deviations x at the knots under input increments.
@@ -221,18 +240,24 @@ class TimeVarying:
             raise ValueError("the set-points are delivered")
         on_state, on_input = (np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2])
 
-        length, count = self.lengths, self.lengths.astype(float)
-        count[-1] += 1.0  # the point at a knot is of the interval after it, the last of the last one
-
-        def add(r: int, costate: Array) -> None:
-            here = np.flatnonzero(r < count)
-            costate[here, 0] += on_state[here]
-
-        rows = self._costates(1, add)
+        length, count = self.lengths[:, None], self.lengths[:, None].copy()
+        count[-1] += 1  # the point at a knot is of the interval after it, the last of the last one
+        none = np.zeros_like(on_input)
+        total, block = Sums(0.0 * on_state, none, none), Sums(on_state, none, none)
+        # Blocks of 1, 2, 4, ... points, each before the shorter ones.
+        for bit in range(int(count.max()).bit_length()):
+            chosen, later, twice = (count >> bit & 1) == 1, total, block
+            if bit < len(self.doubled):
+                later, twice = (one.after(self.doubled[bit], 2**bit) for one in (total, block))
+            total = Sums(
+                *(np.where(chosen, b + t, old) for b, t, old in zip(block, later, total, strict=True))
+            )
+            block = Sums(*(b + t for b, t in zip(block, twice, strict=True)))
         # u rises linearly over an interval: Σ r / length over its points, of which the last has one more.
         risen = (count - 1.0) * count / 2.0 / length
-        start, end = on_input * (count - risen)[:, None], on_input * risen[:, None]
-        return LocalRows(rows.interval, rows.x[:, 0], rows.start[:, 0] + start, rows.end[:, 0] + end)
+        end = on_input * risen + total.slope / length
+        start = on_input * count + total.u - end
+        return LocalRows(np.arange(len(count)), self.before_reset(total.x, np.arange(len(count))), start, end)
 
     def gradient(self, by_omega: Array, by_p_slack: Array, by_p_gen: Array) -> Array:
         """Derivatives of any function of the outputs by the set-points at the knots, by the adjoint.
@@ -332,13 +357,29 @@ def _places(interval: Indices) -> Indices:
     return places
 
 
-def across_intervals(step: Hold, lengths: Indices) -> Hold:
-    """Maps over whole intervals of so many grid steps, from those over one step of each."""
-    across = Hold(*(np.empty_like(part) for part in step))
-    for length in np.unique(lengths):
+def doubled(step: Hold, lengths: Indices) -> tuple[Hold, ...]:
+    """Maps over 1, 2, 4, ... grid steps of intervals of so many; zero where an interval is shorter."""
+    powers = [step]
+    while (steps := 2 ** len(powers)) <= lengths.max():
+        long = np.flatnonzero(lengths >= steps)
+        last, twice = powers[-1].take(long), Hold(*(np.zeros(part.shape) for part in step))
+        for whole, part in zip(twice, last.then(last, steps // 2), strict=True):
+            whole[long] = part
+        powers.append(twice)
+    return tuple(powers)
+
+
+def across_intervals(powers: tuple[Hold, ...], lengths: Indices) -> Hold:
+    """Maps over whole intervals of so many grid steps, from those of `doubled`."""
+    across = Hold(*(np.empty(part.shape) for part in powers[0]))
+    for length in np.unique(lengths).tolist():
         chosen = np.flatnonzero(lengths == length)
-        for whole, part in zip(across, repeated(step.take(chosen), int(length)), strict=True):
-            whole[chosen] = part
+        first, *bits = (bit for bit in range(len(powers)) if length >> bit & 1)
+        total, done = powers[first].take(chosen), 2**first
+        for bit in bits:
+            total, done = total.then(powers[bit].take(chosen), done), done + 2**bit
+        for whole, of_length in zip(across, total, strict=True):
+            whole[chosen] = of_length
     return across
 
 
@@ -371,14 +412,6 @@ def series_step(
 
 
 def repeated(step: Hold, times: int) -> Hold:
-    """A map over several steps, from maps over 1, 2, 4, ... steps."""
-    total: Hold | None = None
-    done, length = 0, 1
-    while True:
-        if times & length:
-            total = step if total is None else total.then(step, done)
-            done += length
-        if done == times:
-            assert total is not None
-            return total
-        step, length = step.then(step, length), 2 * length
+    """Maps over several steps, from those over one."""
+    lengths = np.full(len(step.f), times)
+    return across_intervals(doubled(step, lengths), lengths)

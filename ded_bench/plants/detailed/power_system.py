@@ -29,6 +29,7 @@ from ded_bench.plants.time_varying import (
     Reset,
     TimeVarying,
     across_intervals,
+    doubled,
     repeated,
 )
 from ded_bench.problem.case import Case
@@ -261,7 +262,8 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
         reset = Reset(np.flatnonzero(np.isin(points[:-1], run.agc_points)), f)
     dt_s = float(trajectory.t[1] - trajectory.t[0])
     step = _one_step(rates, into, dt_s, run.steps)
-    across = across_intervals(step, np.diff(points))
+    powers = doubled(step, np.diff(points))
+    across = across_intervals(powers, np.diff(points))
     if reset is not None:
         across.f[reset.intervals] = across.f[reset.intervals] @ reset.f
     return TimeVarying(
@@ -275,6 +277,7 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
         p_gen=trajectory.p_set[points],
         delivered=_delivered(system, kinds, machines, n, trajectory.p_gen, len(middle)),
         reset=reset,
+        powers=powers,
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
-from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, series_step
+from ded_bench.plants.time_varying import Hold, Indices, TimeVarying, across_intervals, doubled, series_step
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, State
@@ -117,7 +117,7 @@ class LosslessPlant:
         return TimeVarying(
             points=points,
             step=step,
-            across=across_intervals(step, np.diff(points)),
+            across=across_intervals(doubled(step, np.diff(points)), np.diff(points)),
             speed=slice(n_gen, 2 * n_gen),
             slack=np.concatenate([slack, np.zeros_like(slack)], axis=1),
             omega=trajectory.omega,

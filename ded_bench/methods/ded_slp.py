@@ -173,7 +173,7 @@ class _OnPlant:
         if self.is_near:
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
-        rows = Rows(OPEN, enough, self.soft)
+        rows = Rows(OPEN, enough)
         attempt = solve_with_rows_added(program, self.limits, rows, self.deadline)
         if attempt.wanted is not None:
             self.steps.append(float(np.abs(attempt.wanted - around.at).max()))

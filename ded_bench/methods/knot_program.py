@@ -155,72 +155,47 @@ class KnotProgram:
         return self._at_all_knots(once, time_limit_s)[0]
 
     def solve_relaxed(
-        self, limits: Indices, time_limit_s: float, by_interval: bool = False
+        self, limits: Indices, time_limit_s: float, price: float = LEAST_PRICE
     ) -> tuple[FormAnswer, Array]:
-        """Solve with limits of outputs widened as little as possible; what PIQP does not solve HiGHS does.
+        """Solve with limits of outputs widened in every interval, and with room for surprises.
 
-        The cost counts, but so little that the widening is the least one but for round-off.
-
-        Args, but for those of `solve`:
-            by_interval: every interval has a widening of its own, and their sum is the least; else all
-                have the same.
-
-        Returns:
-            The answer, and how far limits are widened in each interval, (n_intervals,), rad/s.
-        """
-        pairs = np.unique(limits[:, :2], axis=0)
-        either_way = np.vstack([np.insert(pairs, 2, sign, axis=1) for sign in (1, -1)])
-
-        def once(left_s: float) -> tuple[FormAnswer, Array]:
-            started = time.perf_counter()
-            form, place, widening = self._relaxed(either_way, by_interval, LEAST_PRICE)
-            answer = self._answer(form, left_s)
-            if answer.status == Status.FAILED:
-                other = solve_by_highs(form, max(left_s - (time.perf_counter() - started), 0.0))
-                version = f"{answer.version}, {other.version}"
-                answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
-            return self._widened(answer, place, widening)
-
-        return self._at_all_knots(once, time_limit_s)
-
-    def solve_soft(self, limits: Indices, time_limit_s: float) -> tuple[FormAnswer, Array]:
-        """Solve with a priced excess of outputs in every interval, and with room for surprises.
+        What PIQP does not solve HiGHS does.
 
         Args:
             limits, time_limit_s: see `solve`; limits between knots have rows for their own sign only.
+            price: of widenings; with LEAST_PRICE their sum is the least but for round-off.
 
         Returns:
-            As `solve_relaxed`; the objective is not that of the plan alone.
+            The answer, whose objective is not that of the schedule alone; and how far limits are widened in
+            each interval, (n_intervals,), rad/s.
         """
 
-        if self.condensed:
-            return self._at_all_knots(functools.partial(self._soft_condensed, limits), time_limit_s)
-        deadline = time.perf_counter() + time_limit_s
-        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-        if self._surprises is not None:
-            form, moved = self._with_room(self._surprises, form, place, excess)
-            place, excess = moved[place], moved[excess]
-        answer = solve_form(form, time_limit_s, staged=True)
-        if answer.status == Status.FAILED:
-            answer = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
-        return self._widened(answer, place, excess)
+        def once(left_s: float) -> tuple[FormAnswer, Array]:
+            deadline = time.perf_counter() + left_s
+            form, place, widening = self._relaxed(limits, price)
+            if self._surprises is not None:
+                form, moved = self._with_room(self._surprises, form, place, widening)
+                place, widening = moved[place], moved[widening]
+            if self.condensed:
+                places, (up, down) = self._output_rows.places(self._held, limits), self._sides(limits)
+                answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
+            else:
+                answer = self._answer(form, left_s)
+            if answer.status == Status.FAILED:
+                other = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
+                version = f"{answer.version}, {other.version}"
+                answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
+            if answer.status != Status.OPTIMAL:
+                return answer, np.zeros(self._n)
+            return replace(answer, x=answer.x[place]), answer.x[widening]
 
-    def _soft_condensed(self, limits: Indices, left_s: float) -> tuple[FormAnswer, Array]:
-        """The program with priced excess, from where the last one ended; how far limits are widened."""
-        form, place, excess = self._relaxed(limits, True, SOFT_PRICE)
-        places, (up, down) = self._output_rows.places(self._held, limits), self._sides(limits)
-        answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
-        return self._widened(answer, place, excess)
-
-    def _widened(self, answer: FormAnswer, place: Indices, widening: Indices) -> tuple[FormAnswer, Array]:
-        """An answer of a program with widenings in its own columns, and these, (n_intervals,)."""
-        if answer.status != Status.OPTIMAL:
-            return answer, np.zeros(self._n)
-        return replace(answer, x=answer.x[place]), np.broadcast_to(answer.x[widening], self._n)
+        return self._at_all_knots(once, time_limit_s)
 
     def _by_simplex(self, form: FreeForm, places: Indices, left_s: float) -> FormAnswer:
         """HiGHS's, from where the last program ended; `places` are those of the last rows."""
-        start = None if self._basis is None else self._basis.start(places)
+        start = None
+        if self._basis is not None and len(self._basis.columns) == len(form.cost):
+            start = self._basis.start(places)
         answer = solve_by_highs(form, max(left_s, 0.0), start)
         if answer.status == Status.OPTIMAL and answer.basis is not None:
             self._basis = BasisByPlaces.of(answer.basis, places)
@@ -310,25 +285,21 @@ class KnotProgram:
         )
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        """HiGHS's of a condensed program, else PIQP's."""
-        if self.condensed:
-            return solve_by_highs(form, max(time_limit_s, 0.0))
+        """PIQP's answer."""
         is_short = self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
         return solve_form(form, time_limit_s, staged=not is_short)
 
-    def _relaxed(self, limits: Indices, by_interval: bool, price: float) -> tuple[FreeForm, Indices, Indices]:
+    def _relaxed(self, limits: Indices, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""
         form = self._columns.program(self._radius)
         held = self._held.ravel()
         own = np.append(np.nonzero(self._held)[0], np.searchsorted(self.model.points, limits[:, 1]) - 1)
-        after = self._columns.last if by_interval else self._columns.last[-1:]
-        none = np.zeros(len(after))
+        after, none = self._columns.last, np.zeros(self._n)
         form, place, new = form.with_columns(
             after, none + price * max(self._all_costs, 1.0), none, none + np.inf
         )
-        of_limit = new[own] if by_interval else np.full(len(own), new[0])
         outputs = with_empty_columns(self._rows_held(limits), after)
-        one = np.ones(len(own)), (np.arange(len(own)), of_limit)
+        one = np.ones(len(own)), (np.arange(len(own)), new[own])
         widening = sp.csr_matrix(one, outputs.shape)
         ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])
         low, high = (np.append(knots[held], chosen) for knots, chosen in zip(*ends, strict=True))

@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from ded_bench.methods.knot_program import KnotProgram, Limit, Prediction
+from ded_bench.methods.knot_program import SOFT_PRICE, KnotProgram, Limit, Prediction
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
@@ -131,7 +131,6 @@ class Rows:
 
     open: float  # excess that needs no further row, or makes nothing infeasible, rad/s
     enough: float  # excess with which to stop, rad/s; no less than `open`
-    by_interval: bool = False  # what least excess means, see `KnotProgram.solve_relaxed`
     soft: bool = False  # every excess has a price from the start
 
 
@@ -153,14 +152,14 @@ def solve_with_rows_added(
     for _ in range(MAX_SOFT_PROGRAMS if rows.soft else MAX_PROGRAMS):
         places, widened = np.array(sorted(limits), dtype=int).reshape(-1, 3), None
         if rows.soft:
-            answer, widened = program.solve_soft(places, deadline - time.perf_counter())
+            answer, widened = program.solve_relaxed(places, deadline - time.perf_counter(), SOFT_PRICE)
         elif not infeasible:
             answer = program.solve(places, deadline - time.perf_counter())
         has_none = answer.status in (Status.FAILED, Status.INFEASIBLE)  # or PIQP finds none
         if not rows.soft and (infeasible or has_none):
             iterations += 0 if infeasible else answer.iterations
             left = deadline - time.perf_counter()
-            answer, widened = program.solve_relaxed(places, left, rows.by_interval)
+            answer, widened = program.solve_relaxed(places, left)
             infeasible = infeasible or float(widened.max()) > rows.open
         iterations += answer.iterations
         if answer.status != Status.OPTIMAL:
@@ -172,7 +171,7 @@ def solve_with_rows_added(
         least = (rows.enough if np.isfinite(rows.enough) else rows.open) / 2
         added = program.near(prediction.outputs, least, widened) - limits
         limits |= added if excess > rows.open else set()
-        if not added or left_open <= rows.enough or (infeasible and not rows.by_interval):
+        if not added or left_open <= rows.enough:
             break
     if answer.status != Status.OPTIMAL and not (rows.soft and prediction is not None):
         return Attempt(answer.status, None, None, iterations, answer.version, answer.message)

@@ -57,7 +57,7 @@ def solve_on_surrogate(
     started = built = time.perf_counter()
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
     if plan is None:
-        rows = Rows(OMEGA_TOLERANCE, OMEGA_TOLERANCE, by_interval=soft)
+        rows = Rows(OMEGA_TOLERANCE, OMEGA_TOLERANCE)
     else:
         left = SOFT_TOLERANCE * float(bounds.limit.min())
         rows = Rows(left, left, soft=True)

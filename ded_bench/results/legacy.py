@@ -18,8 +18,6 @@ _SETTINGS = {
     ("ded-dpc-refined", "default"): "refine=200",
     ("ded-dpc-shared-refined", "default"): "iterations=80",
 }
-#: Settings of `ded-ko-knots` that are a method of their own, with its options.
-_REAL_TIME = {"real-time": "default", "reserve": "reserve=on"}
 _NUMBERS = (
     (re.compile(r"ded-dpc-refined steps(\d+)"), "refine={}", 1),
     (re.compile(r"ded-slp (\d+)ms"), "knot_s={:g}", 1e-3),
@@ -35,8 +33,8 @@ def renamed(method: str, settings: str) -> tuple[str, str, str]:
     """
     model = next((m for m in _MODELS if settings.endswith(f"-{m}")), "")
     name = settings.removesuffix(f"-{model}") if model else settings
-    if method == "ded-ko-knots" and name in _REAL_TIME:
-        return "ded-rti", _REAL_TIME[name], model
+    if (method, name) == ("ded-ko-knots", "real-time"):
+        return "ded-rti", "default", model
     for pattern, text, unit in _NUMBERS:
         if found := pattern.fullmatch(f"{method} {name}"):
             return _METHODS.get(method, method), text.format(int(found[1]) * unit), model

@@ -92,15 +92,15 @@ def test_what_is_paid_for_asks_for_no_further_programs(monkeypatch: pytest.Monke
     fast = dict.fromkeys(case.generators, 1.1 * case.omega_bound("TO"))
     beyond = instance.initial.model_copy(update={"omega": fast})
     instance = instance.model_copy(update={"initial": beyond})
-    solve_soft = KnotProgram.solve_soft
+    solve_relaxed = KnotProgram.solve_relaxed
 
     def counted(program: KnotProgram, *args: Any) -> tuple[FormAnswer, Array]:
-        answer, widened = solve_soft(program, *args)
+        answer, widened = solve_relaxed(program, *args)
         left.append(program.excess(program.predict(answer.x).outputs, widened))
         assert widened[0] > 0.1 * bounds.limit.min()
         return answer, widened
 
-    monkeypatch.setattr(KnotProgram, "solve_soft", counted)
+    monkeypatch.setattr(KnotProgram, "solve_relaxed", counted)
     margin = np.where(instance.grid < 0.8, 0.5, 0.0) * bounds.limit.min()
     knots, plan = case_knots(case, instance), Plan(static_dispatch(case, instance), margin=margin)
     surrogate = find_surrogate(case, TRAJECTORY, ())

@@ -12,7 +12,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods import ed
 from ded_bench.methods.ded_slp import OPEN
 from ded_bench.methods.ed import first_schedules, slow_dispatch
-from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knot_program import LEAST_PRICE, SOFT_PRICE, KnotProgram
 from ded_bench.methods.knots import case_knots
 from ded_bench.methods.radau_detailed import DetailedProgram, mesh
 from ded_bench.methods.radau_program import POINTS
@@ -122,29 +122,30 @@ def test_an_estimate_under_a_forecast_that_comes_true_is_the_state(island: Case,
     np.testing.assert_array_equal(estimate.initial(later, other).x, blind.x)
 
 
-@pytest.mark.parametrize("way", ["solve", "solve_relaxed", "solve_soft"])
+@pytest.mark.parametrize("price", [None, LEAST_PRICE, SOFT_PRICE])
 def test_condensed_programs_have_the_optimum_of_those_with_states(
-    island: Case, instance: Instance, way: str
+    island: Case, instance: Instance, price: float | None
 ) -> None:
     """Along the static dispatch, beyond its bounds; widened where no schedule can keep them."""
     points = case_knots(island, instance)
     schedule = Schedule(instance.grid[points], slow_dispatch(island, instance, points))
     model = plant_of(island).linearise_along(simulate(island, instance, schedule), points)
-    bounds = island.bounds("TO").tightened(part=0.0 if way == "solve" else 0.99)
+    bounds = island.bounds("TO").tightened(part=0.0 if price is None else 0.99)
     found, widened = [], []
     for condensed in (False, True):
         program = KnotProgram(island, instance, bounds, model, condensed=condensed)
         if not condensed:
             limits = np.array(sorted(program.near(program.model.omega)))
-        answer = getattr(program, way)(limits, np.inf)
-        if way != "solve":
-            answer, of_intervals = answer
+        if price is None:
+            answer = program.solve(limits, np.inf)
+        else:
+            answer, of_intervals = program.solve_relaxed(limits, np.inf, price)
             widened.append(of_intervals.sum())
         assert answer.status == Status.OPTIMAL
         found.append(program.predict(answer.x))
     with_states, without = found
     # Beside the price of a widening, what the cost is hardly counts for an interior point.
-    same = 1e-7 if way == "solve" else 1e-3
+    same = 1e-7 if price is None else 1e-3
     assert without.objective == pytest.approx(with_states.objective, rel=same)
     if widened:
         # Prices of widenings are sums of all columns' costs, which differ.

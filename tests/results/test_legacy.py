@@ -19,7 +19,6 @@ from ded_bench.results.rows import Results
         ("ded-slp", "100ms", ("ded-slp", "knot_s=0.1", "")),
         ("ded-ko", "default-koopman-paper", ("ded-ko", "default", "koopman-paper")),
         ("ded-ko-knots", "real-time-trajectory", ("ded-rti", "default", "trajectory")),
-        ("ded-ko-knots", "reserve-trajectory", ("ded-rti", "reserve=on", "trajectory")),
         ("ded-dpc-refined", "default", ("ded-dpc", "refine=200", "")),
         ("ded-dpc-refined", "steps25", ("ded-dpc", "refine=25", "")),
         ("ded-dpc-shared", "default-trajectory", ("ded-admm", "default", "trajectory")),

@@ -236,7 +236,7 @@ class KnotProgram:
         Args:
             outputs: shape (n_points, n_out), rad/s.
             left_open: excess that needs no row, rad/s.
-            widened: how far limits are widened in each interval, (n_intervals,), rad/s; None: not at all.
+            widened: how far limits are widened in each interval, (n_intervals,), rad/s; None: they cannot be.
         """
         parts = FEW_PARTS if self.condensed else PARTS
         least = left_open if self.condensed else (NEAR - 1.0) * self.bounds.limit[:, None]
@@ -250,8 +250,8 @@ class KnotProgram:
             chosen[:, :-2] |= over
             chosen[:, 2:] |= over
         chosen[:, divided(points, np.full(len(points) - 1, parts))] = True
-        # Where outputs come back from beyond a bound, an interval exceeds it most where it begins.
-        chosen[:, points[:-1] + 1] |= beyond[:, points[:-1] + 1] > 0.0
+        if widened is not None:  # coming back from beyond a bound, outputs are most where an interval begins
+            chosen[:, points[:-1] + 1] |= beyond[:, points[:-1] + 1] > 0.0
         chosen[:, points] = False
         of, k = np.nonzero(chosen & (beyond > least))
         sign = np.where(outputs[k, of] < 0.0, -1, 1)

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ded_bench.methods.knots import control_times
+from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import Plant, plant_of, servable, simulate
-from ded_bench.plants.time_varying import Indices, TimeVarying
+from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.benchmark import SplitName, select_split
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance

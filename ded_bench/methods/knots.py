@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from ded_bench.plants.time_varying import Indices
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance

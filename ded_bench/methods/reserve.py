@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.signal import lsim
 
-from ded_bench.plants.time_varying import Indices
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.surrogates.linear import at_nominal_point

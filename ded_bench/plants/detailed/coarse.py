@@ -41,8 +41,8 @@ from ded_bench.plants.detailed.machine_arrays import (
 )
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.detailed.start import start
+from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 

@@ -24,7 +24,7 @@ from ded_bench.plants.detailed.equations import (
     sources,
 )
 from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
-from ded_bench.plants.time_varying import Indices
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.quantities import Array
 

@@ -22,16 +22,8 @@ from ded_bench.plants.detailed.machine_arrays import (
     moving,
 )
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
-from ded_bench.plants.time_varying import (
-    Delivered,
-    Hold,
-    Indices,
-    Reset,
-    TimeVarying,
-    across_intervals,
-    doubled,
-    repeated,
-)
+from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled, repeated
+from ded_bench.plants.time_varying import Delivered, Reset, TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.schedule import Trajectory

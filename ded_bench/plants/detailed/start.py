@@ -8,8 +8,8 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
+from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
-from ded_bench.plants.time_varying import Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import Array
 

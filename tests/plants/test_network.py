@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ded_bench.plants.lossless.algebraic import eliminate, elimination_order, solve_factorised
 from ded_bench.plants.lossless.network import MISMATCH, Network
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.sampling import sample_instances
@@ -64,11 +65,53 @@ def test_chain_load_angle(threebus, chain):
     theta_gen, load = rng.uniform(-1.5, 1.5, 300), rng.uniform(-3, 3, 300)
     guess = np.stack([np.zeros(300), np.zeros(300), theta_gen], axis=1)
     theta, f = network.solve_loads(guess, network.load_injections(load[:, None]))
-    np.testing.assert_array_equal(f, network.injections(theta))
+    np.testing.assert_allclose(f, network.injections(theta), rtol=0, atol=1e-14)  # sines are rounded otherwise
     amplitude = np.hypot(a + b * np.cos(theta_gen), b * np.sin(theta_gen))
     phi = np.arctan2(b * np.sin(theta_gen), a + b * np.cos(theta_gen))
     np.testing.assert_allclose(theta[:, 0], phi + np.arcsin(load / amplitude), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(theta[:, 1:], guess[:, 1:])
+
+
+def test_injections_at_any_angles(ninebus):
+    """However many turns an angle has, as while Newton's method is far from a solution."""
+    network = Network(ninebus)
+    theta = np.random.default_rng(5).uniform(-40.0, 40.0, (200, network.n_bus))
+    wanted = network.injections(theta)
+    found, f = network.solve_loads(theta, wanted[:, network.algebraic])
+    np.testing.assert_array_equal(found, theta)
+    np.testing.assert_allclose(f, wanted, rtol=0, atol=1e-13 * network.coupling.sum())
+
+
+@pytest.mark.parametrize("kept", [0, 4])
+def test_elimination_is_that_of_full_matrices(kept: int):
+    """Answers and the Schur complement of random sparse symmetric matrices, definite or not."""
+    rng, n = np.random.default_rng(kept), 40
+    for _ in range(20):
+        pairs = rng.integers(0, n, (60, 2))
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        half = np.diag(rng.uniform(10.0, 15.0, n) * rng.choice([-1.0, 1.0], n))
+        half[pairs[:, 0], pairs[:, 1]] = rng.normal(size=len(pairs))
+        matrix = half + half.T
+        elimination, right = elimination_order(pairs.tolist(), n, kept), rng.normal(size=n)
+        left, factor, x = matrix.copy(), np.empty(n - kept + len(elimination.met)), right.copy()
+        eliminate(elimination, left, factor)
+        inner, across = matrix[kept:, kept:], matrix[kept:, :kept]
+        schur = matrix[:kept, :kept] - across.T @ np.linalg.solve(inner, across)
+        np.testing.assert_allclose(left[:kept, :kept], schur, rtol=0, atol=1e-12)
+        if not kept:
+            solve_factorised(elimination, factor, x)
+            np.testing.assert_allclose(matrix @ x, right, rtol=0, atol=1e-13)
+
+
+def test_elimination_meets_few():
+    """A square grid has no more entries than nested dissection leaves: 31/4 n log2 n (George, 1973)."""
+    side = 12
+    pairs = [(side * i + j, side * i + j + 1) for i in range(side) for j in range(side - 1)]
+    pairs += [(side * i + j, side * i + side + j) for i in range(side - 1) for j in range(side)]
+    n = side**2
+    elimination = elimination_order(pairs, n)
+    assert sorted(elimination.order) == list(range(n))
+    assert len(elimination.met) < 31 / 4 * n * np.log2(side)
 
 
 # Properties that hold on every case.

@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, set_jacobian, solve_algebraic
+from ded_bench.plants.lossless.algebraic import (
+    CompiledGrid,
+    Indices,
+    eliminate,
+    factorised,
+    set_jacobian,
+    solve_algebraic,
+)
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
@@ -28,7 +35,7 @@ from ded_bench.problem.quantities import largest_divisor
 
 #: Mismatch of a power flow that is good enough here, pu.
 MISMATCH = 1e-5
-#: What a step has to leave of it: more than elsewhere, since steps are few and a new Jacobian takes many.
+#: What a step has to leave of it: more than elsewhere, since angles need not be as exact.
 CONTRACTION = 0.3
 #: Damping rates that differ by less than this part are the same in all but the digits of the data.
 ROUND_OFF = 1e-6
@@ -88,13 +95,12 @@ class ModalGrid:
         self.shares = np.trapezoid(self.between, self.points, axis=0) / self.points[-1]
         half = 0.5 * float(self.points[1])
         self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * POINTS)
-        #: Solved for buses without machines, and for generators and these; inverses of nominal Jacobians.
-        grid = self.network.grid._replace(mismatch=MISMATCH)
-        whole = grid._replace(algebraic=np.concatenate([grid.generators, grid.algebraic]))
-        n_gen, jacobian = len(grid.generators), np.empty((len(whole.algebraic),) * 2)
-        set_jacobian(whole, self.theta, jacobian)
-        self._grids, self._whole_inverse = (grid, whole), np.asarray(np.linalg.inv(jacobian))
-        self._inverse_of_loads = np.asarray(np.linalg.inv(jacobian[n_gen:, n_gen:]))
+        #: Solved for generators and buses without machines, and for these, which the last one eliminates.
+        network, n_gen = self.network, len(self.mass)
+        buses = np.concatenate([network.generators, network.algebraic])
+        self._whole, grid = (g._replace(mismatch=MISMATCH) for g in (network.grid_of(buses), network.grid))
+        self._grids = grid, network.grid_of(buses, kept=n_gen)
+        self._factors = [factorised(g, self.theta) for g in (self._whole, grid)]
 
     def _linearise_nominal(self) -> None:
         self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)
@@ -122,9 +128,8 @@ class ModalGrid:
         wanted = np.hstack([problems.p_initial, network.load_injections(problems.load[:, 0])])
         f = np.empty(network.n_bus)
         for b in range(batch):
-            served[b] = solve_algebraic(
-                self._grids[1], wanted[b], self._whole_inverse.copy(), theta[b], f, CONTRACTION
-            )
+            factor = self._factors[0].copy()
+            served[b] = solve_algebraic(self._whole, wanted[b], factor, theta[b], f, CONTRACTION)
         served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
@@ -168,9 +173,9 @@ class ModalGrid:
         generators, at = self.network.generators, self.stiffness_knots // self.every
         for b in range(batch):
             if start.served[b]:
-                angles, inverse = start.theta[b, generators] + slow[b], self._inverse_of_loads.copy()
+                angles, factor = start.theta[b, generators] + slow[b], self._factors[1].copy()
                 start.served[b] = follow_trajectory(
-                    self._grids, angles, wanted[b], inverse, start.theta[b], at, f[b], stiffness[b]
+                    self._grids, angles, wanted[b], factor, start.theta[b], at, f[b], stiffness[b]
                 )
         if not start.served.all():
             bad = np.logical_not(start.served)
@@ -234,7 +239,7 @@ def follow_trajectory(
     grids: tuple[CompiledGrid, CompiledGrid],
     angles: Array,
     wanted: Array,
-    inverse: Array,
+    factor: Array,
     theta: Array,
     taken: Indices,
     f: Array,
@@ -243,29 +248,29 @@ def follow_trajectory(
     """Electrical power of the generators along a trajectory of their angles, and its derivative.
 
     Args:
-        grids: the network; the first solves for buses without machines, the second for generators and these.
+        grids: the network; the first solves for buses without machines, which the second eliminates.
         angles: of the generators at the power flows, (n_flows, n_gen), rad.
         wanted: injections at the other buses there, (n_flows, n_algebraic), pu.
-        inverse: of the Jacobian of these buses somewhere near; is renewed, (n_algebraic, n_algebraic).
+        factor: of the Jacobian of these buses somewhere near; is renewed, (n_factor,).
         theta: angles of all buses near the first ones, (n_bus,), rad.
         taken: at which power flows the derivative is taken; the first is one, (n_stiffness,).
         f: receives electrical powers of the generators, (n_flows, n_gen), pu.
         stiffness: receives ∂f/∂θ of the generators, (n_stiffness, n_gen, n_gen), pu/rad.
 
     Returns:
-        Whether there is a solution all along; LinAlgError where a Jacobian is singular.
+        Whether there is a solution all along.
     """
-    grid, whole = grids
+    grid, reduced = grids
     n, n_gen, at = len(grid.algebraic), angles.shape[1], 0
     angle, injection, before, change = theta.copy(), np.empty_like(theta), theta.copy(), np.zeros_like(theta)
-    full = np.empty((n_gen + n, n_gen + n))
+    full, eliminated = np.empty((n_gen + n, n_gen + n)), np.empty(n + len(reduced.elimination.met))
     for k in range(len(angles)):
         for i in range(n):
             bus = grid.algebraic[i]
             angle[bus] = before[bus] + change[bus]
         for g in range(n_gen):
             angle[grid.generators[g]] = angles[k, g]
-        if not solve_algebraic(grid, wanted[k], inverse, angle, injection, CONTRACTION):
+        if not solve_algebraic(grid, wanted[k], factor, angle, injection, CONTRACTION):
             return False
         if k > 0:
             change[:] = angle - before
@@ -273,10 +278,9 @@ def follow_trajectory(
         for g in range(n_gen):
             f[k, g] = injection[grid.generators[g]]
         if at < len(taken) and taken[at] == k:
-            set_jacobian(whole, angle, full)
-            across = np.ascontiguousarray(full[n_gen:, :n_gen])
-            inverse[:] = np.linalg.inv(np.ascontiguousarray(full[n_gen:, n_gen:]))
-            moved = np.dot(inverse, across)
-            stiffness[at] = full[:n_gen, :n_gen] - np.dot(np.ascontiguousarray(across.T), moved)
+            factor[:] = factorised(grid, angle)
+            set_jacobian(reduced, angle, full)
+            eliminate(reduced.elimination, full, eliminated)
+            stiffness[at] = full[:n_gen, :n_gen]
             at += 1
     return True

@@ -85,16 +85,11 @@ class LosslessPlant:
         inputs = stepper.GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
         steps = max(int(np.ceil(state.divisions * dt_s)), 1)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
-        past = state.carried
-        try:
-            if past is None:
-                carried = stepper.carried_from(grid, theta[0])
-            else:
-                carried = stepper.Carried(*(part.copy() for part in past))  # type: ignore[arg-type]
-            done = stepper.integrate(grid, inputs, steps, carried, theta, omega, p_slack)
-        except np.linalg.LinAlgError:
-            done = 0
-        if done < n:
+        if state.carried is None:
+            carried = stepper.carried_from(grid, theta[0])
+        else:
+            carried = stepper.Carried(*(part.copy() for part in state.carried))  # type: ignore[arg-type]
+        if stepper.integrate(grid, inputs, steps, carried, theta, omega, p_slack) < n:
             raise SimulationError("the system cannot follow this schedule: the power flow has no solution")
         end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions, carried)
         return Piece(omega, p_set, p_slack, theta, end)

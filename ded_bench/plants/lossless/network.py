@@ -77,18 +77,25 @@ class Network:
         self.d = np.array([case.machines[g].d for g in case.generators])
         self.mismatch = max(MISMATCH, RESOLUTION * float(self.coupling.max()))
         self._flat = self.incidence.T @ (self.coupling[:, None] * self.incidence)
-        self._first_step = np.zeros_like(self._flat)
-        self._first_step[np.ix_(self.unknown, self.unknown)] = np.linalg.inv(
-            self._flat[np.ix_(self.unknown, self.unknown)]
-        )
 
     @functools.cached_property
     def grid(self) -> CompiledGrid:
         """What compiled functions see of this network."""
-        from ded_bench.plants.lossless.algebraic import CompiledGrid  # and with it Numba: help does without
+        return self.grid_of(self.algebraic)
 
-        places = self.generators, self.algebraic, self.slack
-        return CompiledGrid(self.ends, self.coupling, *places, self.m, self.d, self.mismatch)
+    @functools.cached_property
+    def _whole_grid(self) -> CompiledGrid:
+        return self.grid_of(self.unknown)
+
+    def grid_of(self, algebraic: NDArray[np.int_], kept: int = 0) -> CompiledGrid:
+        """With other buses whose angles follow from injections; the first `kept` are not eliminated."""
+        from ded_bench.plants.lossless import algebraic as compiled  # with it Numba: help does without
+
+        place = {bus: i for i, bus in enumerate(algebraic.tolist())}
+        inner = [[place[bus] for bus in ends] for ends in self.ends.tolist() if place.keys() >= {*ends}]
+        order = compiled.elimination_order(inner, len(algebraic), kept)
+        buses = self.generators, algebraic, order, self.slack
+        return compiled.CompiledGrid(self.ends, self.coupling, *buses, self.m, self.d, self.mismatch)
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
@@ -127,9 +134,7 @@ class Network:
         wanted = np.zeros((*shape, self.n_bus))
         wanted[..., self.generators] = p_gen
         wanted[..., self.loads] = p_load
-        theta = wanted @ self._first_step  # Newton's first step from θ = 0
-        whole = self.grid._replace(algebraic=self.unknown)
-        theta, _ = self._newton(theta, wanted[..., self.unknown], whole)
+        theta, _ = self._newton(np.zeros_like(wanted), wanted[..., self.unknown], self._whole_grid)
         if not (np.abs(theta @ self.incidence.T) < np.pi / 2).all():
             raise SimulationError("an angle across a line exceeds 90 degrees")
         return theta
@@ -177,10 +182,6 @@ class Network:
         wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(grid.algebraic))).reshape(
             -1, len(grid.algebraic)
         )
-        try:
-            solved = solve_angles(grid, np.ascontiguousarray(wanted), *rows)
-        except np.linalg.LinAlgError:
-            solved = False
-        if not solved:
+        if not solve_angles(grid, np.ascontiguousarray(wanted), *rows):
             raise SimulationError("the power flow has no solution")
         return theta, f

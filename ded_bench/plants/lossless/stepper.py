@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import RK45
 
-from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, invert, solve_algebraic
+from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, factorised, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
@@ -46,7 +46,7 @@ class Carried(NamedTuple):
     """What goes on from piece to piece, so that pieces are the whole to the last bit."""
 
     recent: Array  # algebraic angles at the last steps, newest first, (RECENT, n_algebraic), rad
-    inverse: Array  # of the Jacobian, (n_algebraic, n_algebraic), rad/pu
+    factor: Array  # of the Jacobian of the algebraic equations, (n_factor,), see `eliminate`
     ahead: Array  # the algebraic angles where the next step begins, nearly, (n_algebraic,), rad
     past: Array  # derivatives of angles and frequencies at the last steps, newest first, (6, 2, n_gen)
     linear: Indices  # steps that powers and loads have been linear for, (1,)
@@ -65,11 +65,11 @@ class Work(NamedTuple):
 
 @compiled
 def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
-    """What a state without a past has, at angles (n_bus,); LinAlgError if the Jacobian is singular."""
+    """What a state without a past has, at angles (n_bus,)."""
     n, n_gen = len(grid.algebraic), len(grid.generators)
     carried = Carried(
         recent=np.empty((RECENT, n)),
-        inverse=np.empty((n, n)),
+        factor=factorised(grid, theta),
         ahead=np.empty(n),
         past=np.zeros((len(BASHFORTH), 2, n_gen)),
         linear=np.zeros(1, np.int_),
@@ -77,7 +77,6 @@ def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
     )
     for i in range(n):
         carried.recent[:, i] = carried.ahead[i] = theta[grid.algebraic[i]]
-    invert(grid, theta, carried.inverse)
     return carried
 
 
@@ -149,9 +148,9 @@ def integrate(
 
 @compiled
 def _set_apart(carried: Carried) -> Carried:
-    """With angles and Jacobian of its own, which a step at the last point may change."""
-    recent, inverse, ahead, past, linear, slope = carried
-    return Carried(recent.copy(), inverse.copy(), ahead, past, linear, slope)
+    """With angles and factors of its own, which a step at the last point may change."""
+    recent, factor, ahead, past, linear, slope = carried
+    return Carried(recent.copy(), factor.copy(), ahead, past, linear, slope)
 
 
 @compiled
@@ -245,7 +244,7 @@ def _evaluate(
         grid: the network.
         inputs: what drives it.
         moment: a point of time, and the part of the interval after it that has gone by.
-        carried: gives the inverse, and receives the algebraic angles where a step begins.
+        carried: gives the factors, and receives the algebraic angles where a step begins.
         s: the stage whose derivatives they are; -1: no stage.
         state: where.
         work: guesses of algebraic angles become answers; receives injections and derivatives.
@@ -261,11 +260,11 @@ def _evaluate(
     for i in range(n_algebraic):
         wanted[i] = inputs.injection[k, i]
         wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
-    solved = solve_algebraic(grid, wanted, carried.inverse, angle, work.f)
+    solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f)
     if not solved:  # a bad guess? from the angles of the step before, then
         for i in range(n_algebraic):
             angle[grid.algebraic[i]] = recent[0, i]
-        solved = solve_algebraic(grid, wanted, carried.inverse, angle, work.f)
+        solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f)
     if not solved:
         return False
     if s == 0:

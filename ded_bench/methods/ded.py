@@ -96,18 +96,8 @@ def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: 
 
 
 @functools.lru_cache(maxsize=1)
-def _built(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
-    return build_ded(case, steps, dt)
-
-
-@functools.lru_cache(maxsize=1)
 def _compiled(case: Case, steps: int, dt: float) -> CasadiIpopt:
     return CasadiIpopt(_built(case, steps, dt), _IPOPT_OPTIONS)
-
-
-@functools.lru_cache(maxsize=2)
-def _programs(case: Case, regime: str, steps: int, dt: float) -> EulerPrograms:
-    return EulerPrograms(case, regime, steps, dt)
 
 
 def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
@@ -154,6 +144,10 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
     add_ramps_and_cost(m, case, list(m.t), dt)
     return m
+
+
+_built = functools.lru_cache(maxsize=1)(build_ded)
+_programs = functools.lru_cache(maxsize=2)(EulerPrograms)
 
 
 def add_powers(m: pyo.ConcreteModel, case: Case, points: Any) -> None:

@@ -112,11 +112,6 @@ def _solve_model(
 
 
 @functools.lru_cache(maxsize=1)
-def _built(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
-    return build_ded_ko(case, koopman, steps)
-
-
-@functools.lru_cache(maxsize=1)
 def _compiled(case: Case, koopman: Koopman, steps: int, solver: str) -> OnArrays:
     return OnArrays(_built(case, koopman, steps), solver)
 
@@ -156,6 +151,9 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
 
     add_ramps_and_cost(m, case, list(m.point), koopman.dt_s)
     return m
+
+
+_built = functools.lru_cache(maxsize=1)(build_ded_ko)
 
 
 def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:

@@ -103,9 +103,7 @@ def _on_detailed(
     return answer(outcome, build_s, program.schedule)
 
 
-@functools.lru_cache(maxsize=1)
-def _program(case: Case, elements: int, limit_s: float | None) -> RadauProgram:
-    return RadauProgram(case, elements, limit_s)
+_program = functools.lru_cache(maxsize=1)(RadauProgram)
 
 
 def default_element(case: Case) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -270,6 +271,10 @@ class GridFiles(Fingerprinted):
         return next(m.name for m in self.data.machines if m.bus == self.data.slack_machine_bus)
 
 
+#: A file's record; many instances' files have the same case beside them.
+_parsed: Callable[..., Any] = functools.lru_cache(maxsize=32)(parse_record)
+
+
 def load_grid_files(folder: Path, case: str, f0_hz: float) -> GridFiles:
     """Read `network.json` and `machines.json` of a case's folder.
 
@@ -293,9 +298,3 @@ def load_grid_files(folder: Path, case: str, f0_hz: float) -> GridFiles:
                 place, f"machines.{number}.bus", f"there is no bus {machine.bus} in {NETWORK_FILE}"
             )
     return GridFiles(network=network, data=data)
-
-
-@functools.lru_cache(maxsize=32)
-def _parsed(kind: Any, text: str, source: Path) -> Any:
-    """A file's record; many instances' files have the same case beside them."""
-    return parse_record(kind, text, source)

@@ -12,7 +12,6 @@ find set-points near the given ones that keep the bounds.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -344,9 +343,3 @@ def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: 
             ahead = relaxed * rows[i] + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
             kept[i] = min(max(ahead, given.low[i]), given.high[i])
             dual[i] = ahead - kept[i]
-
-
-@functools.lru_cache(maxsize=8)
-def grid_of(case: Case, regime: str, horizon_s: float) -> IslandGrid:
-    """The grid of a case, regime and horizon, made once."""
-    return IslandGrid(case, regime, horizon_s)

@@ -19,7 +19,6 @@ from ded_bench.methods.island.island_iterations import (
     IslandGrid,
     IslandIterations,
     IslandProblem,
-    grid_of,
 )
 from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.plants.plant import SimulationError
@@ -32,6 +31,8 @@ MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
 NEAR = 0.05
 #: How often, at most.
 MENDED = 5
+#: The grid of a case, regime and horizon, made once.
+_grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 
 
 class IslandPolicy(TrainedPolicy):
@@ -42,7 +43,7 @@ class IslandPolicy(TrainedPolicy):
     @functools.cached_property
     def grid(self) -> IslandGrid:
         """The island as the policy sees it."""
-        return grid_of(self.scope.case, self.scope.regime, self.scope.horizon_s)
+        return _grid_of(self.scope.case, self.scope.regime, self.scope.horizon_s)
 
     @functools.cached_property
     def iterate(self) -> IslandIterations:

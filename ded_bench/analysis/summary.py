@@ -98,12 +98,9 @@ def groups(frame: pd.DataFrame) -> Iterator[tuple[str, tuple[str, str, str], pd.
         yield regime, (method, settings, model), parts[key]
 
 
-def _natural(text: str) -> tuple[tuple[str, float], ...]:
-    """Sorting key that puts refine=25 before refine=100."""
-    parts = re.split(r"(\d+)", text)
-    return tuple(
-        (word, float(number or 0)) for word, number in zip(parts[::2], [*parts[1::2], ""], strict=True)
-    )
+def _natural(text: str) -> list[str | int]:
+    """Sorting key that puts refine=25 before refine=100: words and numbers in turn."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:
@@ -242,7 +239,7 @@ def statistics(group: pd.DataFrame) -> dict[str, Any]:
     found |= _spread("gap_percent", paired["gap_percent"])
     found["cost_ratio"] = cost / theirs if theirs > 0 else np.nan
     for name in VIOLATIONS:
-        found |= _spread(name, group[name].dropna())
+        found |= _spread(name, group[name])
     for name in OTHER_JUDGES:
         asked = [judgement for judgement in group.get(name, ()) if judgement != ""]
         said = [judgement for judgement in asked if judgement is not None]
@@ -252,10 +249,8 @@ def statistics(group: pd.DataFrame) -> dict[str, Any]:
 
 
 def _spread(name: str, values: pd.Series[float]) -> dict[str, float]:
-    numbers = values.to_numpy(dtype=float)
-    if not len(numbers):
-        return dict.fromkeys((f"{name}_{part}" for part in SPREAD), np.nan)
-    found = (numbers.mean(), np.median(numbers), np.quantile(numbers, 0.95), numbers.max())
+    numbers = values.astype(float)
+    found: list[Any] = [numbers.mean(), numbers.median(), numbers.quantile(0.95), numbers.max()]
     return {f"{name}_{part}": float(value) for part, value in zip(SPREAD, found, strict=True)}
 
 

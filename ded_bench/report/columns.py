@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 
@@ -32,9 +32,9 @@ class Column:
         """What stands above the column."""
         return f"{self.text} ({self.unit})" if self.unit else self.text
 
-    def cell(self, value: object) -> str:
+    def cell(self, value: Any) -> str:
         """The printed value; a missing number is a dash."""
-        if value is None or (isinstance(value, float) and math.isnan(value)) or value is pd.NA:
+        if pd.isna(value):
             return "–"
         if isinstance(value, float):
             return format(value, self.form).replace("%", " %")

@@ -59,10 +59,8 @@ class PageTable:
     @property
     def numeric(self) -> list[bool]:
         """Whether each column holds numbers."""
-        kinds = [self.frame[c.name].dtype for c in self.columns]
-        return [
-            pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind) for kind in kinds
-        ]
+        numbers = self.frame.select_dtypes("number")
+        return [c.name in numbers for c in self.columns]
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,6 @@ class PaperKoopman(nn.Module):
         self.first = nn.Linear(2 * n_gen + 1, hidden)
         self.last = nn.Linear(hidden, n_observables)
 
-    first: nn.Linear
-    last: nn.Linear
-
     def matrices(self) -> tuple[Tensor, Tensor]:
         """K, shape (n_psi, n_psi), and B, shape (n_psi, n_in), in the order (ω, P_s, N)."""
         n, n_in = len(self.skew), self.steady.shape[1]

@@ -35,15 +35,11 @@ Answer = tuple[Tensor, Tensor, Tensor]
 class TorchIterations(nn.Module):
     """All iterations for one case, bound and horizon; only `nodes` are learned."""
 
-    start: Tensor
-    between: Tensor
-
     def __init__(self, grid: ModalGrid, iterations: int) -> None:
         super().__init__()
         self.grid = grid
         self.nodes = nn.Parameter(torch.zeros(weight_shapes()["nodes"]))
-        self.register_buffer("start", _single(starting_settings(iterations)), persistent=False)
-        self.register_buffer("between", _single(between_nodes(iterations)), persistent=False)
+        self.start, self.between = _single(starting_settings(iterations)), _single(between_nodes(iterations))
 
     def settings(self) -> Tensor:
         """See `admm_inference.settings_of`."""

@@ -71,15 +71,12 @@ class StagedNetwork(nn.Module):
         self.response = response
         step = case.ramp * (response.knots[1] - response.knots[0])
         by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
-        of_power = by_knot.reshape(n_knots * n_gen, -1)
-        buffers = {"of_power": of_power, "low": case.p_min, "high": case.p_max, "step": step}
-        for name, value in buffers.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)
-
-    of_power: Tensor  # as `Response.of_power`, powers and outputs knot by knot
-    low: Tensor  # bounds, (n_gen,), pu
-    high: Tensor
-    step: Tensor  # largest change between two knots, (n_gen,), pu
+        #: As `Response.of_power`, powers and outputs knot by knot.
+        self.of_power = torch.tensor(by_knot.reshape(n_knots * n_gen, -1), dtype=torch.float32)
+        #: Bounds, and the largest change between two knots, (n_gen,), pu.
+        self.low, self.high, self.step = (
+            torch.tensor(limit, dtype=torch.float32) for limit in (case.p_min, case.p_max, step)
+        )
 
     def normalise(self, channels: Channels) -> None:
         """Set the affine input normalisation of all stages from training data."""
@@ -122,14 +119,10 @@ class ResidualNetwork(nn.Module):
                 layer.weight.mul_(0.5)  # type: ignore[operator]
         nn.init.zeros_(self.last.weight)  # training starts from the schedule as it is
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
-        for name, n in (("sequence", n_sequence), ("constants", n_constants)):
-            self.register_buffer(f"{name}_mean", torch.zeros(n))
-            self.register_buffer(f"{name}_scale", torch.ones(n))
-
-    sequence_mean: Tensor
-    sequence_scale: Tensor
-    constants_mean: Tensor
-    constants_scale: Tensor
+        self.sequence_mean = nn.Buffer(torch.zeros(n_sequence))
+        self.sequence_scale = nn.Buffer(torch.ones(n_sequence))
+        self.constants_mean = nn.Buffer(torch.zeros(n_constants))
+        self.constants_scale = nn.Buffer(torch.ones(n_constants))
 
     def normalise(self, sequence: Array, constants: Array) -> None:
         """Set the affine input normalisation from training data, channels in the last axis."""

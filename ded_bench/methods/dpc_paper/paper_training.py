@@ -52,15 +52,10 @@ class PaperNetwork(nn.Module):
             _same_padding(last),
             nn.Conv1d(FILTERS, len(p_min), last),
         )
-        self.register_buffer("mean", torch.zeros(n_channels, 1))  # of inputs: raw in the paper's recipe
-        self.register_buffer("scale", torch.ones(n_channels, 1))
-        self.register_buffer("p_min", torch.as_tensor(p_min, dtype=torch.float32)[:, None])
-        self.register_buffer("p_max", torch.as_tensor(p_max, dtype=torch.float32)[:, None])
-
-    mean: Tensor
-    scale: Tensor
-    p_min: Tensor
-    p_max: Tensor
+        self.mean = nn.Buffer(torch.zeros(n_channels, 1))  # of inputs: raw in the paper's recipe
+        self.scale = nn.Buffer(torch.ones(n_channels, 1))
+        self.p_min = nn.Buffer(torch.as_tensor(p_min, dtype=torch.float32)[:, None])
+        self.p_max = nn.Buffer(torch.as_tensor(p_max, dtype=torch.float32)[:, None])
 
     def forward(self, channels: Tensor) -> Tensor:
         """Map (batch, n_channels, n_knots) to powers, (batch, n_knots, n_gen), pu, within bounds."""

@@ -1,6 +1,6 @@
 """Machines with their controls as arrays on 100 MVA, in one form that compiled and symbolic equations share.
 
-Every machine has the states of `STATES`. What a model lacks stands still: its inverse time constants are
+Every machine has the same states. What a model lacks stands still: its inverse time constants are
 zero. A classical machine is one whose flux linkages stand still, behind x'd on both axes.
 """
 
@@ -14,13 +14,7 @@ from ded_bench.plants.hold import Indices
 
 #: Rotor angle (rad), speed deviation (pu), flux linkages, exciter, field voltage, exciter's feedback,
 #: stabiliser, governor and turbine; a row of a state array each.
-STATES = (
-    *("delta", "w", "e1q", "e1d", "e2d", "e2q"),
-    *("exciter", "v_f", "feedback"),
-    *("washout", "lead_a", "lead_b"),
-    *("gate", "turbine"),
-)
-N_STATES = len(STATES)
+N_STATES = 14
 DELTA, SPEED, E1Q, E1D, E2D, E2Q, EXCITER, FIELD, FEEDBACK, WASHOUT, LEAD_A, LEAD_B, GATE, TURBINE = range(
     N_STATES
 )

@@ -8,8 +8,8 @@ is `observed`.
 from __future__ import annotations
 
 import functools
-import importlib
 import os
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -174,8 +174,7 @@ def plant_of(case: Case, given: str | Plant | None = None) -> Plant:
 
 @functools.lru_cache(maxsize=16)
 def _made(case: Case, name: str) -> Plant:
-    module, _, kind = PLANTS[name].partition(":")
-    plant: Plant = getattr(importlib.import_module(module), kind)(case)
+    plant: Plant = pkgutil.resolve_name(PLANTS[name])(case)
     return plant
 
 

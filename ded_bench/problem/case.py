@@ -6,6 +6,7 @@ import abc
 import functools
 import importlib
 import json
+import pkgutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -299,8 +300,7 @@ def _record_of(text: str) -> type[Case]:
     except (ValueError, RecursionError):
         data = None
     schema = data.get("schema") if isinstance(data, dict) else None
-    module, _, kind = SCHEMAS[schema if schema in SCHEMAS else min(SCHEMAS)].partition(":")
-    record: type[Case] = getattr(importlib.import_module(module), kind)
+    record: type[Case] = pkgutil.resolve_name(SCHEMAS[schema if schema in SCHEMAS else min(SCHEMAS)])
     return record
 
 

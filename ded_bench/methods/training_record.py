@@ -81,8 +81,7 @@ class TrainingOptions:
 
     def facts(self) -> dict[str, Any]:
         """What every policy's file tells of how it was trained."""
-        kept = ("seed", "version", "commit")
-        return {name: getattr(self, name) for name in kept}
+        return {"seed": self.seed, "version": self.version, "commit": self.commit}
 
 
 #: `train(case, regime, instances, out, options)` of a method's training module. The instances are all on one

@@ -14,7 +14,7 @@ import pandas as pd
 
 from ded_bench.analysis.online_summary import own_latency, practice_lines
 from ded_bench.analysis.reference import Paper, result_lines
-from ded_bench.analysis.summary import findings, groups, own_first, records, title, titled
+from ded_bench.analysis.summary import findings, groups, own_first, records, summary, title, titled
 from ded_bench.methods.options import DEFAULT
 from ded_bench.methods.registry import METHODS
 from ded_bench.plants.score import FEASIBLE_HZ, FEASIBLE_PU, ISLAND_HZ, STRICT_HZ, STRICT_PU
@@ -254,7 +254,8 @@ def _makers(sources: Sources) -> Iterator[str]:
 
 def each_method(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """Default settings in sight, all others folded away."""
-    overview, usual = sources.summary, sources.summary["settings"] == DEFAULT
+    overview = summary(sources.judged)
+    usual = overview["settings"] == DEFAULT
     others = columns.OTHER_RATES if overview[["validated_asked", "confirmed_asked"]].to_numpy().any() else ()
     for name, judge in (("carried", "validated"), ("refereed", "confirmed")) if others else ():
         counts = overview[f"{judge}_n"].astype(str) + " of " + overview[f"{judge}_asked"].astype(str)

@@ -21,7 +21,6 @@ from ded_bench.analysis.summary import (
     newest,
     on_usual_model,
     outcome,
-    summary,
 )
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
@@ -72,11 +71,6 @@ class Sources:
     def tightest(self) -> str:
         """The regime with the tightest bound."""
         return min(self.case.regimes, key=lambda name: self.case.regimes[name].largest_hz)
-
-    @cached_property
-    def summary(self) -> pd.DataFrame:
-        """Of the judged rows: see `summary.summary`."""
-        return summary(self.judged)
 
     @property
     def shown(self) -> pd.DataFrame:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
-
-Indices = NDArray[np.intp]
 
 
 @compiled

@@ -19,7 +19,6 @@ import numpy as np
 
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start
 from ded_bench.methods.admm.modal_kernels import (
-    Array32,
     Floats,
     MeanModes,
     Modes,
@@ -32,6 +31,7 @@ from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import Array32
 
 #: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
 #: bounds, ramps, ω and P_s, in the case's `price`; how often the quadratic model counts the last two;

@@ -20,14 +20,8 @@ from numpy.typing import NDArray
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.lossless.algebraic import (
-    CompiledGrid,
-    Indices,
-    eliminate,
-    factorised,
-    set_jacobian,
-    solve_algebraic,
-)
+from ded_bench.plants.hold import Indices
+from ded_bench.plants.lossless import algebraic
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
@@ -100,7 +94,7 @@ class ModalGrid:
         buses = np.concatenate([network.generators, network.algebraic])
         self._whole, grid = (g._replace(mismatch=MISMATCH) for g in (network.grid_of(buses), network.grid))
         self._grids = grid, network.grid_of(buses, kept=n_gen)
-        self._factors = [factorised(g, self.theta) for g in (self._whole, grid)]
+        self._factors = [algebraic.factorised(g, self.theta) for g in (self._whole, grid)]
 
     def _linearise_nominal(self) -> None:
         self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)
@@ -129,7 +123,7 @@ class ModalGrid:
         f = np.empty(network.n_bus)
         for b in range(batch):
             factor = self._factors[0].copy()
-            served[b] = solve_algebraic(self._whole, wanted[b], factor, theta[b], f, CONTRACTION)
+            served[b] = algebraic.solve_algebraic(self._whole, wanted[b], factor, theta[b], f, CONTRACTION)
         served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
@@ -236,7 +230,7 @@ def averaged(values: Array, every: int) -> Array:
 
 @compiled
 def follow_trajectory(
-    grids: tuple[CompiledGrid, CompiledGrid],
+    grids: tuple[algebraic.CompiledGrid, algebraic.CompiledGrid],
     angles: Array,
     wanted: Array,
     factor: Array,
@@ -270,7 +264,7 @@ def follow_trajectory(
             angle[bus] = before[bus] + change[bus]
         for g in range(n_gen):
             angle[grid.generators[g]] = angles[k, g]
-        if not solve_algebraic(grid, wanted[k], factor, angle, injection, CONTRACTION):
+        if not algebraic.solve_algebraic(grid, wanted[k], factor, angle, injection, CONTRACTION):
             return False
         if k > 0:
             change[:] = angle - before
@@ -278,9 +272,9 @@ def follow_trajectory(
         for g in range(n_gen):
             f[k, g] = injection[grid.generators[g]]
         if at < len(taken) and taken[at] == k:
-            factor[:] = factorised(grid, angle)
-            set_jacobian(reduced, angle, full)
-            eliminate(reduced.elimination, full, eliminated)
+            factor[:] = algebraic.factorised(grid, angle)
+            algebraic.set_jacobian(reduced, angle, full)
+            algebraic.eliminate(reduced.elimination, full, eliminated)
             stiffness[at] = full[:n_gen, :n_gen]
             at += 1
     return True

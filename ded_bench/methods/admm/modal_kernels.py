@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
-Array32 = NDArray[np.float32]
 #: Of either precision.
 Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.int_]
 
 #: Grid points for which C is held: it changes over many seconds.
 HELD = 4

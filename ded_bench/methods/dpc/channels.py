@@ -12,17 +12,16 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
+from ded_bench.problem.quantities import Array32
 from ded_bench.surrogates.koopman import hat_functions
 from ded_bench.surrogates.linear import by_angles, linear_model
 
-Array32 = NDArray[np.float32]
 #: Costs whose sum is smaller are as good as free.
 SMALLEST_SUM = 1e-9
 

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.dpc.channels import Array32, Channels, Response, n_channels
+from ded_bench.methods.dpc.channels import Channels, Response, n_channels
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
+from ded_bench.problem.quantities import Array32
 
 #: How many stages there are, channels of their hidden layers, and of the layer that constants pass through.
 STAGES, WIDTH, EMBEDDING = 2, 24, 64

@@ -21,17 +21,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
-from ded_bench.problem.quantities import largest_divisor
+from ded_bench.problem.quantities import Array32, largest_divisor
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import by_angles, linear_model
 
-Array32 = NDArray[np.float32]
 #: Spacing of the points at which P_s and ω are taken, s. Frequencies are below 0.25 Hz.
 SPACING_S = 0.2
 #: Penalty weights of the split: P_s (pu), ω (in units of its bound), ramps and powers (pu).

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import knot_points, track, transfer_room
@@ -26,8 +25,7 @@ from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance
-
-Array32 = NDArray[np.float32]
+from ded_bench.problem.quantities import Array32
 
 #: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25

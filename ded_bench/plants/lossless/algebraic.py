@@ -12,12 +12,10 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
-
-Indices = NDArray[np.int_]
 
 #: Newton gives up after so many steps.
 NEWTON_STEPS = 30
@@ -138,8 +136,6 @@ def solve_algebraic(
     Returns:
         Whether there is a solution; if there is none, angles and f mean nothing.
     """
-    n = len(wanted)
-    correction = np.empty(n)
     last = np.inf
     for _ in range(NEWTON_STEPS):
         worst = _mismatch(grid, wanted, angle, f)
@@ -150,11 +146,9 @@ def solve_algebraic(
         if worst > contraction * last:
             factor[:] = factorised(grid, angle)
         last = worst
-        for i in range(n):
-            correction[i] = f[grid.algebraic[i]] - wanted[i]
+        correction = f[grid.algebraic] - wanted
         solve_factorised(grid.elimination, factor, correction)
-        for i in range(n):
-            angle[grid.algebraic[i]] -= correction[i]
+        angle[grid.algebraic] -= correction
     return False
 
 

@@ -179,9 +179,8 @@ class Network:
 
         theta, f = np.array(theta), np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
-        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], len(grid.algebraic))).reshape(
-            -1, len(grid.algebraic)
-        )
+        n = len(grid.algebraic)
+        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], n)).reshape(-1, n)
         if not solve_angles(grid, np.ascontiguousarray(wanted), *rows):
             raise SimulationError("the power flow has no solution")
         return theta, f

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import RK45
 
-from ded_bench.plants.lossless.algebraic import CompiledGrid, Indices, factorised, solve_algebraic
+from ded_bench.plants.hold import Indices
+from ded_bench.plants.lossless.algebraic import CompiledGrid, factorised, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
@@ -204,14 +205,10 @@ def _adams(
 @inlined
 def _bends(inputs: GridInputs, k: int, slope: Array) -> bool:
     """Whether powers or loads change otherwise after a point than before it; `slope` becomes their change."""
-    off, n_gen = 0.0, inputs.p_gen.shape[1]
-    for g in range(n_gen):
-        change = inputs.p_gen[k + 1, g] - inputs.p_gen[k, g]
-        off, slope[g] = max(off, abs(change - slope[g])), change
-    for i in range(inputs.injection.shape[1]):
-        change = inputs.injection[k + 1, i] - inputs.injection[k, i]
-        off, slope[n_gen + i] = max(off, abs(change - slope[n_gen + i])), change
-    return off > LINEAR
+    n_gen, before = inputs.p_gen.shape[1], slope.copy()
+    slope[:n_gen] = inputs.p_gen[k + 1] - inputs.p_gen[k]
+    slope[n_gen:] = inputs.injection[k + 1] - inputs.injection[k]
+    return bool(np.abs(slope - before).max() > LINEAR)
 
 
 @inlined

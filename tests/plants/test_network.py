@@ -65,7 +65,7 @@ def test_chain_load_angle(threebus, chain):
     theta_gen, load = rng.uniform(-1.5, 1.5, 300), rng.uniform(-3, 3, 300)
     guess = np.stack([np.zeros(300), np.zeros(300), theta_gen], axis=1)
     theta, f = network.solve_loads(guess, network.load_injections(load[:, None]))
-    np.testing.assert_allclose(f, network.injections(theta), rtol=0, atol=1e-14)  # sines are rounded otherwise
+    np.testing.assert_allclose(f, network.injections(theta), rtol=0, atol=1e-14)  # rounding
     amplitude = np.hypot(a + b * np.cos(theta_gen), b * np.sin(theta_gen))
     phi = np.arctan2(b * np.sin(theta_gen), a + b * np.cos(theta_gen))
     np.testing.assert_allclose(theta[:, 0], phi + np.arcsin(load / amplitude), rtol=0, atol=1e-12)

@@ -21,7 +21,7 @@ from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
 from tests.run.test_pool import runs, wait_until
 
-#: So much processor time may pass before the first line of a command, s: two and a half times what it takes alone,
+#: So much processor time may pass before the first line of a command, s: more than twice what it takes alone,
 #: since a core that others share counts more.
 FIRST_LINE_S = 5.0
 

@@ -160,7 +160,7 @@ class KnotProgram:
     ) -> tuple[FormAnswer, Array]:
         """Solve with limits of outputs widened in every interval, and with room for surprises.
 
-        What PIQP does not solve HiGHS does.
+        What PIQP does not solve it solves with dense blocks instead of a sparse matrix, or HiGHS does.
 
         Args:
             limits, time_limit_s: see `solve`; limits between knots have rows for their own sign only.
@@ -182,6 +182,9 @@ class KnotProgram:
                 answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
             else:
                 answer = self._answer(form, left_s)
+                if answer.status == Status.FAILED:
+                    other = solve_form(form, max(deadline - time.perf_counter(), 0.0), staged=True)
+                    answer = replace(other, iterations=answer.iterations + other.iterations)
             if answer.status == Status.FAILED:
                 other = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
                 version = f"{answer.version}, {other.version}"

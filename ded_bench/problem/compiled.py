@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core.event import Listener, register
+from numba.core.types import unliteral
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -45,6 +46,8 @@ def compiled(function: Function) -> Function:
     except RuntimeError:  # there is no such folder
         return cast(Function, numba.njit(nogil=True)(function))
     made._cache._cache_file._version = sources_stamp()  # looked at before anything of the file is unpickled
+    resolve = made.get_call_template  # callers that are compiled: one version for all literal integers
+    made.get_call_template = lambda args, named: resolve(tuple(map(unliteral, args)), named)
     return cast(Function, made)
 
 

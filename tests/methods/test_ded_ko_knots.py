@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods import ded_ko_knots, knot_program
+from ded_bench.methods import ded_ko, ded_ko_knots, knot_program
 from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.solvers.linear_program import FormAnswer
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
+from ded_bench.solvers.piqp import solve_form
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import linear_model
@@ -123,3 +124,19 @@ def test_what_piqp_does_not_solve_highs_does(regime, ninebus: Case, monkeypatch:
     assert "highs" in rescued.solver_version
     # Rows that a relaxed program widens within its tolerance are worth so much.
     assert rescued.solver_objective == pytest.approx(usual.solver_objective, rel=1e-5)
+
+
+def test_what_a_sparse_matrix_does_not_solve_blocks_do(ninebus: Case, monkeypatch) -> None:
+    """PIQP's two factorisations; HiGHS may go on for half an hour instead."""
+    instance, solve = short(ninebus, 1), ded_ko.prepare(ninebus, "TO", Settings(model="trajectory"))
+    usual = solve(instance)
+
+    def hard(form: FreeForm, time_limit_s: float, staged: bool = False) -> FormAnswer:
+        if staged:
+            return solve_form(form, time_limit_s, staged)
+        return FormAnswer(Status.FAILED, np.empty(0), 3, "piqp", "hard")
+
+    monkeypatch.setattr(knot_program, "solve_form", hard)
+    rescued = solve(instance)
+    assert (rescued.status, rescued.solver_version) == (Status.OPTIMAL, usual.solver_version)
+    assert rescued.solver_objective == pytest.approx(usual.solver_objective, rel=1e-6)

@@ -12,9 +12,7 @@ from scipy.optimize import linprog
 from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import (
     FORGOTTEN,
-    MEAN_MARGIN,
     RAMP_MARGIN,
-    SWING_MARGIN,
     IslandGrid,
     IslandIterations,
     swings_by,
@@ -43,11 +41,11 @@ def test_many_iterations_solve_the_linear_program(island: Case, instance: Instan
     grid = IslandGrid(island, "TO", HORIZON)
     asked = grid.ask(instance)
     near = grid.follow(asked, asked.start)
-    found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))(asked, near, 1500, True)
+    found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0, 0.3, 0.1]))(asked, near, 1500, True)
     n, n_gen = grid.maps.mean.shape[1], len(island.generators)
     swings = [swings_by(grid.maps, np.float32(one).reshape(-1, n_gen)).ravel() for one in np.eye(n)]
     rows = np.vstack([grid.maps.mean, np.transpose(swings)])
-    room = np.repeat([1.0 - MEAN_MARGIN, 1.0 - SWING_MARGIN], [len(near.mean), near.swings.size])
+    room = np.repeat([0.7, 0.9], [len(near.mean), near.swings.size])
     room[len(near.mean) - 1] *= grid.last
     x0, at = near.schedule[1:].ravel(), np.concatenate([near.mean, near.swings.ravel()])
     change = np.eye(n) - np.eye(n, k=-n_gen)

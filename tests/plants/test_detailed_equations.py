@@ -141,7 +141,7 @@ def test_symbolic_and_compiled_equations_agree(system):
     """At random states, to 1e-10 of the rates, with the network solved by Newton's method symbolically."""
     x, guess, point, v_ref = random_states(system, 3)
     p_ref, n_load = point.power.real + 0.1, system.network.n_load_port
-    compiled = compiled_rates(system, point.p_drawn[:n_load], (p_ref, v_ref), x, guess)
+    compiled = compiled_rates(system, point.p_drawn[:n_load].copy(), (p_ref, v_ref), x, guess)
     for states, rates in zip(x, compiled, strict=True):
         v = voltages(system, states, guess, point.p_drawn)
         symbolic = system.symbolic.equations(states.ravel(), v, p_ref, point.p_drawn, v_ref)[0].full()

@@ -31,8 +31,6 @@ from ded_bench.problem.quantities import Array32
 SPACING_S = 0.25
 #: Part of what a knot does to swings that iterations leave out, once it is long ago.
 FORGOTTEN = 0.02
-#: Parts of the bounds on the mean frequency and on swings that are left to errors of the model.
-MEAN_MARGIN, SWING_MARGIN = 0.3, 0.1
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of set-points, pu: 1.5 kW, and half the size in archives.
@@ -43,8 +41,9 @@ REGULARISATION = 1e-4
 PACE = 0.7
 #: Over-relaxation.
 RELAXATION = 1.6
-#: Names of the learned settings: logarithms of the penalties of outputs, limits and ramps; of the price.
-SETTINGS = ("mean", "swing", "limit", "ramp", "price")
+#: Names of the learned settings, logarithms: penalties of outputs, limits and ramps; the price; parts of the
+#: bounds on the mean frequency and on swings that are left to errors of the model.
+SETTINGS = ("mean", "swing", "limit", "ramp", "price", "mean margin", "swing margin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +190,7 @@ class IslandIterations:
 
     def __init__(self, grid: IslandGrid, settings: Sequence[float] | Array) -> None:
         self.grid = grid
-        mean, swing, limit, ramp, self.price = np.exp(np.asarray(settings, dtype=np.float64)).tolist()
+        mean, swing, limit, ramp, self.price, *self.margins = np.exp(np.asarray(settings, float)).tolist()
         n_gen, n = len(grid.case.generators), grid.maps.mean.shape[1]
         n_swings, identity = grid.maps.swing.shape[1], np.eye(n)
         self.penalties = np.array([mean, swing, limit, ramp, limit], dtype=np.float32)
@@ -229,7 +228,7 @@ class IslandIterations:
         n, n_gen = len(grid.knots) - 1, len(case.generators)
         spread = max(float(np.ptp(asked.cost)), 1e-9)
         pull = self.pull @ (asked.cost * (self.price / spread if priced else 0.0)).astype(np.float32)
-        mean = np.full(n, 1.0 - MEAN_MARGIN)
+        mean = np.full(n, max(1.0 - self.margins[0], 0.0))
         mean[-1] *= grid.last
         by_transfer = case.transfer_rows[0].astype(np.float32)
         step, ones = grid.step.astype(np.float32), np.ones((n, n_gen))
@@ -240,7 +239,7 @@ class IslandIterations:
             np.diff(near.schedule, axis=0) / grid.step,
             near.schedule[1:] @ by_transfer.T,
         ]
-        swing = np.full_like(near.swings, 1.0 - SWING_MARGIN)
+        swing = np.full_like(near.swings, max(1.0 - self.margins[1], 0.0))
         ramp = (1.0 - RAMP_MARGIN) * ones
         low = [-mean, -swing, case.p_min * ones, -ramp, np.full_like(asked.room, -np.inf)]
         high = [mean, swing, case.p_max * ones, ramp, asked.room]

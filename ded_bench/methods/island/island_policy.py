@@ -26,7 +26,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 #: Settings of mending; the price is not used.
-MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0])
+MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0, 0.3, 0.1])
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.05
 #: How often, at most.

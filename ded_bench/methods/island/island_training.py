@@ -1,4 +1,4 @@
-"""Train `ded-admm` on an island: CMA-ES on its five settings, judged by simulations in coarse steps.
+"""Train `ded-admm` on an island: CMA-ES on its seven settings, judged by simulations in coarse steps.
 
 Instances are not drawn afresh, since each would have to be simulated to see that it can be served: candidates
 are compared on a few of those given, others in every generation, and the last ones are held out.
@@ -30,7 +30,7 @@ WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
 #: Where the search starts, and its first standard deviation.
-FIRST = np.log([0.2, 0.25, 2.5, 0.2, 20.0])
+FIRST = np.log([0.2, 0.25, 2.5, 0.2, 20.0, 0.3, 0.1])
 SIGMA = 0.4
 #: Most instances that are held out.
 HELD_OUT = 40
@@ -81,11 +81,7 @@ def train(
             break
     write_history(out, history)
     facts |= {"epochs": len(history), "seconds": time.perf_counter() - began, "held_out_loss": best_loss}
-    facts |= {
-        "instances": len(trained),
-        "held_out": held,
-        "cma": cma.__version__,
-    }
+    facts |= {"instances": len(trained), "held_out": held, "cma": cma.__version__}
     made = policy(best)
     made.save(out)
     return made

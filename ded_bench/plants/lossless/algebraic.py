@@ -127,7 +127,7 @@ def solve_algebraic(
     factor: Array,
     angle: Array,
     f: Array,
-    contraction: float = CONTRACTION,
+    contraction: float,
 ) -> bool:
     """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
 

@@ -106,7 +106,7 @@ class Network:
         """Injections at the algebraic buses, shape (..., n_algebraic): loads, and zero at junctions."""
         full = np.zeros((*p_load.shape[:-1], self.n_bus))
         full[..., self.loads] = p_load
-        return full[..., self.algebraic]
+        return np.take(full, self.algebraic, axis=-1)
 
     def solve_loads(self, theta: Array, injection: Array) -> tuple[Array, Array]:
         """Angles and injections of all buses, given angles of generators and slack: L_i = f_i(θ), index 1.
@@ -180,7 +180,7 @@ class Network:
         theta, f = np.array(theta), np.empty(theta.shape)
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
         n = len(grid.algebraic)
-        wanted = np.broadcast_to(wanted, (*theta.shape[:-1], n)).reshape(-1, n)
-        if not solve_angles(grid, np.ascontiguousarray(wanted), *rows):
+        wanted = np.array(np.broadcast_to(wanted, (*theta.shape[:-1], n)).reshape(-1, n), order="C")
+        if not solve_angles(grid, wanted, *rows):
             raise SimulationError("the power flow has no solution")
         return theta, f

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.integrate import RK45
 
 from ded_bench.plants.hold import Indices
-from ded_bench.plants.lossless.algebraic import CompiledGrid, factorised, solve_algebraic
+from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorised, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
@@ -257,11 +257,11 @@ def _evaluate(
     for i in range(n_algebraic):
         wanted[i] = inputs.injection[k, i]
         wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
-    solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f)
+    solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, CONTRACTION)
     if not solved:  # a bad guess? from the angles of the step before, then
         for i in range(n_algebraic):
             angle[grid.algebraic[i]] = recent[0, i]
-        solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f)
+        solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, CONTRACTION)
     if not solved:
         return False
     if s == 0:

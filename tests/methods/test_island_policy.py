@@ -41,7 +41,8 @@ def test_many_iterations_solve_the_linear_program(island: Case, instance: Instan
     grid = IslandGrid(island, "TO", HORIZON)
     asked = grid.ask(instance)
     near = grid.follow(asked, asked.start)
-    found, _ = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0, 0.3, 0.1]))(asked, near, 1500, True)
+    iterate = IslandIterations(grid, np.log([1.0, 1.0, 1.0, 1.0, 10.0]))
+    found, _ = iterate(asked, near, 1500, np.array([0.3, 0.1]))
     n, n_gen = grid.maps.mean.shape[1], len(island.generators)
     swings = [swings_by(grid.maps, np.float32(one).reshape(-1, n_gen)).ravel() for one in np.eye(n)]
     rows = np.vstack([grid.maps.mean, np.transpose(swings)])

@@ -186,11 +186,11 @@ class IslandGrid:
 
 
 class IslandIterations:
-    """Iterations with given settings, see `SETTINGS`."""
+    """Iterations with given penalties and price, the first of `SETTINGS`."""
 
     def __init__(self, grid: IslandGrid, settings: Sequence[float] | Array) -> None:
         self.grid = grid
-        mean, swing, limit, ramp, self.price, *self.margins = np.exp(np.asarray(settings, float)).tolist()
+        mean, swing, limit, ramp, self.price = np.exp(np.asarray(settings, float)).tolist()
         n_gen, n = len(grid.case.generators), grid.maps.mean.shape[1]
         n_swings, identity = grid.maps.swing.shape[1], np.eye(n)
         self.penalties = np.array([mean, swing, limit, ramp, limit], dtype=np.float32)
@@ -210,7 +210,7 @@ class IslandIterations:
         self.pull = (inverse @ grid.delivered.T).astype(np.float32)
 
     def __call__(
-        self, asked: IslandProblem, near: Found, iterations: int, priced: bool, dual: Array32 | None = None
+        self, asked: IslandProblem, near: Found, iterations: int, margins: Array, dual: Array32 | None = None
     ) -> tuple[Array, Array32]:
         """Iterate from a schedule.
 
@@ -218,7 +218,7 @@ class IslandIterations:
             asked: the instance.
             near: a schedule and what it leads to.
             iterations: how many.
-            priced: whether costs count.
+            margins: the last of `SETTINGS`.
             dual: to go on from; None: zero.
 
         Returns:
@@ -227,8 +227,8 @@ class IslandIterations:
         grid, case = self.grid, self.grid.case
         n, n_gen = len(grid.knots) - 1, len(case.generators)
         spread = max(float(np.ptp(asked.cost)), 1e-9)
-        pull = self.pull @ (asked.cost * (self.price / spread if priced else 0.0)).astype(np.float32)
-        mean = np.full(n, max(1.0 - self.margins[0], 0.0))
+        pull = self.pull @ (asked.cost * (self.price / spread)).astype(np.float32)
+        mean = np.full(n, max(1.0 - margins[0], 0.0))
         mean[-1] *= grid.last
         by_transfer = case.transfer_rows[0].astype(np.float32)
         step, ones = grid.step.astype(np.float32), np.ones((n, n_gen))
@@ -239,7 +239,7 @@ class IslandIterations:
             np.diff(near.schedule, axis=0) / grid.step,
             near.schedule[1:] @ by_transfer.T,
         ]
-        swing = np.full_like(near.swings, max(1.0 - self.margins[1], 0.0))
+        swing = np.full_like(near.swings, max(1.0 - margins[1], 0.0))
         ramp = (1.0 - RAMP_MARGIN) * ones
         low = [-mean, -swing, case.p_min * ones, -ramp, np.full_like(asked.room, -np.inf)]
         high = [mean, swing, case.p_max * ones, ramp, asked.room]

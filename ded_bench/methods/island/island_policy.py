@@ -25,8 +25,8 @@ from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
-#: Settings of mending; the price is not used.
-MENDING = np.log([0.5, 0.5, 1.0, 0.5, 1.0, 0.3, 0.1])
+#: Penalties of mending, and no price.
+MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.05
 #: How often, at most.
@@ -48,7 +48,7 @@ class IslandPolicy(TrainedPolicy):
     @functools.cached_property
     def iterate(self) -> IslandIterations:
         """The iterations."""
-        return IslandIterations(self.grid, self.weights["settings"])
+        return IslandIterations(self.grid, self.weights["settings"][: len(MENDING)])
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""
@@ -73,16 +73,17 @@ class IslandPolicy(TrainedPolicy):
 
     def _improved(self, asked: IslandProblem, start: Array, count: int) -> Array:
         """The first far enough from the bounds, else that with the least excess."""
-        answer, dual, seen = start, None, []
+        answer, dual, seen, margins = start, None, [], np.exp(self.weights["settings"][len(MENDING) :])
         try:
             for _ in range(self.training["rounds"]):
                 seen.append(self.grid.follow(asked, answer))
-                answer, dual = self.iterate(asked, seen[-1], count, True, dual)
+                answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
             for _ in range(MENDED):
                 seen.append(self.grid.follow(asked, answer))
                 if seen[-1].excess <= -NEAR:
                     return answer
-                answer, _ = mending_of(self.grid)(asked, seen[-1], self.training["mending"], False)
+                count = self.training["mending"]
+                answer, _ = mending_of(self.grid)(asked, seen[-1], count, margins)
             seen.append(self.grid.follow(asked, answer))
         except SimulationError:
             if not seen:

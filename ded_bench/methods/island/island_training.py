@@ -1,4 +1,4 @@
-"""Train `ded-admm` on an island: CMA-ES on its seven settings, judged by simulations in coarse steps.
+"""Train `ded-admm` on an island: CMA-ES on its seven settings, judged by the scorer.
 
 Instances are not drawn afresh, since each would have to be simulated to see that it can be served: candidates
 are compared on a few of those given, others in every generation, and the last ones are held out.
@@ -20,8 +20,10 @@ from ded_bench.methods.island.island_policy import IslandPolicy
 from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions, write_history
 from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.score import score
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
 
 #: Iterations of each round with costs, and of mending.
 ITERATIONS, MENDING = 28, 16
@@ -34,10 +36,8 @@ FIRST = np.log([0.2, 0.25, 2.5, 0.2, 20.0, 0.3, 0.1])
 SIGMA = 0.4
 #: Most instances that are held out.
 HELD_OUT = 40
-#: Cost, as a part of it, of what is beyond a bound by the whole of it; the most that counts for one instance.
-PRICE, HOPELESS = 0.2, 0.05
-#: Excess, as a part of the bound, below which the scorer sees none: between points peaks are higher.
-SAFE = -0.04
+#: What an answer that breaks a limit counts for, and one that cannot be simulated, as parts of cost.
+INFEASIBLE, HOPELESS = 0.008, 0.05
 
 
 def train(
@@ -88,15 +88,16 @@ def train(
 
 
 def loss(policy: IslandPolicy, instances: Sequence[Instance]) -> float:
-    """Mean of what answers cost beyond the schedules that they start from, as a part, and of excess."""
+    """Mean of what answers cost beyond the schedules that they start from, as a part; what fails counts."""
     return float(np.mean([_one(policy, policy.grid, instance) for instance in instances]))
 
 
 def _one(policy: IslandPolicy, grid: IslandGrid, instance: Instance) -> float:
     asked = grid.ask(instance)
     try:
-        start, found = grid.follow(asked, asked.start), grid.follow(asked, policy.powers(instance))
+        answer = Schedule(policy.knots, policy.powers(instance))
+        found = score(policy.scope.case, instance, answer, policy.scope.regime)
+        start = grid.follow(asked, asked.start).cost * (instance.steps + 1)
     except SimulationError:
         return HOPELESS
-    excess = PRICE * max(found.excess - SAFE, 0.0)
-    return found.cost / start.cost - 1.0 + excess / (1.0 + excess / HOPELESS)
+    return found.objective / start - 1.0 + (0.0 if found.feasible else INFEASIBLE)

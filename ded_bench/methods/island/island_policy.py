@@ -14,12 +14,7 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.island.island_iterations import (
-    SETTINGS,
-    IslandGrid,
-    IslandIterations,
-    IslandProblem,
-)
+from ded_bench.methods.island.island_iterations import SETTINGS, IslandGrid, IslandIterations, IslandProblem
 from ded_bench.methods.trained_policy import TrainedPolicy
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
@@ -29,8 +24,8 @@ from ded_bench.problem.instance import Instance
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.05
-#: How often, at most.
-MENDED = 5
+#: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
+MENDED, WIDENED = 5, 1.5
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 
@@ -78,12 +73,12 @@ class IslandPolicy(TrainedPolicy):
             for _ in range(self.training["rounds"]):
                 seen.append(self.grid.follow(asked, answer))
                 answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
-            for _ in range(MENDED):
+            for more in np.linspace(1.0, WIDENED, MENDED):
                 seen.append(self.grid.follow(asked, answer))
                 if seen[-1].excess <= -NEAR:
                     return answer
                 count = self.training["mending"]
-                answer, _ = mending_of(self.grid)(asked, seen[-1], count, margins)
+                answer, _ = mending_of(self.grid)(asked, seen[-1], count, more * margins)
             seen.append(self.grid.follow(asked, answer))
         except SimulationError:
             if not seen:

@@ -37,7 +37,7 @@ SIGMA = 0.4
 #: Most instances that are held out.
 HELD_OUT = 40
 #: What an answer that breaks a limit counts for, and one that cannot be simulated, as parts of cost.
-INFEASIBLE, HOPELESS = 0.008, 0.05
+INFEASIBLE, HOPELESS = 0.02, 0.05
 
 
 def train(

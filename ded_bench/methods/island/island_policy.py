@@ -25,7 +25,7 @@ MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 #: What is as near a bound as this part of it is mended.
 NEAR = 0.05
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
-MENDED, WIDENED = 5, 1.5
+MENDED, WIDENED = 5, 2.0
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 

@@ -49,7 +49,7 @@ def add_commands(commands: Any) -> None:
     budget.add_argument("--seconds", type=positive_number, metavar="S", help="train for so long")
     budget.add_argument("--epochs", type=positive, metavar="N", help="train for so many")
     p.add_argument("--limit", type=positive, help="only the first so many training instances")
-    p.add_argument("--start", type=Path, metavar="FILE", help="policy whose weights training starts from")
+    p.add_argument("--device", default="cpu", metavar="NAME", help="of torch, such as cuda; default: cpu")
     p.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.add_argument("--workers", type=positive, default=1, metavar="N", help="trainings at a time")
@@ -92,9 +92,9 @@ def _train_dpc(a: argparse.Namespace) -> int:
     with _missing_named():
         for method in methods:
             _ = method.train  # says if it is not trained
-    for method in methods if a.start else ():
-        if not method.takes_start:
-            raise InputError("--start", str(a.start), f"{method.name} does not start from other weights")
+    for method in methods if a.device != "cpu" else ():
+        if not method.takes_device:
+            raise InputError("--device", a.device, f"{method.name} is trained on the CPU alone")
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
     if min(a.workers, len(jobs)) == 1:
         for job in jobs:
@@ -123,7 +123,7 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
         seconds=a.seconds,
         epochs=a.epochs,
         resume=a.resume,
-        start=a.start,
+        device=a.device,
         model=a.model,
         search=search_folders(case, results),
         version=version(),

@@ -121,12 +121,13 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Replace `path` by `content` in one step: a reader or a crash never sees half a file."""
+    """Replace `path` by `content`, packed for `.gz`, in one step: no reader or crash sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    data = content if isinstance(content, bytes) else content.encode()
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
         with naming(path), open(temporary, "xb") as file:
-            file.write(content if isinstance(content, bytes) else content.encode())
+            file.write(gzip.compress(data, 3, mtime=0) if path.suffix == ".gz" else data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

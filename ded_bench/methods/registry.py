@@ -33,7 +33,7 @@ class Method:
     module: str
     title: str
     trainer: str = ""  # the module that trains it
-    takes_start: bool = False  # its training can start from the weights of another policy
+    takes_device: bool = False  # it can be trained on a GPU
     model: str = ""  # the surrogate that it plans with unless told otherwise, if it takes any
 
     @property
@@ -113,6 +113,7 @@ METHODS: dict[str, Method] = {
             "ded_bench.methods.dpc_paper.paper_policy",
             "DED-DPC (paper's recipe)",
             trainer="ded_bench.methods.dpc_paper.paper_training",
+            takes_device=True,
         ),
         Method(
             "ded-dpc",
@@ -126,7 +127,6 @@ METHODS: dict[str, Method] = {
             "ded_bench.methods.admm.admm_policy",
             "DED-ADMM",
             trainer="ded_bench.methods.admm.admm_training",
-            takes_start=True,
         ),
     )
 }

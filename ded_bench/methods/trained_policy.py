@@ -88,7 +88,7 @@ class TrainedPolicy(abc.ABC):
     @functools.cached_property
     def fingerprint(self) -> str:
         """Twelve hex digits that change when any weight does."""
-        return weights_fingerprint(self.weights)
+        return hashlib.sha256(b"".join(w.tobytes() for w in self.weights.values())).hexdigest()[:12]
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -164,11 +164,6 @@ def checked_weights(
 def weights_of(network: nn.Module) -> Weights:
     """The weights and buffers of a network in torch, copied."""
     return {name: value.detach().cpu().numpy().copy() for name, value in network.state_dict().items()}
-
-
-def weights_fingerprint(weights: Weights) -> str:
-    """Twelve hex digits that change when any weight does."""
-    return hashlib.sha256(b"".join(value.tobytes() for value in weights.values())).hexdigest()[:12]
 
 
 def as_solver(policy: TrainedPolicy, answer: Callable[[Instance], Array], iterations: int = 0) -> Solver:

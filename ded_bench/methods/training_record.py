@@ -65,7 +65,7 @@ class TrainingOptions:
     seconds: float | None = None  # end after so much training time; None: train for all epochs
     epochs: int | None = None  # None: as many as the method's recipe says
     resume: bool = False  # go on from the checkpoint, if there is one
-    start: Path | None = None  # policy file, perhaps of another grid, whose weights training starts from
+    device: str = "cpu"  # of torch, for methods that take it
     model: str = ""  # surrogate to train on, by name or file, for methods that train on one
     search: tuple[Path, ...] = ()  # folders where trained models may lie
     version: str = ""  # of this package, and its commit: facts that the policy's file tells
@@ -81,14 +81,13 @@ class TrainingOptions:
 
     def facts(self) -> dict[str, Any]:
         """What every policy's file tells of how it was trained."""
-        return {"seed": self.seed, "version": self.version, "commit": self.commit}
+        return {"seed": self.seed, "device": self.device, "version": self.version, "commit": self.commit}
 
 
 #: `train(case, regime, instances, out, options)` of a method's training module. The instances are all on one
 #: time grid. It writes the policy to `out`, its history beside it, and returns something whose `training` has
 #: facts: `epochs` (done), `seconds` (spent), one of `LOSSES`, and any others. It raises InputError if the
-#: surrogate is missing, the checkpoint to go on from belongs to another training, or the weights to start
-#: from do not fit.
+#: surrogate is missing, the checkpoint to go on from belongs to another training, or there is no such device.
 Trainer = Callable[[Case, str, Sequence[Instance], Path, TrainingOptions], Any]
 
 

@@ -162,13 +162,28 @@ class TrainingRun(abc.ABC):
 
 @contextlib.contextmanager
 def repeatable() -> Iterator[None]:
-    """Train so that results repeat: on one thread, from which these networks lose nothing."""
+    """Train so that results repeat: on one thread, from which these networks lose nothing.
+
+    On a GPU with algorithms that repeat, in full single precision: cuDNN's default rounds to ten bits.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+            yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def tensors_on(device: str) -> Iterator[None]:
+    """Make tensors on a device of torch; InputError if it has none of this name."""
+    try:
+        torch.zeros(1, device=device)
+    except (AssertionError, RuntimeError) as error:
+        raise InputError("--device", device, str(error).partition("\n")[0]) from None
+    with torch.device(device):
+        yield
 
 
 def follow_within(targets: Tensor, p_initial: Tensor, low: Tensor, high: Tensor, step: Tensor) -> Tensor:

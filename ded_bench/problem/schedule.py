@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gzip
 import io
 import math
 from collections.abc import Mapping
@@ -48,8 +47,7 @@ class Schedule:
         text = io.StringIO()
         header, table = ",".join(["t", *(f"P_{g}" for g in generators)]), np.column_stack([self.t, self.p])
         np.savetxt(text, table, fmt="%.15g", delimiter=",", header=header, comments="")
-        data = text.getvalue().encode()
-        write_atomically(path, gzip.compress(data, 3, mtime=0) if path.suffix == ".gz" else data)
+        write_atomically(path, text.getvalue())
 
     @staticmethod
     def read(path: str | Path, case: Case, horizon_s: float) -> Schedule:

@@ -85,7 +85,7 @@ class ResultsFolder:
 
     def certificate_rows(self, *name: str) -> Path:
         """What one certificate counts, one row per instance; `name` is what makes it unique."""
-        return self.path / "certificates" / f"{'-'.join(filter(None, name))}.csv"
+        return self.path / "certificates" / f"{'-'.join(filter(None, name))}.csv.gz"
 
     def trajectory(self, key: OnlineKey) -> Path:
         """The trajectory of a row of the closed loop."""

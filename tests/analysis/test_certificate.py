@@ -83,7 +83,7 @@ def candidate(regime: str) -> Candidate:
 
 
 def rows_of(folder: Path, regime: str) -> list[certificate.CertificateRow]:
-    (path,) = (folder / "certificates").glob(f"*-{regime}.csv")
+    (path,) = (folder / "certificates").glob(f"*-{regime}.csv.gz")
     return ROWS.read(path)
 
 

@@ -222,7 +222,7 @@ def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys
     [
         (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method and regime"),
         (("--method", "ded", "--regime", "TO"), "is not trained"),
-        (("--method", "ded-dpc", "--start", "p.safetensors"), "ded-dpc does not start from other weights"),
+        (("--method", "ded-dpc", "--device", "cuda"), "ded-dpc is trained on the CPU alone"),
     ],
 )
 def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:

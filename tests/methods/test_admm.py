@@ -12,7 +12,6 @@ import scipy.optimize
 import scipy.signal
 import torch
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_slp
 from ded_bench.methods.admm import admm_training
 from ded_bench.methods.admm.admm_inference import (
@@ -23,7 +22,7 @@ from ded_bench.methods.admm.admm_inference import (
     starting_settings,
 )
 from ded_bench.methods.admm.admm_policy import prepare
-from ded_bench.methods.admm.admm_training import read_start, with_margin
+from ded_bench.methods.admm.admm_training import with_margin
 from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, oscillators
 from ded_bench.methods.admm.problems import POINTS, problems_of
 from ded_bench.methods.admm.torch_iterations import (
@@ -33,7 +32,6 @@ from ded_bench.methods.admm.torch_iterations import (
     judged,
 )
 from ded_bench.methods.solution import Settings
-from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
@@ -196,23 +194,6 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     assert cost == pytest.approx(truth.objective, rel=5e-4)
     excess = truth.freq_violation_hz * 2 * np.pi / grid.bound
     assert float(most[0]) == pytest.approx(excess, abs=0.02)
-
-
-def test_training_starts_from_weights_of_another_grid(ninebus: Case, threebus: Case, tmp_path: Path) -> None:
-    start, out = tmp_path / "start.safetensors", tmp_path / "p.safetensors"
-    known = random_policy("ded-admm", threebus)
-    known.save(start)
-    found = read_start(start)
-    assert all(np.array_equal(found[name], value) for name, value in known.weights.items())
-    instances = short_instances(ninebus, 4)
-    options = TrainingOptions(seconds=1e-3, epochs=1, start=start)
-    trained = admm_training.train(ninebus, "TO", instances, out, options)
-    assert trained.training["start"] == known.fingerprint
-    assert trained.fingerprint != known.fingerprint
-    other = tmp_path / "other.safetensors"
-    random_policy("ded-dpc", threebus).save(other)
-    with pytest.raises(InputError, match="ded-admm"):
-        read_start(other)
 
 
 def test_margin_is_the_least_that_makes_enough_schedules_feasible(

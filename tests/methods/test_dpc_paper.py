@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.dpc_paper.paper_policy import (
     FILTERS,
     WINDOWS,
@@ -180,3 +181,9 @@ def test_the_recipe_is_the_papers_and_nothing_else(threebus: Case, tmp_path: Pat
     assert (expected["scale"] == 1).all()
     for name, value in policy.weights.items():
         np.testing.assert_allclose(value, expected[name].numpy(), rtol=1e-4, atol=1e-6)
+
+
+def test_a_device_that_torch_does_not_have_is_refused(threebus: Case, tmp_path: Path) -> None:
+    options, instances = TrainingOptions(model="linear", epochs=1, device="gpu"), some_instances(threebus, 8)
+    with pytest.raises(InputError, match="--device"):
+        train(threebus, next(iter(threebus.regimes)), instances, tmp_path / "p.safetensors", options)

@@ -50,8 +50,8 @@ def test_it_is_trained_by_the_command(problem: Path, out: Path, capsys) -> None:
     assert path.read_bytes() != before
     assert train(problem, out, "--model", "linear") == 0
     assert policy_file(out, "learned", "TO", "linear").is_file()
-    assert train(problem, out, "--force", "--start", str(path)) == 2
-    assert "--start" in capsys.readouterr().err
+    assert train(problem, out, "--force", "--device", "cuda") == 2
+    assert "--device" in capsys.readouterr().err
 
 
 def test_it_solves_here_and_where_the_results_folder_is_not(problem: Path, out: Path, tmp_path: Path) -> None:

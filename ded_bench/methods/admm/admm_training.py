@@ -12,22 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ded_bench.files.arrays import read_arrays
-from ded_bench.files.errors import InputError
-from ded_bench.methods.admm.admm_inference import PRICE, weight_shapes
+from ded_bench.methods.admm.admm_inference import PRICE
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, Start
 from ded_bench.methods.admm.problems import draw, problems_of
 from ded_bench.methods.admm.torch_iterations import TorchIterations, judged
 from ded_bench.methods.island.island_training import train as train_on_island
-from ded_bench.methods.trained_policy import (
-    Scope,
-    TrainedPolicy,
-    Weights,
-    checked_weights,
-    weights_fingerprint,
-    weights_of,
-)
+from ded_bench.methods.trained_policy import Scope, TrainedPolicy, weights_of
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.methods.training_run import TrainingRun, repeatable
 from ded_bench.plants.plant import SimulationError
@@ -77,9 +68,6 @@ def train(
     horizon = instances[0].horizon_s
     grid = ModalGrid(case, case.omega_bound(regime), horizon)
     network = TorchIterations(grid, iterations_of(grid))
-    start = read_start(options.start) if options.start else None
-    if start is not None:
-        network.load_state_dict({name: torch.as_tensor(value) for name, value in start.items()})
     check = grid.start(problems_of(case, instances[:HELD_OUT], grid.points))
     run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
@@ -88,7 +76,6 @@ def train(
         "batch": run.batch,
         "instances": run.step * run.batch,
         "held_out": len(check.served),
-        "start": weights_fingerprint(start) if start is not None else "",
         "iterations": len(network.start),
     }
     policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights_of(network), facts), instances)
@@ -101,18 +88,6 @@ def iterations_of(grid: ModalGrid) -> int:
     rates = grid.ramp / (np.diag(grid.stiffness) * grid.spacing)
     fewest, rounds = LOOSE if np.median(rates) < RAMPING * grid.bound else TIGHT
     return max(fewest, rounds // len(rates))
-
-
-def read_start(path: Path) -> Weights:
-    """Weights of a policy of whatever grid and regime, to start from.
-
-    Raises:
-        InputError: the file is wrong, or a policy of another method.
-    """
-    arrays, header = read_arrays(path)
-    if header.get("method") != AdmmPolicy.method:
-        raise InputError(path, "method", f"is no {AdmmPolicy.method} policy")
-    return checked_weights(arrays, weight_shapes(), path)
 
 
 class _AdmmTraining(TrainingRun):

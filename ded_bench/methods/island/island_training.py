@@ -48,7 +48,7 @@ def train(
     Raises:
         InputError: the case is no island of detailed machines, or training is to go on.
     """
-    if options.resume or options.start is not None:
+    if options.resume:
         raise InputError("--resume", "", "policies of islands train in minutes, and start anew")
     facts = options.facts() | {"rounds": 2, "iterations": ITERATIONS, "mending": MENDING}
     scope = Scope(case, regime, instances[0].horizon_s)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.analysis.online_summary import own_latency
+from ded_bench.analysis.online_summary import LOOP, own_latency
 from ded_bench.analysis.reference import result_lines
 from ded_bench.analysis.summary import titled
 from ded_bench.problem.case import SHIPPED_CASES, Case
@@ -72,22 +72,29 @@ def methods() -> str:
 
 
 def loop() -> str:
-    """Cost and excess in the closed loop: static dispatch, the cheapest plans, those that exceed least."""
+    """Cost and excess in the closed loop: static dispatch, the cheapest plans, those that exceed least.
+
+    Of the methods that operated all scenarios of static dispatch.
+    """
     rows = []
     for case in GRIDS:
-        found = titled(own_latency(run(case).online))
-        found = found[found["regime"] == "TO"] if len(found) else found
-        planned = found[found["method"] != "ed"] if len(found) else found
-        if not len(planned):
+        operations = run(case).online
+        if not len(operations):
             continue
-        static = found[(found["method"] == "ed") & (found["settings"] == "every=1")]
+        operations = operations[operations["regime"] == "TO"]
+        is_static = (operations["method"] == "ed") & (operations["settings"] == "every=1")
+        shared = set(operations.loc[is_static, "scenario"])
+        everywhere = operations.groupby(LOOP)["scenario"].transform(shared.issubset)
+        found = titled(own_latency(operations[everywhere & operations["scenario"].isin(shared)]))
+        planned = found[found["method"] != "ed"]
         chosen = [
-            static.iloc[0],
+            found[(found["method"] == "ed") & (found["settings"] == "every=1")].iloc[0],
             planned.loc[planned["increase_percent_mean"].idxmin()],
             planned.loc[planned["max_excess_mhz_mean"].idxmin()],
         ]
-        rows.append([case, *(operated(line) for line in chosen)])
-    return markdown(["Grid", "static dispatch every second", "cheapest plans", "least excess"], rows)
+        rows.append([case, str(len(shared)), *(operated(line) for line in chosen)])
+    heads = ["Grid", "scenarios", "static dispatch every second", "cheapest plans", "least excess"]
+    return markdown(heads, rows)
 
 
 def operated(line: pd.Series) -> str:

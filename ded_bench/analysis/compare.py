@@ -294,7 +294,8 @@ def _task(case: Case, row: Row, instances: Mapping[str, Instance], folder: Path)
     except InputError as error:
         return str(error)
     if task.key.policy != row.policy or (model in TRAINED and task.key.model != row.model):
-        return f"its {row.policy or row.model} is not the one in {folder}"
+        other = row.policy if task.key.policy != row.policy else row.model
+        return f"its {other} is not the one in {folder}"
     return task
 
 

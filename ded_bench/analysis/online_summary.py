@@ -12,7 +12,7 @@ from ded_bench.problem.scenario import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
 #: What rows of one line of a table share, besides the scenario.
-LOOP = [*GROUP, "period_s", "latency_s", "warm"]
+LOOP = [*GROUP, "plant", "period_s", "latency_s", "warm"]
 #: What others are set beside: static dispatch of every second, and on islands practice; method and settings.
 STATIC, PRACTICE = ("ed", "every=1"), ("ed", "every=60")
 #: Names of an island's numbers in lines, their columns in online.csv, and units of the former in the latter.
@@ -29,15 +29,17 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     frame = _predicted(results, case)
     own = (frame["latency_source"] == "timing") & (frame["forecast"] == QUALITIES[0])
     frame = frame[own].reset_index(drop=True)
-    typical = frame.groupby([*GROUP, "period_s", "warm"])["latency_s"].transform("median")
+    typical = frame.groupby([name for name in LOOP if name != "latency_s"])["latency_s"].transform("median")
     close = (frame["latency_s"] - typical).abs() <= SAME * typical
     frame["latency_s"] = frame["latency_s"].mask(close, typical)
+    frame = frame.drop_duplicates([*LOOP, "scenario"], keep="last").reset_index(drop=True)
     static = frame[
         (frame["method"] == STATIC[0]) & (frame["settings"] == STATIC[1]) & (frame["period_s"] == 1)
     ]
-    found = static.drop_duplicates(["regime", "scenario"], keep="last").set_index(["regime", "scenario"])
+    place = ["regime", "scenario", "plant"]
+    found = static.drop_duplicates(place, keep="last").set_index(place)
     names = {"objective": "static_objective", "max_excess_hz": "static_excess_hz"}
-    return frame.join(found[list(names)].rename(columns=names), on=["regime", "scenario"])
+    return frame.join(found[list(names)].rename(columns=names), on=place)
 
 
 def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
@@ -53,7 +55,7 @@ def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     minutes = minutes.where(minutes > 0, alike)  # nobody came to the end
     frame["minutes"] = minutes.where(minutes > 0, minutes[minutes > 0].min())
     frame = frame[frame["cps1"].notna() | frame["objective"].isna()].reset_index(drop=True)
-    place = ["regime", "scenario", "forecast"]
+    place = ["regime", "scenario", "forecast", "plant"]
     practice = frame[(frame["method"] == PRACTICE[0]) & (frame["settings"] == PRACTICE[1])]
     found = practice.drop_duplicates(place, keep="last").set_index(place)
     names = ["objective", "mean_freq_max_hz", "agc_travel_pu"]
@@ -62,7 +64,7 @@ def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
 
 def practice_lines(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, kind of forecast, length, method, period and latency of `practice_rows`."""
-    by = ["regime", "forecast", "minutes", "method", "settings", "model", "period_s", "latency_s"]
+    by = ["forecast", "minutes", *LOOP]
     made = [dict(zip(by, key, strict=True)) | _beside(rows) for key, rows in frame.groupby(by, sort=False)]
     return pd.DataFrame(made, columns=[*by, *_beside(frame[:0])])
 
@@ -83,7 +85,9 @@ def _predicted(results: OnlineResults, case: str) -> pd.DataFrame:
     """Rows of a case whose plans started from the state when they took effect, in the order of the table."""
     rows = list(results.table.rows.values())
     frame = named(ONLINE.frame(rows).assign(key=pd.Series([row.key for row in rows], dtype=object)))
-    return frame[frame["predicted"].astype(bool) & (frame["case"] == case)].reset_index(drop=True)
+    dated = frame.sort_values("date", kind="stable")  # only the newest model and policy of a line count
+    is_new = dated["made_with"] == dated.groupby([*GROUP, "plant"])["made_with"].transform("last")
+    return frame[is_new & frame["predicted"].astype(bool) & (frame["case"] == case)].reset_index(drop=True)
 
 
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:

@@ -58,7 +58,7 @@ def add_commands(commands: Any) -> None:
 
     p = command(commands, "report", "write tables V and VI, figures, report.md and report.html")
     declare(p, "--case", "--results")
-    p.add_argument("--workers", type=positive, help="of no effect any more: rows are scored when solved")
+    p.add_argument("--workers", type=positive, help="no effect: rows are scored when solved")
     p.set_defaults(run=_report)
 
     p = command(commands, "overview", "one page over several grids: gaps, violations, time and memory")

@@ -111,7 +111,7 @@ class RealTimeSolver:
         knots = knots_on_clock(case, near, surprises.now_s)
         margin, room = surprises.margin(near.grid), surprises.room(near.grid[knots[1:]])
         solution = self._step(case.bounds(self.regime), near, knots, Plan(in_force, room, margin=margin))
-        if (plan := solution.schedule) is not None:
+        if (plan := solution.schedule) is not None and plan.t[-1] < instance.horizon_s:
             longer = Schedule(np.append(plan.t, instance.horizon_s), np.vstack([plan.p, plan.p[-1:]]))
             solution = dataclasses.replace(solution, schedule=longer)
         surprises.keep(solution.schedule, near)

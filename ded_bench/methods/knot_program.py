@@ -182,7 +182,7 @@ class KnotProgram:
                 answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
             else:
                 answer = self._answer(form, left_s)
-                if answer.status == Status.FAILED:
+                if answer.status == Status.FAILED and self._is_sparse:
                     other = solve_form(form, max(deadline - time.perf_counter(), 0.0), staged=True)
                     answer = replace(other, iterations=answer.iterations + other.iterations)
             if answer.status == Status.FAILED:
@@ -290,8 +290,12 @@ class KnotProgram:
 
     def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
         """PIQP's answer."""
-        is_short = self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
-        return solve_form(form, time_limit_s, staged=not is_short)
+        return solve_form(form, time_limit_s, staged=not self._is_sparse)
+
+    @property
+    def _is_sparse(self) -> bool:
+        """Whether PIQP is given a sparse matrix: knots at all grid points, and few columns at each."""
+        return self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
 
     def _relaxed(self, limits: Indices, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""

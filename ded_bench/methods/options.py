@@ -21,7 +21,6 @@ from ded_bench.files.errors import InputError
 DEFAULT = "default"
 _TRUE, _FALSE, _NONE = "on", "off", "none"
 _KINDS = {bool: f"{_TRUE} or {_FALSE}", int: "a whole number", float: "a number"}
-_ENDS = {"lowest": -math.inf, "highest": math.inf}
 
 T = TypeVar("T")
 
@@ -31,23 +30,16 @@ class NoOptions:
     """The options of a method that has none."""
 
 
-def option(
-    default: Any,
-    text: str,
-    *,
-    choices: Sequence[str] = (),
-    lowest: float = -math.inf,
-    highest: float = math.inf,
-) -> Any:
+def option(default: Any, text: str, *, choices: Sequence[str] = (), lowest: float = -math.inf) -> Any:
     """Declare a field of an `Options` dataclass, of type bool, int, float, str, or one of these or None.
 
     Args:
         default: its value unless `--set` says otherwise.
         text: one line of help, with the unit.
         choices: the texts that a str may be.
-        lowest, highest: of a number.
+        lowest: of a number.
     """
-    limits = {"choices": tuple(choices), "lowest": lowest, "highest": highest}
+    limits = {"choices": tuple(choices), "lowest": lowest}
     return dataclasses.field(default=default, metadata={"text": text, **limits})
 
 
@@ -94,18 +86,16 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
         return None
     kind = next(k for k in kinds if k is not types.NoneType)
     choices = field.metadata.get("choices", ())
-    lowest, highest = (field.metadata.get(name, end) for name, end in _ENDS.items())
+    lowest = field.metadata.get("lowest", -math.inf)
     try:
         value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
         is_number = kind in (int, float)
-        fits = lowest <= value <= highest and math.isfinite(value) if is_number else True
+        fits = lowest <= value and math.isfinite(value) if is_number else True
         if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):
         wanted = f"one of {', '.join(choices)}" if choices else _KINDS.get(kind, kind.__name__)
-        bounds = [f"at least {lowest:g}"] if math.isfinite(lowest) else []
-        bounds += [f"at most {highest:g}"] if math.isfinite(highest) else []
-        wanted = " ".join([wanted, " and ".join(bounds)]).strip()
+        wanted += f" of at least {lowest:g}" if math.isfinite(lowest) else ""
         raise InputError("--set", field.name, f"{text[:40]!r} is not {wanted}") from None
     return value
 

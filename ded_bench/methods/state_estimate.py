@@ -60,8 +60,9 @@ class StateEstimate:
         return self._plant.initial(instance) if estimate is None else self._plant.initial(instance, estimate)
 
     def keep(self, instance: Instance, state: PlantState, schedule: Schedule | None) -> None:
-        """Remember the plan that was given for an instance and a state."""
-        self._given = None if schedule is None else (instance, state, schedule)
+        """Remember the plan that was given for an instance and a state; without one the last goes on."""
+        if schedule is not None:
+            self._given = instance, state, schedule
 
     def _ahead(self, in_force: Schedule | None) -> PlantState:
         """What the last plan has led to at the instance's t = 0; None if another one is in force."""

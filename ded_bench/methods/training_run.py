@@ -149,7 +149,7 @@ class TrainingRun(abc.ABC):
         """
         path = checkpoint_file(self.out)
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             for name in ("network", "average", "optimiser"):
                 getattr(self, name).load_state_dict(state[name])
             for name in self.progress:

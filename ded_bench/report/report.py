@@ -156,7 +156,9 @@ def _methods_caption(sources: Sources) -> str:
     timing, timed = sources.timing, "of this run under load: `ded-bench bench` takes better ones"
     if len(timing):
         counts = "/".join(map(str, sorted(set(timing["instances"]))))
-        timed = f"medians on {counts} instances, alone on {timing['host'].iloc[-1]}"
+        timed = f"medians, alone on {timing['host'].iloc[-1]} (instances: {counts})"
+        loaded = sources.outcome.loc[~sources.outcome["alone"], "title"].unique()
+        timed += f", but of {', '.join(loaded)} under load" if len(loaded) else ""
     return f"The methods that were run ({rows_caption(sources)}; times: {timed})"
 
 

@@ -138,9 +138,12 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     rows, left_out = newest(ours)
     notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
+    made_by = {key: row.method_version for key, row in results.rows.items()}  # else it was another answer
+    validated = [r for r in VALIDATED.existing(paths.validated) if made_by.get(r.key[0]) == r.method_version]
+    refereed = [r for r in REFEREE.existing(paths.referee) if made_by.get(r.key) == r.method_version]
     judgements: dict[str, dict[Key, bool | None]] = {
-        "validated": {row.key[0]: row.feasible for row in VALIDATED.existing(paths.validated)},
-        "confirmed": {row.key: row.confirmed for row in REFEREE.existing(paths.referee)},
+        "validated": {row.key[0]: row.feasible for row in validated},
+        "confirmed": {row.key: row.confirmed for row in refereed},
     }
     rows = judged_elsewhere(gaps(rows, reference.objectives), judgements)
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id]

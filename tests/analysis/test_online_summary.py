@@ -60,6 +60,16 @@ def test_methods_at_their_own_latency(results):
     assert (one["share_outside"], one["slack_travel_pu"]) == (0.25, 2.0)
 
 
+def test_rows_of_an_older_policy_or_another_plant_are_not_averaged_with_the_newest(tmp_path):
+    kept = OnlineResults(tmp_path)
+    policy = {"method": "ded-admm", "latency_source": "timing"}
+    old = row("a", 0.5, 101.0, policy="ded-admm@old", date="2026-01-01T00:00:00Z", **policy)
+    new = {"policy": "ded-admm@new", "date": "2026-01-02T00:00:00Z"} | policy
+    kept.table.add([old, row("a", 0.5, 109.0, **new), row("a", 0.5, 150.0, plant="detailed", **new)])
+    lines = own_latency(online_rows(kept, "here"))
+    assert sorted(lines["increase_percent_mean"]) == pytest.approx([9.0, 50.0])
+
+
 def test_own_latencies_that_hardly_differ_share_a_line(tmp_path):
     """As after `bench` was run anew; half as long a latency is another line."""
     kept = OnlineResults(tmp_path)

@@ -12,6 +12,7 @@ import scipy.optimize
 import scipy.signal
 import torch
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods import ded_slp
 from ded_bench.methods.admm import admm_training
 from ded_bench.methods.admm.admm_inference import (
@@ -32,6 +33,7 @@ from ded_bench.methods.admm.torch_iterations import (
     judged,
 )
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
@@ -194,6 +196,11 @@ def test_loss_is_the_scorers(ninebus: Case) -> None:
     assert cost == pytest.approx(truth.objective, rel=5e-4)
     excess = truth.freq_violation_hz * 2 * np.pi / grid.bound
     assert float(most[0]) == pytest.approx(excess, abs=0.02)
+
+
+def test_a_surrogate_is_refused(ninebus: Case, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="without a surrogate"):
+        admm_training.train(ninebus, "TO", [], tmp_path / "p.safetensors", TrainingOptions(model="linear"))
 
 
 def test_margin_is_the_least_that_makes_enough_schedules_feasible(

@@ -32,6 +32,7 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, find_surrogate
 from ded_bench.surrogates.linear import linear_model
 from tests.methods.on_surrogates import prepared, replay, short
+from tests.methods.policies import short_instances
 from tests.methods.test_ded_ko_knots import least_excess
 
 #: Between rows |ω| may pass the bound by SOFT_TOLERANCE of it, which saves at most this part of the cost.
@@ -69,6 +70,14 @@ def test_plans_in_operation_keep_the_margin(case: Case, koopman) -> None:
     omega = replay(case, koopman, instance, plan.schedule).omega[1 : round(NEAR_S / instance.dt_s)]
     kept = (1 - ALWAYS) * case.omega_bound("TO") * (1 + 1.1 * SOFT_TOLERANCE)
     assert np.abs(omega).max() <= kept
+
+
+def test_a_horizon_shorter_than_the_plans_own_is_planned_to_its_end(threebus: Case) -> None:
+    instance = short_instances(threebus, 1, horizon=6.0)[0]
+    planner = get_method("ded-rti").prepare(threebus, "TO", Settings(model="trajectory"))
+    plan = planner.solve(instance).schedule
+    assert plan.t[-1] == 6.0
+    assert (np.diff(plan.t) > 0).all()
 
 
 def test_what_is_infeasible_is_exceeded_little(ninebus: Case) -> None:

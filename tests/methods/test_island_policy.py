@@ -105,6 +105,11 @@ def test_a_trained_policy_keeps_the_bounds(
     assert found.objective < 1.005 * best
 
 
+def test_one_instance_is_too_few_to_train_on(island: Case, instance: Instance, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="too few"):
+        train(island, "TO", [instance], tmp_path / "p.safetensors", TrainingOptions(epochs=1))
+
+
 def test_further_iterations_are_no_dearer(island: Case, instance: Instance) -> None:
     made = policy(island)
     own, further = (Schedule(made.knots, made.powers(instance, count)) for count in (0, 60))

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import PRICE
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.modal_grid import ModalGrid, Start
@@ -63,6 +64,8 @@ def train(
     Args:
         instances: choose the best weights and the margin, and are never trained on, but for islands.
     """
+    if options.model:
+        raise InputError("--model", options.model, f"{AdmmPolicy.method} is trained without a surrogate")
     if case.slack is None:
         return train_on_island(case, regime, instances, out, options)
     horizon = instances[0].horizon_s

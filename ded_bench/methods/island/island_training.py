@@ -50,6 +50,8 @@ def train(
     """
     if options.resume:
         raise InputError("--resume", "", "policies of islands train in minutes, and start anew")
+    if len(instances) < 2:
+        raise InputError("--limit", str(len(instances)), "is too few: one instance is held out")
     facts = options.facts() | {"rounds": 2, "iterations": ITERATIONS, "mending": MENDING}
     scope = Scope(case, regime, instances[0].horizon_s)
     held = min(HELD_OUT, len(instances) // 2)

@@ -110,11 +110,11 @@ def _place(method: str) -> int:
     return known.index(method) if method in known else len(known)
 
 
-def legend_below(figure: Figure, columns: int = 3) -> None:
+def legend_below(figure: Figure) -> None:
     """One legend under all panels, each label once, so that it never covers data; the figure grows by it."""
     unique = {
         label: line for ax in figure.axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
     if unique:
-        figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(unique) // columns))
-        figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=columns)
+        figure.set_figheight(figure.get_figheight() + 0.19 * -(-len(unique) // 3))
+        figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=3)

@@ -67,7 +67,7 @@ def cps1(t: Array, mean: Array) -> float:
         mean: frequency deviation, (n,), Hz.
     """
     steps = max(round(MINUTE_S / (t[1] - t[0])), 1)
-    starts = np.arange(max(round((len(t) - 1) / steps), 1)) * steps
+    starts = np.arange(max(int((len(t) - 1) / steps + 0.5), 1)) * steps
     minutes = np.add.reduceat(mean, starts) / np.diff(starts, append=len(mean))
     return float(100 * (2 - np.mean(minutes**2) / EPSILON_HZ**2))
 

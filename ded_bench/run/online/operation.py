@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, named
@@ -130,7 +131,7 @@ def operate(
         WorkersLostError: the workers cannot run this package.
     """
     table = results.table
-    todo = [o for o in operations if not table.made_from(o.row.key, o.row.fingerprint, o.row.method_version)]
+    todo = [o for o in operations if not _is_there(table, o.row)]
     with Workers(workers) as pool:
         if look_back:
             _look_back(case, operations, results, pool)
@@ -199,13 +200,19 @@ def _look_back(case: Case, asked_for: Sequence[Operation], results: OnlineResult
     wanted = [
         (scenario, HindsightRow(*key, **_made(case, key[2], scenario))) for key, scenario in asked.items()
     ]
-    missing = [one for one in wanted if not results.hindsight.made_from(one[1].key, one[1].fingerprint)]
+    missing = [one for one in wanted if not _is_there(results.hindsight, one[1])]
     calls = ((find_hindsight, (case, *one, results.files)) for one in missing)
     for (_, row), answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
     ):
         failed = dataclasses.replace(row, error=reason_of(answer))
         results.hindsight.add([answer if isinstance(answer, HindsightRow) else failed])
+
+
+def _is_there(table: KeyedTable[Any, Any], row: OnlineRow | HindsightRow) -> bool:
+    """Whether a row was made, by no older version, and did not fail."""
+    made = table.made_from(row.key, row.fingerprint, row.method_version)
+    return made and table.rows[row.key].objective is not None
 
 
 def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:

@@ -136,6 +136,8 @@ def test_minutes_of_known_frequency_have_a_known_cps1():
     quick = EPSILON_HZ * np.sin(2 * np.pi * t / 60)  # its means vanish
     assert cps1(t, quick) == pytest.approx(200.0, abs=1e-5)
     assert cps1(t[:1001], np.full(1001, EPSILON_HZ)) == pytest.approx(100.0)
+    last = np.where(t >= 120.0, 2 * EPSILON_HZ, 0.0)[:15001]  # half a minute is the third
+    assert cps1(t[:15001], last) == pytest.approx(100 * (2 - 4 / 3), abs=0.02)
 
 
 def test_hindsight_keeps_the_bounds_and_costs_no_more_than_who_keeps_them(island, scenario):

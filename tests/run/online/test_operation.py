@@ -126,6 +126,8 @@ def test_no_plan_is_no_result(threebus, scenarios, tmp_path, capsys):
     assert "every plan failed: KeyError: 'power' (faulty_methods.py, line" in said
     log = (tmp_path / "failures.log").read_text()
     assert "Traceback (most recent call last)" in log
+    assert main([*line, f"{FAULTY}:lost", "--latency", "0"]) == 1  # what failed is tried again
+    assert len((tmp_path / "failures.log").read_text()) > len(log)
     assert main([*line, f"{FAULTY}:lost"]) == 1
     assert "has no answer to any of them: KeyError" in capsys.readouterr().err
     assert main([*line, "ed"]) == 0

@@ -92,9 +92,8 @@ def _train_dpc(a: argparse.Namespace) -> int:
     with _missing_named():
         for method in methods:
             _ = method.train  # says if it is not trained
-    for method in methods if a.device != "cpu" else ():
-        if not method.takes_device:
-            raise InputError("--device", a.device, f"{method.name} is trained on the CPU alone")
+    if a.device != "cpu" and (others := [method.name for method in methods if not method.takes_device]):
+        raise InputError("--device", a.device, f"{others[0]} is trained on the CPU alone")
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
     if min(a.workers, len(jobs)) == 1:
         for job in jobs:

@@ -31,14 +31,14 @@ class TrainingRun(abc.ABC):
     """
 
     #: What a checkpoint holds beside the states of network, average, optimiser and generator.
-    progress: tuple[str, ...] = ("epoch", "step", "spent", "busy", "best", "best_weights", "history")
+    progress: tuple[str, ...] = ("of", "epoch", "step", "spent", "busy", "best", "best_weights", "history")
     clip_norm, average_decay = 1.0, 0.998  # of gradients; of the weights, exponentially
     looks = 40  # at the loss, at most
 
     def __init__(self, network: nn.Module, optimiser: torch.optim.Optimizer, seed: int, out: Path) -> None:
         self.network, self.optimiser, self.generator = network, optimiser, torch.Generator().manual_seed(seed)
         self.rates = [float(group["lr"]) for group in optimiser.param_groups]
-        self.out, self.average = out, copy.deepcopy(network)
+        self.of, self.out, self.average = ["", seed], out, copy.deepcopy(network)
         self.epoch, self.step, self.spent, self.busy = 0, 0, 0.0, 0.0
         self.best, self.best_weights = math.inf, copy.deepcopy(network.state_dict())
         self.history: list[dict[str, float]] = []
@@ -74,6 +74,7 @@ class TrainingRun(abc.ABC):
         Raises:
             InputError: the checkpoint is none, or one of another training.
         """
+        self.of = [title, options.seed]
         if options.resume and checkpoint_file(self.out).is_file():
             self.load()
         self._go(options.epochs or epochs, options.seconds, title)
@@ -150,6 +151,8 @@ class TrainingRun(abc.ABC):
         path = checkpoint_file(self.out)
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
+            if state["of"] != self.of:
+                raise ValueError("of another training")
             for name in ("network", "average", "optimiser"):
                 getattr(self, name).load_state_dict(state[name])
             for name in self.progress:

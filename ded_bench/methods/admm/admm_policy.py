@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,8 @@ class AdmmPolicy(TrainedPolicy):
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
     """The policy that answers."""
-    return (AdmmPolicy if case.slack is not None else IslandPolicy).artifacts(case, regime, settings)
+    own = replace(settings, model="")  # of others that are asked for along with it
+    return (AdmmPolicy if case.slack is not None else IslandPolicy).artifacts(case, regime, own)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
@@ -114,11 +115,11 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     Raises:
         InputError: there is no policy (names the command that trains one), or it does not fit.
     """
-    iterations = read_options(Options, settings.options).iterations
+    iterations, own = read_options(Options, settings.options).iterations, replace(settings, model="")
     if case.slack is None:
-        island = IslandPolicy.find(case, regime, settings)
+        island = IslandPolicy.find(case, regime, own)
         return as_solver(island, lambda instance: island.powers(instance, iterations), iterations)
-    policy = AdmmPolicy.find(case, regime, settings)
+    policy = AdmmPolicy.find(case, regime, own)
     further = policy.further(iterations) if iterations else None
 
     def answer(instance: Instance) -> Array:

@@ -165,14 +165,11 @@ class TrainingRun(abc.ABC):
 
 @contextlib.contextmanager
 def repeatable() -> Iterator[None]:
-    """Train so that results repeat: on one thread, from which these networks lose nothing.
-
-    On a GPU with algorithms that repeat, in full single precision: cuDNN's default rounds to ten bits.
-    """
+    """Train so that results repeat: on one thread, from which these networks lose nothing."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+        with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):  # 10 bits
             yield
     finally:
         torch.set_num_threads(threads)

@@ -11,7 +11,7 @@ import pandas as pd
 
 from ded_bench.analysis.certificate import Certificate, read_certificates
 from ded_bench.analysis.online_summary import online_rows, practice_rows
-from ded_bench.analysis.referee import REFEREE
+from ded_bench.analysis.referee import REFEREE, RefereeRow
 from ded_bench.analysis.reference import Paper, Reference, choose_reference, read_paper
 from ded_bench.analysis.summary import (
     gaps,
@@ -32,8 +32,8 @@ from ded_bench.problem.schedule import Trajectory
 from ded_bench.report.columns import TRAINING
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import OnlineResults
-from ded_bench.results.rows import VALIDATED, Key, Results, reference_objectives
-from ded_bench.results.timing import TIMING, timing_summary
+from ded_bench.results.rows import VALIDATED, Key, Results, Row, reference_objectives
+from ded_bench.results.timing import TIMING, TimingRow, timing_summary
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,15 +138,19 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     rows, left_out = newest(ours)
     notes += left_out
     reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
-    made_by = {key: row.method_version for key, row in results.rows.items()}  # else it was another answer
-    validated = [r for r in VALIDATED.existing(paths.validated) if made_by.get(r.key[0]) == r.method_version]
-    refereed = [r for r in REFEREE.existing(paths.referee) if made_by.get(r.key) == r.method_version]
+    newest_of = everything.groupby("method")["method_version"].max().to_dict()
+
+    def is_of_today(
+        one: Row | RefereeRow | TimingRow,
+    ) -> bool:  # else it is about other answers; 0 is unknown
+        return one.method_version in (0, newest_of.get(one.method, one.method_version))
+
     judgements: dict[str, dict[Key, bool | None]] = {
-        "validated": {row.key[0]: row.feasible for row in validated},
-        "confirmed": {row.key: row.confirmed for row in refereed},
+        "validated": {r.key[0]: r.feasible for r in filter(is_of_today, VALIDATED.existing(paths.validated))},
+        "confirmed": {r.key: r.confirmed for r in filter(is_of_today, REFEREE.existing(paths.referee))},
     }
     rows = judged_elsewhere(gaps(rows, reference.objectives), judgements)
-    calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id]
+    calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
         case=case,

@@ -74,7 +74,9 @@ def finished(ninebus: Case, problems: Path, tmp_path_factory: pytest.TempPathFac
     timed = TimingRow("run", 1, "TO", "ded", "default", "9bus-0000", "Optimal", solve_s=3.5, host="h")
     timed = dataclasses.replace(timed, case="9bus", problems_version=version, load_average=0.9)
     results.pack()
-    TIMING.write(results.paths.timing, [timed, dataclasses.replace(timed, case="other", solve_s=99.0)])
+    other = {"case": "other", "solve_s": 99.0}
+    stale = {"method": "ded-ko", "model": models["ded-ko"], "method_version": 2, "solve_s": 9.0}
+    TIMING.write(results.paths.timing, [timed, *(dataclasses.replace(timed, **d) for d in (other, stale))])
     return results.folder
 
 
@@ -151,6 +153,7 @@ def test_table_v_is_what_the_rows_say(report, finished: Path) -> None:
     assert made.loc[("NO", "ded-ko"), ["n", "failures", "model"]].to_list() == [TEST - 1, 1, "koopman"]
     assert made.loc[("TO", "ded"), "solve_s"] == 3.5  # of this case, not of the other one
     assert np.isnan(made.loc[("NO", "ded"), "solve_s"])
+    assert np.isnan(made.loc[("TO", "ded-ko"), "solve_s"])  # of another version's answers
     assert made.loc[("NO", "ded-dpc"), "n"] == 0  # not run
     assert made["paper_solve_s"].notna().all()
 

@@ -105,7 +105,6 @@ def solve(
         InputError: unknown method, regime, settings or case, or a model or policy that is missing.
     """
     own = _case_of(instance, case)
-    own.check_regimes([regime])
     instance.check_case(own)
     return _prepared(own, method, regime, settings)(instance)
 

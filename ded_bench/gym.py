@@ -84,8 +84,8 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         self.regime, self.plant = regime, plant_of(self.case, plant)
         self._bounds = self.case.bounds(regime)
         ranges = self.case.sampling
-        self._points = max(round(STEP_S / ranges.dt_s), 1)
-        step_cost = self._points * float(np.mean(ranges.cost)) * float(np.abs(self.case.load_nominal).sum())
+        drawn = float(np.abs(self.case.load_nominal).sum())
+        step_cost = max(round(STEP_S / ranges.dt_s), 1) * float(np.mean(ranges.cost)) * drawn
         largest_hz = self.case.regimes[regime].largest_hz
         self.price = step_cost / largest_hz if price is None else price
         self.action_space = Box(-1.0, 1.0, (len(self.case.generators),), np.float32)
@@ -120,7 +120,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         self._run: History
         self.instance, self._run = self._drawn(master) if given is None else (given, self._begun(given))
         self._cost = self.instance.cost_gen(self.case), self.instance.cost_slack(self.case)
-        self._knots = [0]
+        self._knots, self._points = [0], max(round(STEP_S / self.instance.dt_s), 1)
         return self._observation(), {"instance": self.instance}
 
     def step(self, action: NDArray[np.floating]) -> tuple[Observed, float, bool, bool, dict[str, Any]]:

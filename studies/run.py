@@ -3,15 +3,16 @@
     python studies/run.py report --case 39bus --limit 4
     python studies/run.py online --case 9bus --list
 
-A file has a list for each step: commands, and names of other steps, which come first and only once. A
-command is a table of its options by name; those that all commands share are added here. A file takes the
-steps that it does not list from its `base`, `default.toml` unless it says so; grids without a file have that
-one. Entries with `when = "train"` run only if `--train` is given, those with `when = "policies"` also where
-the results folder or the case's reference run has trained policies. The first command that fails ends it, as
-in make.
+A file has a list for each step: commands, and names of other steps, which come first and only once. A command
+is a table of its options by name; those that all commands share are added here. A file takes the steps that
+it does not list from its `base`, `default.toml` unless it says so; grids without a file have that one,
+islands `island.toml`. Entries with `when = "train"` run only if `--train` is given, those with `when =
+"policies"` also where the results folder or the case's reference run has trained policies. The first command
+that fails ends it, as in make.
 """
 
 import argparse
+import json
 import shlex
 import subprocess
 import sys
@@ -38,12 +39,20 @@ BUDGETS = ("seconds", "epochs")
 Entry = dict[str, Any]
 
 
+def runs_of(case: str) -> str:
+    """The name of a grid's file in `runs/`."""
+    if (RUNS / f"{Path(case).name}.toml").exists():
+        return Path(case).name
+    places = Path(case), RUNS.parents[1] / "problems" / case
+    data = next((json.loads(p.read_text()) for p in (q / "case.json" for q in places) if p.is_file()), {})
+    return "island" if data.get("plant", {}).get("slack") == "island" else "default"
+
+
 def read_steps(name: str) -> dict[str, list[str | Entry]]:
     """The steps of a file in `runs/`, with those of its base where it lists none."""
-    path = RUNS / f"{name}.toml"
-    steps = tomllib.loads((path if path.exists() else RUNS / "default.toml").read_text(encoding="utf-8"))
+    steps = tomllib.loads((RUNS / f"{name}.toml").read_text(encoding="utf-8"))
     base = steps.pop("base", "default")
-    return steps if path.stem == "default" or not path.exists() else read_steps(base) | steps
+    return steps if name == "default" else read_steps(base) | steps
 
 
 def entries(steps: dict[str, list[str | Entry]], step: str, holds: dict[str, bool]) -> Iterator[Entry]:
@@ -106,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     trained = [Path(asked.results, "policies"), Path(f"results/{name}-reference/policies")]
     holds = {"train": bool(asked.train)}
     holds["policies"] = holds["train"] or any(folder.is_dir() for folder in trained)
-    road = list(entries(read_steps(asked.runs or name), asked.step, holds))
+    road = list(entries(read_steps(asked.runs or runs_of(asked.case)), asked.step, holds))
     for number, entry in enumerate(road, start=1):
         words = command_line(entry, asked)
         print("" if asked.list else f"[{number} of {len(road)}] ", shlex.join(words), sep="", flush=True)

@@ -54,7 +54,7 @@ def as_scenario(case: Case, instance: Instance) -> Scenario:
     """The same loads, known to everyone."""
     still = Fluctuation(step_s=2 * instance.horizon_s, values=(0.0, 0.0), decay_s=1.0)
     load = {}
-    for bus, ramp in zip(case.loads, instance.ramps(case), strict=True):
+    for bus, ramp in instance.load.items():
         values = {"start": ramp.start, "duration": ramp.duration, "rate": ramp.rate}
         known = ScenarioRamp(**values, announced_start=ramp.start, announced_rate=ramp.rate)
         load[bus] = ScenarioLoad(initial=ramp.initial, ramps=(known,), fluctuation=still)

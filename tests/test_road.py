@@ -33,7 +33,7 @@ STEPS = (
     "certify",
 )
 PARSER = functools.cache(cli.parser)
-GRIDS = ("9bus", "two-area", "39bus", "68bus", "140bus", "elsewhere/mine")
+GRIDS = ("9bus", "two-area", "39bus", "68bus", "140bus", "39bus-agc", "elsewhere/mine")
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +86,11 @@ def test_every_command_is_understood(case: str) -> None:
             if command[0] in ("solve", "online"):
                 (name,) = asked.method
                 METHODS[name].canonical(Settings(asked.set))
+
+
+def test_methods_that_refuse_islands_are_not_on_their_road() -> None:
+    methods = {name for name, _, _ in solved(commands("report", "two-area-agc"))}
+    assert methods == {"ed", "ded-slp", "ded-rti", "ded-ko-knots", "ded-admm"}
 
 
 def test_the_smaller_limit_counts() -> None:

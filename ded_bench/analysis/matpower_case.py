@@ -1,4 +1,4 @@
-"""A lossless case (case/2) of a MATPOWER grid and its machines' dynamics, by the rules of docs/grids.md.
+"""A lossless case (case/2) of a MATPOWER grid and its machines' dynamics, by the rules of docs/grid_data.md.
 
 A MATPOWER file is parsed, never executed.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import string
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -265,7 +264,7 @@ def _units(
         if number == grid.reference:  # elsewhere the power flow keeps them, but for round-off
             p[0] += float(total.real) - sum(p)
         for k, (one, row) in enumerate(zip(own, rows, strict=False)):
-            letter = string.ascii_lowercase[k] if len(rows) > 1 else ""
+            letter = chr(ord("a") + k) if len(rows) > 1 else ""
             power = complex(p[k], float(total.imag) * rating[k] / sum(rating))
             ends = (one.p_min, row[9]), (one.p_max, row[8])
             low, high = (float(p) / BASE_MVA if own is None else own for own, p in ends)
@@ -313,7 +312,7 @@ def _record(
         f"regimes and sampling as in {like.id}",
     }
     kept = {"f0_hz", "ramp_pu_per_s", "regimes", "sampling"}
-    data: dict[str, Any] = {"schema": like.schema_, "id": name, "source": source}
+    data: dict[str, Any] = {"schema": "ded-bench/case/2", "id": name, "source": source}
     data |= json.loads(like.model_dump_json(by_alias=True, include=kept))
     return data | {"buses": buses, "lines": lines, "machines": machines}
 

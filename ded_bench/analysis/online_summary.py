@@ -56,7 +56,9 @@ def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     frame["minutes"] = minutes.where(minutes > 0, minutes[minutes > 0].min())
     frame = frame[frame["cps1"].notna() | frame["objective"].isna()].reset_index(drop=True)
     place = ["regime", "scenario", "forecast", "plant"]
-    practice = frame[(frame["method"] == PRACTICE[0]) & (frame["settings"] == PRACTICE[1])]
+    is_practice = (frame["method"] == PRACTICE[0]) & (frame["settings"] == PRACTICE[1])
+    practice = frame[is_practice & (frame["period_s"] == 60) & frame["warm"].astype(bool)]
+    practice = practice.sort_values("latency_s", ascending=False, kind="stable")  # the least counts
     found = practice.drop_duplicates(place, keep="last").set_index(place)
     names = ["objective", "mean_freq_max_hz", "agc_travel_pu"]
     return frame.join(found[names].add_prefix("practice_"), on=place)
@@ -85,9 +87,10 @@ def _predicted(results: OnlineResults, case: str) -> pd.DataFrame:
     """Rows of a case whose plans started from the state when they took effect, in the order of the table."""
     rows = list(results.table.rows.values())
     frame = named(ONLINE.frame(rows).assign(key=pd.Series([row.key for row in rows], dtype=object)))
+    frame = frame[frame["predicted"].astype(bool) & (frame["case"] == case)]
     dated = frame.sort_values("date", kind="stable")  # only the newest model and policy of a line count
-    is_new = dated["made_with"] == dated.groupby([*GROUP, "plant"])["made_with"].transform("last")
-    return frame[is_new & frame["predicted"].astype(bool) & (frame["case"] == case)].reset_index(drop=True)
+    is_new = dated["made"] == dated.groupby([*GROUP, "plant", "forecast"])["made"].transform("last")
+    return dated[is_new].sort_index().reset_index(drop=True)
 
 
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:

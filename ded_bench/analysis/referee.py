@@ -147,7 +147,7 @@ def speeds(python: str, grid: Mapping[str, Any], run: Mapping[str, Any]) -> tupl
 
     Raises:
         InputError: there is no such interpreter, or it has no ANDES.
-        SimulationError: ANDES finds no equilibrium, or no solution later.
+        SimulationError: ANDES finds no equilibrium or no later solution, or was killed.
     """
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as folder:
         place, asked = Path(folder) / "speeds.npy", json.dumps({"grid": grid, "run": run})
@@ -161,6 +161,8 @@ def speeds(python: str, grid: Mapping[str, Any], run: Mapping[str, Any]) -> tupl
             if last.startswith("ModuleNotFoundError"):
                 hint = "skipped; `pip install andes` there, or name another by --python"
                 raise InputError(python, "", f"has no ANDES ({last}): {hint}")
+            if done.returncode < 0:  # it was killed, perhaps for its memory: others may have an answer
+                raise SimulationError(f"ANDES was ended by signal {-done.returncode}")
             raise InputError(python, "", f"ANDES ended without an answer ({last})")
         answer = json.loads(done.stdout)
         if answer["error"]:
@@ -179,7 +181,7 @@ def referee(
 ) -> list[RefereeRow]:
     """Run kept schedules of a results folder through ANDES; each is saved in `referee.csv` at once.
 
-    What stands there already, of the same schedule on the same grid, is not run again.
+    An answer that stands there already, of the same schedule on the same grid, is not asked for again.
 
     Args:
         case: of the rows.
@@ -207,7 +209,7 @@ def referee(
         facts = f"{row.fingerprint} {case.detailed.fingerprint}".encode()
         judged_on = facts + schedule.t.tobytes() + schedule.p.tobytes()
         name = hashlib.sha256(judged_on).hexdigest()[:12]
-        if table.made_from(row.key, name):
+        if table.made_from(row.key, name) and not table.rows[row.key].error:
             found.append(table.rows[row.key])
         else:
             todo.append((row, schedule, name))

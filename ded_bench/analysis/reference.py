@@ -111,7 +111,7 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
         line = ours.get(key) or head(key[0], key[1:]) | statistics(rows[:0])
         timed = times.get(key, {})
         line["is_reference"] = (key[1], key[2]) == (reference, DEFAULT)
-        line["solve_s"], line["timing_failures"] = timed.get("solve_s", math.nan), timed.get("failures", 0)
+        line["solve_s"], line["timing_failures"] = timed.get("time_s", math.nan), timed.get("failures", 0)
         line["increase_percent"] = math.nan if line["is_reference"] else line["gap_percent_mean"]
         for name in PaperRow.model_fields:
             number = getattr(beside.get(key), name, None)

@@ -32,15 +32,17 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _number(kind: Callable[[str], float], least: float, said: str) -> Callable[[str], Any]:
-    """What reads a finite number of at least `least`."""
+def _number(
+    kind: Callable[[str], float], low: float, said: str, top: float = math.inf
+) -> Callable[[str], Any]:
+    """What reads a finite number from `low` to `top`."""
 
     def read(text: str) -> float:
         try:
             value = kind(text)
         except ValueError:
             value = -1
-        if not least <= value < math.inf:
+        if not (low <= value <= top and value < math.inf):
             raise argparse.ArgumentTypeError(f"{text!r} is not {said}")
         return value
 
@@ -49,8 +51,9 @@ def _number(kind: Callable[[str], float], least: float, said: str) -> Callable[[
 
 natural = _number(int, 0, "a whole number")
 positive = _number(int, 1, "a whole number of at least 1")
-not_negative = _number(float, 0, "a number of at least 0")
-positive_number = _number(float, sys.float_info.min, "a number above 0")
+not_negative = _number(float, 0, "a number from 0 to 1e6", 1e6)
+share = _number(float, sys.float_info.min, "a number above 0, below 1", 1.0 - 1e-9)
+positive_number = _number(float, sys.float_info.min, "a number above 0, at most 1e6", 1e6)
 
 #: Options that commands share (see `declare`).
 SHARED: dict[str, dict[str, Any]] = {

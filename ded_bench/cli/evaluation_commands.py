@@ -15,6 +15,7 @@ from ded_bench.cli.arguments import (
     positive,
     positive_number,
     say,
+    share,
 )
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method, registered
@@ -43,7 +44,7 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--count", type=positive, default=10_000, metavar="M", help="how many fresh instances")
     p.add_argument("--gap", type=positive_number, default=1.0, metavar="PERCENT", help="over ded-ko-knots")
     p.add_argument("--tolerance", type=positive_number, default=1e-6, metavar="HZ", help="of the frequency")
-    p.add_argument("--delta", type=positive_number, default=0.01, help="1 - confidence")
+    p.add_argument("--delta", type=share, default=0.01, help="1 - confidence")
     p.set_defaults(run=_certify)
 
     p = command(commands, "compare", "what changed between two results folders")
@@ -109,8 +110,8 @@ def _bench(a: argparse.Namespace) -> int:
         problems_version=chosen.version,
     )
     for row in timing_summary(rows).to_dict("records"):
-        timed = row["solve_s"] == row["solve_s"]
-        said = f"{row['solve_s']:.6f} s, {row['repeats']} rounds" if timed else row["error"]
+        timed = row["time_s"] == row["time_s"]
+        said = f"{row['time_s']:.6f} s, {row['repeats']} rounds" if timed else row["error"]
         name = f"{row['method']:<16} {row['settings']:<12} {row['model']:<12} {row['regime']:<4}"
         print(f"{name} {said}", flush=True)
     return 1 if any(row.status == Status.FAILED for row in rows) else 0

@@ -21,9 +21,10 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method
-from ded_bench.plants.plant import PLANTS
+from ded_bench.plants.plant import PLANTS, plant_of
 from ded_bench.problem.benchmark import problem_folder, scenario_files
 from ded_bench.problem.case import Case
+from ded_bench.problem.instance import check_plausible
 from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders
 
@@ -75,6 +76,9 @@ def _online(a: argparse.Namespace) -> int:
     folder = a.out or default_results(case)
     files = a.scenario or scenario_files(problem_folder(a.case, case) / "scenarios", a.scenarios)
     scenarios = load_scenarios(files, case)
+    for file, scenario in zip(a.scenario or (), scenarios, strict=False):  # the tests check those shipped
+        check_plausible(case, first := scenario.snapshot(case, 0.0), file)
+        plant_of(case, a.plant).check_servable(first, str(file))
     if "timing" in a.latency and not _timed(a, case, search_folders(case, folder)):
         return 1
     operations = _operations(a, case, folder, scenarios)
@@ -120,12 +124,12 @@ def _operations(
 def _timed(a: argparse.Namespace, case: Case, search: tuple[Path, ...]) -> bool:
     """Time methods whose times no results folder has; whether all have an answer to be timed."""
     from ded_bench.run.bench import FEW, Job, measure
-    from ded_bench.run.online.operation import timed_job, timed_latency
+    from ded_bench.run.online.operation import timed_latency
 
     case.check_regimes(a.regime or ())
     for (name, settings), regime in itertools.product(chosen_methods(a, search), a.regime or case.regimes):
         try:
-            timed_latency(case, timed_job(case, get_method(name), regime, settings), search)
+            timed_latency(case, get_method(name), regime, settings, search)
         except InputError:
             say(f"{name} {regime} is not timed yet: its latency is measured on {FEW} drawn instances first")
             rows = measure(case, Job(name, regime, settings), ResultsFolder(search[0]).latency)

@@ -128,7 +128,8 @@ def _solve(a: argparse.Namespace) -> int:
 
     tell_solved(case, a.case, results, rows, sys.stderr if a.instance else sys.stdout)
     print(f"{counted(len(rows), 'row')} in {results.path} ({len(finished)} there already)", file=sys.stderr)
-    return 1 if any(row.status == Status.FAILED for row in rows) else 0
+    unanswered = Status.INFEASIBLE, Status.TIME_LIMIT  # results, too
+    return 1 if any(row.objective is None and row.status not in unanswered for row in rows) else 0
 
 
 def _score(a: argparse.Namespace) -> int:
@@ -225,9 +226,9 @@ def _reproduce(a: argparse.Namespace) -> int:
 
     found = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
     print(found.replace({"model": {"": "-"}}).to_string(index=False, float_format="{:.1e}".format))
-    differ = found["differ"].sum()
-    print(f"{counted(int(found['rows'].sum()), 'row')} solved again, {differ} differ")
-    return 1 if differ else 0
+    count, differ = int(found["rows"].sum()), int(found["differ"].sum())
+    print(f"{counted(count, 'row')} solved again, {differ} differ")
+    return 1 if differ or not count else 0
 
 
 def _referee(a: argparse.Namespace) -> int:
@@ -255,7 +256,7 @@ def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]
     if a.instance:
         chosen = _chosen(a)
         return results, chosen.case, {instance.id: instance for instance, _ in chosen.instances}
-    named = {row.case for row in results.rows.values()}
+    named = {row.case for row in results.rows.values()} - {""}
     if not a.case and len(named) != 1:
         raise InputError(results.path, "case", f"rows of {len(named)} cases: choose one by --case")
     place = a.case or named.pop()

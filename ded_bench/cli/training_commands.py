@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -95,17 +96,20 @@ def _train_dpc(a: argparse.Namespace) -> int:
     if a.device != "cpu" and (others := [method.name for method in methods if not method.takes_device]):
         raise InputError("--device", a.device, f"{others[0]} is trained on the CPU alone")
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")
-    if min(a.workers, len(jobs)) == 1:
-        for job in jobs:
-            print(_train_one(a, *job), flush=True)
+    if len(jobs) == 1:  # what stops it is the command's
+        print(_train_one(a, *jobs[0]), flush=True)
         return 0
-    failures = 0
+    code = 0
     with Workers(min(a.workers, len(jobs))) as pool:
         for job, said in pool.imap(((_train_one, (a, *job)) for job in jobs), jobs):
-            told = said if isinstance(said, str) else f"{' '.join(job)}: {reason_of(said)}"
-            failures += not isinstance(said, str)
-            print(told, flush=True)
-    return 1 if failures else 0
+            if isinstance(said, str):
+                print(said, flush=True)
+                continue
+            is_input = isinstance(said, InputError)
+            code = max(code, 2 if is_input else 1)
+            told = f"{' '.join(job)}: {said if is_input else reason_of(said)}"
+            print(f"ded-bench: {told}", file=sys.stderr, flush=True)
+    return code
 
 
 def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:

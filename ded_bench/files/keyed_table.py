@@ -75,7 +75,7 @@ class KeyedTable(Generic[K, T]):
     def add(self, rows: Iterable[T]) -> None:
         """Save rows at once, replacing those with the same key; other processes' rows are kept."""
         rows = list(rows)
-        with self.locked():
+        with locked(self.path.parent):
             self.reload()
             if self._mark is None or not set(self._table.names) <= set(self._header):
                 self._take(rows)
@@ -93,7 +93,7 @@ class KeyedTable(Generic[K, T]):
 
     def compact(self) -> None:
         """Leave one line per key."""
-        with self.locked():
+        with locked(self.path.parent):
             self.reload()
             if self._superseded:
                 self._write_all()
@@ -130,13 +130,14 @@ class KeyedTable(Generic[K, T]):
         self._header, self._superseded = self._table.names, 0
         self._mark, self._end = _mark(self.path.stat()), len(data)
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other processes from writing to the folder; not to be nested."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path.parent / ".lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield  # closing the file releases the lock
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing to tables of a folder; not to be nested."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / ".lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield  # closing the file releases the lock
 
 
 def _mark(found: os.stat_result) -> tuple[int, int, int]:

@@ -68,6 +68,7 @@ class _SimulationLayer(torch.autograd.Function):
         return tuple(torch.from_numpy(values).to(power) for values in found)
 
     @staticmethod
+    @torch.autograd.function.once_differentiable  # else second derivatives would be zero
     def backward(ctx: Any, *by: torch.Tensor) -> tuple[torch.Tensor, None]:
         given = tuple(part.detach().double().cpu().numpy() for part in by)
         found = ctx.batch.gradient(ctx.runs, ctx.power, given)

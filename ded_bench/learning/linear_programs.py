@@ -55,7 +55,6 @@ def export_programs(
         InputError: unknown method, regime or settings, or the method solves no linear programs.
         SimulationError: the plant cannot follow.
     """
-    case.check_regimes([regime])
     own = settings or Settings()
     own = own if own.search else replace(own, search=search_folders(case))
     options, arrays, now = options or LoopOptions(), {}, 0.0

@@ -54,7 +54,7 @@ class Options:
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
-    case.check_regimes([regime])
+    lossless(case)  # says if it has another network
     options = read_options(Options, settings.options)
     solve = _accelerated if options.accelerated else _solve
     return functools.partial(solve, case, regime, settings.time_limit_s)

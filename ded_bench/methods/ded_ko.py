@@ -54,7 +54,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     Raises:
         InputError: the case is an island; or the solver wants a lifted model, and this surrogate is none.
     """
-    case.check_regimes([regime])
     if case.slack is None:
         raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
     surrogate = find_surrogate(case, settings.model or "koopman", settings.search)

@@ -27,7 +27,6 @@ VERSION = 1
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances on the surrogate that the settings name."""
-    case.check_regimes([regime])
     surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
     return KnotSolver(case, surrogate, regime, settings.time_limit_s)
 
@@ -41,10 +40,6 @@ class KnotSolver:
     regime: str
     time_limit_s: float | None = None
 
-    def __call__(self, instance: Instance) -> Solution:
-        """Solve one instance; `Infeasible` comes without a schedule."""
-        return self._solution(instance, soft=False)
-
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
 
@@ -52,9 +47,10 @@ class KnotSolver:
             instance: what to solve.
             last: of no meaning here.
         """
-        return self._solution(instance, soft=True)
+        return self(instance, soft=True)
 
-    def _solution(self, instance: Instance, soft: bool) -> Solution:
+    def __call__(self, instance: Instance, soft: bool = False) -> Solution:
+        """Solve one instance; `Infeasible` comes with a schedule if `soft`."""
         points, bounds = case_knots(self.case, instance), self.case.bounds(self.regime)
         return solve_on_surrogate(
             self.case, self.surrogate, instance, bounds, points, self.time_limit_s, soft

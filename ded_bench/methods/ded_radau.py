@@ -56,7 +56,6 @@ class Options:
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one program per process serves them all."""
-    case.check_regimes([regime])
     length_s = read_options(Options, settings.options).element_s
     if case.plant_name == "detailed":
         return functools.partial(_on_detailed, case, regime, length_s or DETAILED_S, settings.time_limit_s)

@@ -53,7 +53,6 @@ NEAR_S = 30.0
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
-    case.check_regimes([regime])
     surrogate = find_surrogate(case, settings.model or TRAJECTORY, settings.search)
     return RealTimeSolver(case, surrogate, regime, settings.time_limit_s)
 

@@ -54,7 +54,6 @@ class Options:
 
 def prepare(case: Case, regime: str, settings: Settings) -> SlpSolver:
     """Return a solver of single instances, which may start from an earlier solution."""
-    case.check_regimes([regime])
     return SlpSolver(case, regime, read_options(Options, settings.options), settings.time_limit_s)
 
 
@@ -67,10 +66,6 @@ class SlpSolver:
     options: Options = Options()
     time_limit_s: float | None = None
 
-    def __call__(self, instance: Instance) -> Solution:
-        """Solve from the static dispatch of every second."""
-        return self._solution(instance, None, soft=False)
-
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule of least frequency excess.
 
@@ -78,9 +73,10 @@ class SlpSolver:
             instance: what to solve.
             last: its schedule, if it has one, is where to start; its time is the instance's.
         """
-        return self._solution(instance, last.schedule if last is not None else None, soft=True)
+        return self(instance, last.schedule if last is not None else None, soft=True)
 
-    def _solution(self, instance: Instance, near: Schedule | None, soft: bool) -> Solution:
+    def __call__(self, instance: Instance, near: Schedule | None = None, soft: bool = False) -> Solution:
+        """Solve from a schedule; None: the static dispatch of every second. See `solve` for `soft`."""
         started = time.perf_counter()
         deadline = started + (np.inf if self.time_limit_s is None else self.time_limit_s)
         points = case_knots(self.case, instance, self.options.knot_s)
@@ -145,11 +141,12 @@ class _OnPlant:
         """What to claim at the end: the confirmed schedule, the best one, or that of least excess."""
         if end.status == Status.OPTIMAL and end.followed is not None:
             return end.status, self._schedule(end.followed.at)
-        if end.status == Status.INFEASIBLE:
+        best = None if self.best is None else self._schedule(self.best.at)
+        if end.status == Status.INFEASIBLE and (self.soft or best is None):
             nearest = end.answer.wanted if self.soft and end.answer is not None else None
             return end.status, None if nearest is None else self._schedule(nearest)
-        best = None if self.best is None else self._schedule(self.best.at)
-        return (Status.FEASIBLE if best and end.status == Status.FAILED else end.status), best
+        is_over = end.status in (Status.FAILED, Status.INFEASIBLE)
+        return (Status.FEASIBLE if best and is_over else end.status), best
 
     def _schedule(self, p_gen: Array) -> Schedule:
         return Schedule(t=self.instance.grid[self.points], p=p_gen)

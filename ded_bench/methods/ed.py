@@ -52,7 +52,6 @@ class Options:
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a dispatcher of single instances; both regimes get the same schedules."""
-    case.check_regimes([regime])
     options = read_options(Options, settings.options)
     if options.lead and case.slack is not None:
         raise InputError("--set", "lead", f"needs an island; case {case.id} has a slack")

@@ -327,9 +327,7 @@ class KnotProgram:
         """A program with room to follow ramps at the next knots, and where its columns stand then."""
         mean = float(np.mean(list(self._instance.cost.values())))
         shortage = room.price * mean * knot_weights(self.model.lengths)[1:] / room.limit
-        points, x = self.model.points[1:], self._columns.u  # no surprise asks for ω
-        if isinstance(self.model.speed, slice):
-            x = self._columns.x[:, self.model.speed]
+        points, x = self.model.points[1:], self._columns.x[:, self.model.speed]
         at = self.model.p_gen[1:], self.model.omega[points]
         return room.required(form, (place[self._columns.u], place[x]), at, excess, shortage)
 

@@ -46,7 +46,7 @@ def case_knots(case: Case, instance: Instance, distance_s: float | None = None) 
     """Grid points of the case's knots, or of those at a distance, and of times of secondary control."""
     horizon_s, times = instance.horizon_s, case.knot_times(instance.horizon_s)
     if distance_s is not None:
-        times = np.linspace(0.0, horizon_s, round(horizon_s / distance_s) + 1)
+        times = np.linspace(0.0, horizon_s, max(round(horizon_s / distance_s), 1) + 1)
     return knot_points(np.concatenate([times, control_times(case, instance)]), instance.dt_s)
 
 

@@ -20,7 +20,7 @@ from ded_bench.files.errors import InputError
 #: The text of options that are all as declared.
 DEFAULT = "default"
 _TRUE, _FALSE, _NONE = "on", "off", "none"
-_KINDS = {bool: f"{_TRUE} or {_FALSE}", int: "a whole number", float: "a number"}
+_KINDS = {bool: f"{_TRUE} or {_FALSE}", int: "a whole number", float: "a number", str: "text without slashes"}
 
 T = TypeVar("T")
 
@@ -90,7 +90,7 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
     try:
         value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
         is_number = kind in (int, float)
-        fits = lowest <= value and math.isfinite(value) if is_number else True
+        fits = lowest <= value and math.isfinite(value) if is_number else not set(text) & set("/\\")
         if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):

@@ -68,8 +68,9 @@ class Method:
         """Return the function that solves one instance after another.
 
         Raises:
-            InputError: unknown options, or a model or policy that does not fit.
+            InputError: unknown regime or options, or a model or policy that does not fit.
         """
+        case.check_regimes([regime])
         solver: Solver = self._answering.prepare(case, regime, self.canonical(settings))
         return solver
 

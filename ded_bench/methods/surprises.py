@@ -68,7 +68,7 @@ class Surprises:
         self._forget()
 
     def _forget(self) -> None:
-        self.now_s, self._planned_s, self._between_s = 0.0, 0.0, OLD_S
+        self.now_s, self._given_s, self._planned_s, self._between_s = 0.0, 0.0, 0.0, OLD_S
         self._forecast: Instance | None = None  # that of the last plan
         self._known: set[tuple[int, int]] = set()  # stretches and loads whose ramp is known
         self._present, self._ramps = None, np.zeros(len(self._case.loads), dtype=bool)
@@ -83,9 +83,9 @@ class Surprises:
         passed = None if self._schedule is None else passed_s(instance, in_force, self._schedule)
         if passed is None:
             self._forget()
-        self.now_s += passed or 0.0
+        before, self.now_s = self.now_s, self._given_s + (passed or 0.0)
         self._between_s = min(passed or OLD_S, OLD_S)
-        self._look(instance, passed or 0.0)
+        self._look(instance, self.now_s - before)
         later = {
             bus: _delayed(instance.load[bus], at, WAIT_S - at, instance.horizon_s)
             for bus, (at, _) in zip(self._case.loads, self._next, strict=True)
@@ -127,8 +127,10 @@ class Surprises:
         return bool(np.abs(change).max() > self._slow)
 
     def keep(self, schedule: Schedule | None, made_for: Instance | None = None) -> None:
-        """Remember the plan that is given, and what it was made for, if it is a new one."""
-        self._schedule = schedule
+        """Remember the plan that is given, and what it was made for, if it is new; of no plan, nothing."""
+        if schedule is None:
+            return
+        self._schedule, self._given_s = schedule, self.now_s
         if made_for is not None:
             self._forecast, self._planned_s = made_for, self.now_s
 

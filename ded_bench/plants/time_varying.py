@@ -194,12 +194,8 @@ class TimeVarying:
 
         Args:
             cost: of the generators, shape (n_gen,).
-
-        Raises:
-            ValueError: the set-points are delivered.
         """
-        if self.delivered is None:
-            raise ValueError("the set-points are delivered")
+        assert self.delivered is not None  # else its caller has another way
         on_state, on_input = (np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2])
 
         length, count = self.lengths[:, None], self.lengths[:, None].copy()

@@ -299,7 +299,7 @@ def _record_of(text: str) -> type[Case]:
         data = json.loads(text)
     except (ValueError, RecursionError):
         data = None
-    schema = data.get("schema") if isinstance(data, dict) else None
+    schema = str(data.get("schema")) if isinstance(data, dict) else ""
     record: type[Case] = pkgutil.resolve_name(SCHEMAS[schema if schema in SCHEMAS else min(SCHEMAS)])
     return record
 

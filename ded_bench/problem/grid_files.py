@@ -16,7 +16,7 @@ from pydantic import Field, WrapValidator, model_validator
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, of_kind, parse_record, read_text
-from ded_bench.problem.quantities import SMALLEST, Magnitude, Name, NonNegative, Number, Positive
+from ded_bench.problem.quantities import SMALLEST, Magnitude, Name, NonNegative, Number, Positive, TimeConst
 
 BASE_MVA = 100.0
 GRID_FILES = NETWORK_FILE, MACHINES_FILE = "network.json", "machines.json"
@@ -114,9 +114,9 @@ def _of_its_model(*kinds: type[Record]) -> WrapValidator:
     by_model = {kind.__name__.upper(): kind for kind in kinds}
 
     def choose(value: dict[str, Any]) -> type[Record]:
-        if value.get("model") not in by_model:
+        if (model := str(value.get("model"))) not in by_model:
             raise ValueError(f"model: must be one of {', '.join(by_model)}")
-        return by_model[value["model"]]
+        return by_model[model]
 
     return of_kind(choose, *kinds)
 
@@ -127,8 +127,8 @@ class Sexs(Record):
     model: Literal["SEXS"]
     k: Positive
     ta: NonNegative
-    tb: Positive
-    te: Positive
+    tb: TimeConst
+    te: TimeConst
 
 
 class Ieeex1(Record):
@@ -136,11 +136,11 @@ class Ieeex1(Record):
 
     model: Literal["IEEEX1"]
     ka: Positive
-    ta: Positive
-    te: Positive
+    ta: TimeConst
+    te: TimeConst
     ke: Number
     kf: NonNegative
-    tf: Positive
+    tf: TimeConst
 
 
 class St2cut(Record):
@@ -148,11 +148,11 @@ class St2cut(Record):
 
     model: Literal["ST2CUT"]
     ks: Number
-    tw: Positive
+    tw: TimeConst
     t1: NonNegative
-    t2: Positive
+    t2: TimeConst
     t3: NonNegative
-    t4: Positive
+    t4: TimeConst
 
 
 class Tgov1(Record):
@@ -160,9 +160,9 @@ class Tgov1(Record):
 
     model: Literal["TGOV1"]
     r: Magnitude
-    t1: Positive
+    t1: TimeConst
     t2: NonNegative
-    t3: Positive
+    t3: TimeConst
 
 
 class _ModelledMachine(Record):
@@ -190,10 +190,10 @@ class Genrou(_ModelledMachine):
     xq1: Magnitude
     xd2: Magnitude
     xl: NonNegative
-    Td10: Positive
-    Tq10: Positive
-    Td20: Positive
-    Tq20: Positive
+    Td10: TimeConst
+    Tq10: TimeConst
+    Td20: TimeConst
+    Tq20: TimeConst
     exciter: Annotated[Sexs | Ieeex1, _of_its_model(Sexs, Ieeex1)] | None
     pss: Annotated[St2cut, _of_its_model(St2cut)] | None
 

@@ -28,6 +28,8 @@ from ded_bench.problem.quantities import (
 
 #: No grid in operation is further from its nominal frequency, Hz; whoever writes more means another quantity.
 LARGEST_DEVIATION_HZ = 1.0
+#: How far from a point of the grid of time secondary control may act, in steps.
+BETWEEN = 1e-6
 
 
 def ramped_for(t: Array, start: float, duration: float) -> Array:
@@ -221,6 +223,11 @@ class Instance(Fingerprinted):
                 raise InputError(source, "initial.agc", f"case {case.id} has no secondary control")
             if (agc.next_s or 0.0) > case.agc.period_s:
                 raise InputError(source, "initial.agc.next_s", f"is beyond {case.agc.period_s:g} s, a period")
+        if case.agc is not None:
+            first = (agc and agc.next_s) or 0.0
+            for field, time in (("dt_s", case.agc.period_s), ("initial.agc.next_s", first)):
+                if abs(time - round(time / self.dt_s) * self.dt_s) > BETWEEN * self.dt_s:
+                    raise InputError(source, field, f"AGC acts at {time:g} s, between points of time")
 
     @functools.cached_property
     def steps(self) -> int:
@@ -249,17 +256,6 @@ class Instance(Fingerprinted):
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
         times = self.grid if t is None else t
         return np.stack([self.load[bus].at(times) for bus in case.loads], axis=-1)
-
-    def ramps(self, case: Case) -> tuple[LoadRamp, ...]:
-        """The loads as ramps, in the order of the case.
-
-        Raises:
-            InputError: a load is given by points.
-        """
-        ramps = tuple(load for bus in case.loads if isinstance(load := self.load[bus], LoadRamp))
-        if len(ramps) < len(case.loads):
-            raise InputError(f"instance {self.id}", "load", "must be ramps, not points, for this")
-        return ramps
 
     def p_initial(self, case: Case) -> Array:
         """Generator power at t = 0 (the paper's P_0), shape (n_gen,), pu."""

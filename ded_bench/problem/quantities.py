@@ -18,6 +18,8 @@ Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+#: s; what is faster needs no model here, and millions of steps.
+TimeConst = Annotated[float, Field(ge=1e-4, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Range = tuple[Number, Number]

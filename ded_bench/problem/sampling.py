@@ -19,7 +19,7 @@ from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
 from ded_bench.problem.quantities import Array, Range
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioLoad, ScenarioRamp
 
-#: Master seeds of data that must never overlap the benchmark's instances (DESIGN, section 4).
+#: Master seeds of data that must never overlap the benchmark's instances (docs/grids.md).
 POLICY_SEED, CERTIFICATE_SEED, KOOPMAN_SEED = 1_000_000, 2_000_000, 3_000_000
 #: Between the seeds of policies: instances on which choices are made, so that test instances only score.
 VALIDATION_SEED = POLICY_SEED + 500_000
@@ -128,7 +128,8 @@ def _initial(case: Case, cost: Array, load: Array, uniform: Array) -> Initial:
     n_gen = len(case.generators)
     p_opt = merit_order(case, cost[-n_gen:], np.inf if case.slack is None else cost[0], load)
     power = p_opt - 0.5 * (p_opt - case.p_nominal) * _between(case.sampling.perturbation, perturbation)
-    omega = _between(case.sampling.omega_rad_per_s, frequency)
+    # An island starts at rest.
+    omega = _between(case.sampling.omega_rad_per_s, frequency) * (case.slack is not None)
     return Initial(
         power=_by_bus(case.generators, rounded(power)), omega=_by_bus(case.generators, rounded(omega))
     )

@@ -212,7 +212,7 @@ class Forecast:
             schema_="ded-bench/instance/2",
             id=name,
             case=case.id,
-            seed=scenario.seed,
+            seed=(),  # from which the loads could be drawn again
             horizon_s=horizon_s,
             dt_s=scenario.dt_s,
             cost=scenario.cost,

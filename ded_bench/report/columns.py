@@ -83,6 +83,7 @@ OUTCOME = (
     Column("solved", "solved"),
     Column("feasible", "feasible"),
     Column("gap_percent", "mean gap", "%"),
+    Column("n", "gaps"),
     Column("largest", "largest violation"),
     Column("seconds", "median time", "s"),
 )
@@ -114,9 +115,10 @@ OTHER_RATES = (
 )
 TIMING = (
     *(*_HEAD, INSTANCES, Column("repeats", "repeats")),
-    Column("solve_s_q1", "solve 25 %"),
+    Column("time_s_q1", "time 25 %"),
+    Column("time_s", "time median"),
+    Column("time_s_q3", "time 75 %"),
     Column("solve_s", "solve median"),
-    Column("solve_s_q3", "solve 75 %"),
     Column("setup_s", "set-up median"),
     Column("build_s", "build median"),
     FAILURES,

@@ -56,7 +56,7 @@ def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
     ]
     for heading, blocks in _parts(grids, found).items():
         made += [f"## {heading}", *blocks] if blocks else []
-    if not found["solve_s"].notna().any():
+    if not found["time_s"].notna().any():
         made.append("No method was timed alone yet; run `ded-bench bench`.")
     places = {grid.case.id: Path(os.path.relpath(grid.results.folder, out)) for grid in grids}
     items = [f"`{case}`: `{place.as_posix()}`, seen from this page" for case, place in places.items()]
@@ -102,7 +102,7 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, list[Bloc
             *side_by_side("violations", _number("freq_violation_hz_max"), excess),
         ],
         "Time and memory against size": [
-            *side_by_side("times", _number("solve_s"), "Median time of a schedule, s"),
+            *side_by_side("times", _number("time_s"), "Median time of a schedule, s"),
             *side_by_side("memory", _number("peak_memory_mib"), "Peak memory of the method's process, MiB"),
         ],
         "The closed loop": table("online", operated, (CASE, *ONLINE), loop),
@@ -155,7 +155,7 @@ def points(grids: Sequence[Sources]) -> pd.DataFrame:
     rows = main_lines(pd.concat([grid.judged.assign(case=grid.case.id) for grid in grids], ignore_index=True))
     parts = []
     for grid in grids:
-        timing = grid.timing.set_index(GROUP)[["solve_s", "peak_memory_mib"]]
+        timing = grid.timing.set_index(GROUP)[["time_s", "peak_memory_mib"]]
         found = summary(rows[rows["case"] == grid.case.id]).join(timing, on=GROUP)
         found["is_reference"] = found["method"] == grid.reference.method
         parts.append(found.assign(case=grid.case.id, generators=len(grid.case.generators)))

@@ -23,6 +23,7 @@ from ded_bench.report import columns
 from ded_bench.report.figures import panels, tradeoff
 from ded_bench.report.page import Block, PageTable, Picture, bullets, folded, usual_first, write_page
 from ded_bench.report.sources import Sources, read_sources, trainings
+from ded_bench.results.timing import model_name
 from ded_bench.run.environment import environment, now
 
 #: The topic under which a section shows a figure, and what draws and saves it.
@@ -296,7 +297,8 @@ def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     made.append("## Certificate")
     if not sources.certificates:
         return [*made, "No certificate was made for these results; `ded-bench certify` makes one."]
-    certificates = titled(pd.DataFrame([{"model": ""} | c.model_dump() for c in sources.certificates]))
+    told = [{"model": ""} | c.model_dump() for c in sources.certificates]
+    certificates = titled(pd.DataFrame([one | {"model": model_name(one["model"])} for one in told]))
     return [
         *made,
         PageTable(certificates, columns.CERTIFICATE, "All that makes them up stands in certificate.json"),

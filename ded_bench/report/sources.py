@@ -135,21 +135,20 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     if len(everything) and not len(ours):
         others = ", ".join(sorted(set(everything["case"])))
         raise InputError(paths.results, "case", f"holds rows of {others}, not of {case.id}; give --case")
-    rows, left_out = newest(ours)
+    (counting, left_out), (judged, _) = newest(ours), newest(judged_rows(ours))
     notes += left_out
-    reference = choose_reference(rows, read_paper(problems), reference_objectives(case))
+    reference = choose_reference(counting, read_paper(problems), reference_objectives(case))
     newest_of = everything.groupby("method")["method_version"].max().to_dict()
 
-    def is_of_today(
-        one: Row | RefereeRow | TimingRow,
-    ) -> bool:  # else it is about other answers; 0 is unknown
+    def is_of_today(one: Row | RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
         return one.method_version in (0, newest_of.get(one.method, one.method_version))
 
+    elsewhere = [r for r in VALIDATED.existing(paths.validated) if r.plant != case.plant_name]
     judgements: dict[str, dict[Key, bool | None]] = {
-        "validated": {r.key[0]: r.feasible for r in filter(is_of_today, VALIDATED.existing(paths.validated))},
+        "validated": {r.key[0]: r.feasible for r in filter(is_of_today, elsewhere)},
         "confirmed": {r.key: r.confirmed for r in filter(is_of_today, REFEREE.existing(paths.referee))},
     }
-    rows = judged_elsewhere(gaps(rows, reference.objectives), judgements)
+
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]
     instances, test_count, version = _benchmark(case, problems, notes)
     return Sources(
@@ -157,8 +156,8 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         results=results,
         paper=_paper(case, problems, notes),
         reference=reference,
-        rows=rows,
-        judged=judged_rows(rows),
+        rows=judged_elsewhere(gaps(counting, reference.objectives), judgements),
+        judged=judged_elsewhere(gaps(judged, reference.objectives), judgements),
         timing=named(timing_summary(calls)),
         instances=instances,
         test_count=test_count,

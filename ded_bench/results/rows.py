@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from pydantic import AfterValidator
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.keyed_table import KeyedTable
+from ded_bench.files.keyed_table import KeyedTable, locked
 from ded_bench.files.table import NotNegative, PlainName, Table
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -115,11 +115,6 @@ class Row(OfIslands, Made):
         return Key(*(getattr(self, name) for name in Key._fields))
 
     @property
-    def scored(self) -> bool:
-        """The scorer has spoken, or has failed and said why."""
-        return self.objective is not None or self.error.startswith(SCORING_FAILED)
-
-    @property
     def member(self) -> str:
         """What the row's schedule is called in its archive."""
         return f"{self.instance}-{self.fingerprint}"
@@ -176,7 +171,7 @@ class Results(KeyedTable[Key, Row]):
         if not self.made_from(key, fingerprint, version):
             return False
         row = self.rows[key]
-        return row.objective is not None or (row.scored and self.has_schedule(row))
+        return row.objective is not None or (row.error.startswith(SCORING_FAILED) and self.has_schedule(row))
 
     def archive(self, row: Row) -> Archive:
         """Where the schedule of a row is kept."""
@@ -200,7 +195,7 @@ class Results(KeyedTable[Key, Row]):
         if schedule is not None:
             archive.write(row.member, schedule, case)
         elif left := [name for name in (row.member, before.member) if name in archive]:
-            with self.locked():
+            with locked(self.folder):
                 archive.drop(left)
         self.add([row])
 
@@ -219,7 +214,7 @@ class Results(KeyedTable[Key, Row]):
         """Move schedules that are saved one by one into their archives, and drop those of replaced rows."""
         if not any(self.paths.schedules.glob("*/*/*/*.npy")):
             return
-        with self.locked():
+        with locked(self.folder):
             self.reload()
             members: dict[Archive, set[str]] = {}
             for row in self.rows.values():

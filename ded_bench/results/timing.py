@@ -14,7 +14,8 @@ from ded_bench.results.rows import Made
 
 #: Round of a process's very first call, on the warm-up instance; it enters no median.
 WARM_UP = 0
-PARTS = ("build_s", "setup_s", "solve_s")
+#: `time_s`, what a schedule takes, is build_s + solve_s.
+PARTS = ("build_s", "setup_s", "solve_s", "time_s")
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     """
     frame = TIMING.frame(rows)
     frame["model"] = frame["model"].map(model_name)
+    frame["time_s"] = frame["build_s"].fillna(0.0) + frame["solve_s"]
     last = frame.groupby(_JOB, sort=False)[_SAID].last()
     warm = frame[frame["round"] != WARM_UP]
     is_good = warm["error"] == ""

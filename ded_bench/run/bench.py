@@ -29,6 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
+from ded_bench.files.keyed_table import locked
 from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, Solution, Solver, named
 from ded_bench.plants.plant import servable
@@ -42,8 +43,6 @@ from ded_bench.run.pool import Workers
 from ded_bench.run.tasks import failed, prepared
 from ded_bench.surrogates.find import MODELS
 
-#: Instances that are timed, unless the caller says otherwise.
-SAMPLE = 10
 #: Drawn instances that tell a latency where nobody timed the method.
 FEW = 3
 #: How many rounds a job takes part in, as in `timeit.Timer.autorange`: the least of these numbers whose
@@ -162,7 +161,8 @@ def measure(case: Case, job: Job, path: Path) -> list[TimingRow]:
     warm_up, *instances = validation_instances(case, 1 + FEW, servable=servable)
     with tempfile.TemporaryDirectory(prefix="ded-bench-") as name:
         rows = bench(case, instances, [job], Path(name) / "timing.csv", warm_up=warm_up, rounds=1)
-    TIMING.write(path, [*TIMING.existing(path), *rows])
+    with locked(path.parent):
+        TIMING.write(path, [*TIMING.existing(path), *rows])
     return rows
 
 
@@ -308,7 +308,7 @@ def not_timed(key: Key, method: Method) -> str:
     return ""
 
 
-def choose_sample(instances: Sequence[Instance], count: int = SAMPLE) -> list[Instance]:
+def choose_sample(instances: Sequence[Instance], count: int) -> list[Instance]:
     """The instances to time: spread evenly over the given ones, the same every time."""
     if len(instances) <= count:
         return list(instances)

@@ -164,6 +164,8 @@ def submit(
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
     wanted = [(instance, split, regime) for regime in regimes for instance, split in chosen.instances]
+    if not wanted:
+        raise InputError("--split", "", "holds no instance")
     used = {path for instance, _, regime in wanted for path in _candidates(folder, regime, instance.id)}
     if not used:
         first, _, regime = wanted[0]

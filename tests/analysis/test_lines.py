@@ -76,7 +76,7 @@ def test_the_newest_model_and_policy_count_and_of_time_limits_the_newest_row() -
     rows, notes = newest(frame)
     assert rows["objective"].to_list() == [2.0, 3.0, 5.0]
     (note,) = notes
-    assert note.startswith("2 rows of DED-KO TO are of an older model or policy and left out")
+    assert note.startswith("2 rows of DED-KO TO are of an older model, policy or version and left out")
     assert "koopman@new" in note
     assert newest(frame[:0])[0].empty
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ded_bench.analysis.online_summary import online_rows, own_latency
+from ded_bench.analysis.online_summary import online_rows, own_latency, practice_rows
 from ded_bench.results.online_results import OnlineResults, OnlineRow
 
 
@@ -68,6 +68,24 @@ def test_rows_of_an_older_policy_or_another_plant_are_not_averaged_with_the_newe
     kept.table.add([old, row("a", 0.5, 109.0, **new), row("a", 0.5, 150.0, plant="detailed", **new)])
     lines = own_latency(online_rows(kept, "here"))
     assert sorted(lines["increase_percent_mean"]) == pytest.approx([9.0, 50.0])
+
+
+def test_practice_is_static_dispatch_every_minute_at_once(tmp_path):
+    """Whatever else there is of it: late, or asked every second."""
+    kept, practice = OnlineResults(tmp_path), {"method": "ed", "settings": "every=60"}
+    facts = {"mean_freq_max_hz": 0.1, "agc_travel_pu": 1.0, "cps1": 100.0}
+    for latency, period, cost in ((0.0, 60.0, 100.0), (10.0, 60.0, 120.0), (0.0, 1.0, 130.0)):
+        kept.table.add([row("a", latency, cost, period_s=period, **practice, **facts)])
+    kept.table.add([row("a", 0.5, 101.0, **facts)])
+    assert set(practice_rows(kept, "here")["practice_objective"]) == {100.0}
+
+
+def test_a_sweep_with_a_new_policy_leaves_what_is_announced(tmp_path):
+    kept, policy = OnlineResults(tmp_path), {"method": "ded-admm", "latency_source": "timing"}
+    old = row("a", 0.5, 101.0, policy="ded-admm@old", date="2026-01-01T00:00:00Z", **policy)
+    sweep = {"forecast": "perfect", "policy": "ded-admm@new", "date": "2026-01-02T00:00:00Z"}
+    kept.table.add([old, row("a", 0.5, 100.0, **sweep, **policy)])
+    assert own_latency(online_rows(kept, "here"))["n"].tolist() == [1]
 
 
 def test_own_latencies_that_hardly_differ_share_a_line(tmp_path):

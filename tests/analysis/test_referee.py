@@ -166,6 +166,21 @@ def test_rows_are_judged_once(mixed: Case, results, stand_in) -> None:
     assert sorted(row.error for row in REFEREE.read(folder.paths.referee)) == ["", "", "", "no solution"]
 
 
+def test_a_process_that_is_killed_costs_its_own_row_alone(
+    mixed: Case, results, stand_in, tmp_path: Path
+) -> None:
+    """It is tried again the next time."""
+    folder, instances = results
+    python, log = stand_in
+    die = f"test -e {tmp_path}/died || {{ touch {tmp_path}/died; kill -9 $$; }}"
+    script = f'#!/bin/sh\n{die}\nexec {python} "$@"\n'
+    rows = referee(mixed, instances, folder, python=executable(tmp_path / "dying", script))
+    assert sorted(row.error for row in rows) == ["", "", "", "ANDES was ended by signal 9"]
+    rows = referee(mixed, instances, folder, python=python)
+    assert [row.error for row in rows] == [""] * 4
+    assert len(log.read_text().splitlines()) == 4
+
+
 def test_without_andes_the_command_ends_with_one_line(
     mixed: Case, results, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from ded_bench.analysis.compare import reproduce
+from ded_bench.cli import main
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
-from ded_bench.results.rows import Results
+from ded_bench.results.rows import Results, Row
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import make_tasks
 
@@ -40,6 +41,12 @@ def test_differences_are_told_and_limits_named(threebus: Case, quiet_instance, t
     assert (theirs["method"], theirs["rows"], theirs["differ"]) == ("mine", 0, 0)
     assert "mine default TO: a: no method has this name" in said
     assert results.path.read_bytes() == before
+
+
+def test_what_compares_nothing_shows_nothing(tmp_path: Path) -> None:
+    row = Row("9bus-0003", "test", "TO", "mine", "default", "Feasible", case="9bus", fingerprint="f")
+    Results(tmp_path).add([row])
+    assert main(["reproduce", "--results", str(tmp_path)]) == 1
 
 
 def test_the_sample_is_the_same_every_time(threebus: Case, quiet_instance, tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_solve_ends_with_a_table(problem: Path, tmp_path: Path, capsys) -> None:
     out, err = capsys.readouterr()
     heading, lost, ed, note = out.splitlines()
     assert heading.split()[:5] == ["Regime", "Method", "n", "solved", "feasible"]
-    assert lost.split() == ["NO", "tests.run.online.faulty_methods.lost", "1", "0", "0", "–", "–", "–"]
+    assert lost.split() == ["NO", "tests.run.online.faulty_methods.lost", "1", "0", "0", "–", "0", "–", "–"]
     assert ed.split()[:4] == ["NO", "ED", "1", "1"]
     assert "gaps are to the best feasible schedule" in note or "gaps are to DED (SLP)" in note
     assert "faulty_methods.lost NO, 1 time: KeyError: 'power' (faulty_methods.py, line 31, in lost: " in err
@@ -187,6 +187,18 @@ def test_only_policies_that_need_a_koopman_model_ask_for_one(
     assert "not there yet" in capsys.readouterr().err
     assert main(["train-dpc", "--method", "ded-admm", *where, str(tmp_path)]) == 0
     assert (tmp_path / "policies" / "ded-admm-TO.safetensors").is_file()
+
+
+def test_a_training_that_cannot_be_leaves_the_others(problem: Path, tmp_path: Path, capsys, inline) -> None:
+    """Of one command: the policy of the second method is there already, the first has no model."""
+    there = tmp_path / "policies" / "ded-admm-TO.safetensors"
+    there.parent.mkdir()
+    there.touch()
+    where = ("--case", str(problem), "--regime", "TO", "--results", str(tmp_path))
+    assert main(["train-dpc", "--method", "ded-dpc,ded-admm", *where]) == 2
+    out, err = capsys.readouterr()
+    assert "ded-dpc TO: --model: koopman: not there yet" in err
+    assert f"{there} is there already" in out
 
 
 def test_path_says_where_a_case_lies(problem: Path, capsys, monkeypatch, tmp_path: Path) -> None:

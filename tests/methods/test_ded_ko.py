@@ -122,8 +122,6 @@ def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, k
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> None:
-    with pytest.raises(InputError, match="unknown regime"):
-        prepared(method, case, koopman, "XX")
     with pytest.raises(InputError, match=r"identified at 0\.01"):
         prepared(method, case, koopman, "NO")(short(case, 0, dt_s=0.02))
     with pytest.raises(InputError, match="no such model"):

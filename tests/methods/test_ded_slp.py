@@ -10,7 +10,7 @@ import pytest
 from ded_bench.methods import ded_slp, ed
 from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
-from ded_bench.methods.slp import Parts
+from ded_bench.methods.slp import Attempt, Parts
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.plants.score import score
@@ -123,6 +123,11 @@ def test_finer_knots_cost_no_more(ninebus):
     assert costs[1] <= costs[0] * (1 + 1e-5)
 
 
+def test_knots_further_apart_than_the_horizon_are_its_ends(case):
+    solution = prepare(case, "NO", Settings(f"knot_s={9 * HORIZON}"))(short(case, 0))
+    assert solution.status in (Status.OPTIMAL, Status.INFEASIBLE)
+
+
 def test_failures_are_said(case, monkeypatch):
     """A system that loses synchronism under every schedule."""
 
@@ -142,6 +147,16 @@ def test_what_is_feasible_but_not_confirmed_is_no_optimum(case, monkeypatch):
     solution = prepare(case, "NO", Settings())(instance)
     assert solution.status == Status.FEASIBLE
     assert solution.solver_objective is None
+    assert score(case, instance, solution.schedule, "NO").feasible_strict
+
+
+def test_a_feasible_schedule_in_hand_is_not_called_infeasible(case, monkeypatch):
+    """Programs keep a margin, and may have no answer where static dispatch keeps the bound itself."""
+    none = Attempt(Status.INFEASIBLE, None, None, 1, "none", "no answer")
+    monkeypatch.setattr(ded_slp, "solve_with_rows_added", lambda *args: none)
+    instance = short(case, 0)
+    solution = prepare(case, "NO", Settings())(instance)
+    assert solution.status == Status.FEASIBLE
     assert score(case, instance, solution.schedule, "NO").feasible_strict
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ded_bench.methods.dpc.channels import Channels
 from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
 from ded_bench.methods.dpc.refinement import PARTS, BoundKeeper, predict
 from ded_bench.methods.knots import track
@@ -100,9 +101,9 @@ def test_what_the_committed_policy_exceeds_is_mended(ninebus: Case, index: int) 
     policy = DispatchPolicy.find(ninebus, "TO", Settings(search=search_folders(ninebus)))
     instance = sample_instance(ninebus, VALIDATION_SEED, index)
     inputs = StackedInstances.of(ninebus, [instance])
+    network = policy._compiled(Channels.of(ninebus, inputs, policy.response))
     alone, kept = (
-        score(ninebus, instance, Schedule(policy.knots, p[0]), "TO")
-        for p in (policy.network_powers(inputs), policy.powers(inputs))
+        score(ninebus, instance, Schedule(policy.knots, p[0]), "TO") for p in (network, policy.powers(inputs))
     )
     assert alone.freq_violation_hz > 5e-5
     assert kept.freq_violation_hz == 0.0

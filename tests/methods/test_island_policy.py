@@ -116,8 +116,3 @@ def test_further_iterations_are_no_dearer(island: Case, instance: Instance) -> N
     cost, more = (score(island, instance, one, "TO") for one in (own, further))
     assert more.feasible
     assert more.objective <= cost.objective * (1.0 + 1e-5)
-
-
-def test_no_island_is_refused(threebus: Case) -> None:
-    with pytest.raises(InputError, match="is no island"):
-        IslandGrid(threebus, "TO", 60.0)

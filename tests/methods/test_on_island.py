@@ -27,6 +27,7 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Transfer
+from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
@@ -210,6 +211,17 @@ def test_others_refuse_with_one_line(island: Case, instance: Instance, method: s
         with pytest.raises(InputError) as refusal:
             get_method(method).prepare(island, "TO", Settings(model=model))(instance)
         assert "\n" not in str(refusal.value)
+
+
+def test_full_ded_refuses_before_it_has_an_instance(island: Case) -> None:
+    with pytest.raises(InputError, match="has no lossless network"):
+        get_method("ded").prepare(island, "TO", Settings())
+
+
+def test_islands_start_at_rest_whatever_is_drawn(island: Case) -> None:
+    sampling = island.sampling.model_copy(update={"omega_rad_per_s": (-0.01, 0.01)})
+    drawn = sample_instance(island.model_copy(update={"sampling": sampling}), 7, 0)
+    assert set(drawn.initial.omega.values()) == {0.0}
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

@@ -23,6 +23,11 @@ class Options:
     plain: float = 2.0
 
 
+@dataclass(frozen=True)
+class Named:
+    path: str = ""
+
+
 def test_what_differs_from_the_defaults_is_the_canonical_text() -> None:
     """In the order of the fields, however it was written; read again it is the same."""
     for text, canonical in [
@@ -63,8 +68,11 @@ def test_a_description_has_every_option() -> None:
     assert described(Options)[-1] == ("plain", "2", "")
 
 
-def test_settings_of_a_method_are_canonical() -> None:
+def test_settings_of_a_method_are_canonical(monkeypatch: pytest.MonkeyPatch) -> None:
     assert get_method("ed").canonical(Settings("lead=on, every=60.0")).options == "every=60,lead=on"
+    monkeypatch.setattr("ded_bench.methods.ed.Options", Named)
+    with pytest.raises(InputError, match="path: 'a/b' is not text without slashes"):
+        get_method("ed").canonical(Settings("path=a/b"))
 
 
 def test_the_command_describes_one_method(capsys: pytest.CaptureFixture[str]) -> None:

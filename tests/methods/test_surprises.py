@@ -47,6 +47,24 @@ def test_room_is_asked_for_before_ramps_that_nobody_announces_and_seldom_else(tw
     assert np.mean(asked) / len(case.loads) < 0.2  # a tenth, says the law
 
 
+def test_time_goes_on_while_plans_fail(two_area: Case) -> None:
+    """Stretches are counted from the start of operation; what no plan was made for stays news."""
+    scenario = sample_scenario(two_area, 4_300_000, 0)
+    surprises, clock = Surprises(two_area, two_area.omega_bound("TO")), []
+
+    def ask(instance: Instance, last: Schedule | None) -> Planned:
+        expected, power = surprises.expected(instance, last), instance.p_initial(two_area)
+        clock.append((surprises.now_s, surprises.is_news(expected)))
+        given = Schedule(np.array([0.0, 30.0, instance.horizon_s]), np.array([power] * 3))
+        plan = None if 3 <= len(clock) <= 5 else given
+        surprises.keep(plan, instance)
+        return Planned(plan)
+
+    run_loop(two_area, scenario.model_copy(update={"duration_s": 8.0}), ask, LoopOptions(period_s=1.0))
+    assert [now for now, _ in clock] == pytest.approx(np.arange(8.0))
+    assert all(is_news for _, is_news in clock)
+
+
 def test_a_load_that_waits_goes_on_as_it_would_have() -> None:
     load = LoadPoints(points=((0.0, -1.0), (2.0, -1.0), (4.0, -2.0), (10.0, -2.0)))
     later, t = _delayed(load, 2.0, 0.5, 10.0), np.linspace(0.0, 9.0, 91)

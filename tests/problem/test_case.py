@@ -95,6 +95,7 @@ def _add_bus(**bus: object):
         (_set("colour", "red"), "colour", "unknown field"),
         (_drop("f0_hz"), "f0_hz", "required"),
         (_set("schema", "ded-bench/case/3"), "schema", "'ded-bench/case/1' or 'ded-bench/case/2'"),
+        (_set("schema", []), "schema", "'ded-bench/case/1' or 'ded-bench/case/2'"),
         (_set("knots", 50), "", "knots: belongs to schema ded-bench/case/2"),
         (_set("source", "a book"), "", "source: belongs to schema ded-bench/case/2"),
         (

@@ -146,6 +146,8 @@ def test_lossless_cases_have_machines_of_their_generators(name: str) -> None:
         ("machines.json", "machines.0.name", "2", "", "same name"),
         ("machines.json", "machines.0.share", 0.5, "", "shares at bus 1 do not sum to 1"),
         ("machines.json", "machines.0.model", "GENSAL", "machines.0", "must be one of GENROU, GENCLS"),
+        ("machines.json", "machines.0.model", [], "machines.0", "must be one of GENROU, GENCLS"),
+        ("machines.json", "machines.0.governor.t3", 1e-9, "machines.0.governor.t3", "greater than"),
         ("machines.json", "machines.0.h", 0.0, "machines.0.h", "greater than"),
         ("machines.json", "machines.0.mva", -900.0, "machines.0.mva", "greater than"),
         ("machines.json", "machines.0.xd1", 2.0, "machines.0", "xd: is below xd1"),

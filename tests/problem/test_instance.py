@@ -86,8 +86,6 @@ def test_instance_2_reads_back_as_it_was_written(case, quiet_instance):
     assert json.loads(instance.model_dump_json(by_alias=True)) == json.loads(text)
     np.testing.assert_array_equal(instance.theta_initial(case), [theta[g] for g in case.generators])
     assert instance.p_load(case)[[0, 150, 250, 350], 0] == pytest.approx([-0.9, -0.9, -0.93, -0.96])
-    with pytest.raises(InputError, match="must be ramps"):
-        instance.ramps(case)
 
 
 @pytest.mark.parametrize(

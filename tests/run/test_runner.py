@@ -132,7 +132,7 @@ def test_a_run_leaves_one_line_per_row_even_if_interrupted(
     with pytest.raises(KeyboardInterrupt):
         run(threebus, make("calm-1"), results, on_row=interrupt)
     (done,) = ROWS.read(results.path)
-    assert done.scored
+    assert done.objective is not None
     (left,) = unfinished(make("calm-1"), Results(tmp_path / "out"))
     assert left.key != done.key
     run(threebus, make("calm-1"), results)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 from pathlib import Path
 
@@ -148,4 +149,6 @@ def test_a_folder_without_any_of_them_is_refused(chosen, results, tmp_path) -> N
         submit(chosen, tmp_path / "nowhere", "mine", ["NO"], results)
     with pytest.raises(InputError, match="unknown regime 'XX'"):
         submit(chosen, tmp_path / "mine", "mine", ["XX"], results)
+    with pytest.raises(InputError, match="--split: holds no instance"):
+        submit(dataclasses.replace(chosen, instances=()), tmp_path / "mine", "mine", ["NO"], results)
     assert not results.folder.exists()

@@ -53,7 +53,7 @@ MOST = {"relaxation": 2.0, "tightening": 0.1}
 #: Iterations, equally far apart, whose weights are learned; those of others lie between.
 NODES = 4
 #: Price of one relative unit of excess of |ω| for one second, as a fraction of the instance's cost: an
-#: exact penalty. docs/model.md tells how it was chosen.
+#: exact penalty. studies/admm.md tells how it was chosen.
 PRICE = 0.1
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
 DOUBLING = 0.05

@@ -29,7 +29,7 @@ from ded_bench.problem.instance import Instance
 
 VERSION = 1
 #: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
-#: linearised grid errs (docs/model.md).
+#: linearised grid errs (studies/admm.md).
 MARGIN = 0.01
 #: Weights that were learned for fewer iterations take long steps and do not serve many: the policy answers
 #: with them, and goes on with those where training starts.

@@ -59,11 +59,8 @@ class DispatchPolicy(TrainedPolicy):
 
     def powers(self, inputs: StackedInstances) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
-        return self._keeper(inputs, self.network_powers(inputs))
-
-    def network_powers(self, inputs: StackedInstances) -> Array:
-        """What the network alone answers, as `powers`."""
-        return self._compiled(Channels.of(self.scope.case, inputs, self.response))
+        alone = self._compiled(Channels.of(self.scope.case, inputs, self.response))
+        return self._keeper(inputs, alone)
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

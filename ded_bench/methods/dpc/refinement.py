@@ -10,7 +10,7 @@ factorised once, and a step that treats each component of y alone (Boyd et al. 2
 answer passes through the follower, so that bounds, ramps and P_0 hold after any number of steps.
 
 **Mended** is where |ω| would exceed its bound. The linearised grid tells what a schedule does to ω between
-the knots too, within a hundredth of the bound of what the true system does (docs/model.md). Only where |ω|
+the knots too, within a hundredth of the bound of what the true system does (studies/dpc.md). Only where |ω|
 comes nearer than that to the bound is anything changed: damped Gauss-Newton steps lead the powers to where ω
 stays below. Each passes through the follower.
 """

@@ -47,7 +47,7 @@ MARGIN = 0.02
 #: exact penalty, above nearly all of the optimum's multipliers. It grows from the first to the second.
 PRICE = (0.01, 0.08)
 #: Relative excess at which the price has doubled: rare large excesses count for more than many small ones.
-#: It, MARGIN and PRICE were chosen on validation instances (docs/model.md).
+#: It, MARGIN and PRICE were chosen on validation instances (studies/dpc.md).
 DOUBLING = 0.05
 #: The part of the instances with the largest excess is seen this many times more in the next epoch.
 HARD, REPEATS = 0.02, 5

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import knot_points, track, transfer_room
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.plant import plant_of
@@ -81,8 +80,6 @@ class IslandGrid:
 
     def __init__(self, case: Case, regime: str, horizon_s: float) -> None:
         """Linearise; InputError where the plant has no coarse steps that fit."""
-        if case.slack is not None or case.plant_name != "detailed":
-            raise InputError(f"case {case.id}", "plant", "is no island of detailed machines")
         self.case, self.plant, bounds = case, plant_of(case), case.bounds(regime)
         self.knots = case.knot_times(horizon_s)
         self.between = max(round(float(self.knots[1]) / SPACING_S), 1)

@@ -46,7 +46,7 @@ def train(
     """Train a policy; see `training_record.Trainer`.
 
     Raises:
-        InputError: the case is no island of detailed machines, or training is to go on.
+        InputError: training is to go on, or no instance is left to hold out.
     """
     if options.resume:
         raise InputError("--resume", "", "policies of islands train in minutes, and start anew")

@@ -20,6 +20,7 @@ from ded_bench.problem.scenario import Scenario, forecast
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.results.online_results import Judgement
 from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
+from ded_bench.solvers.status import Status
 
 #: Knots of hindsight lie so many times as close as the case's: renewed plans may bend anywhere.
 FINER = 4
@@ -75,7 +76,7 @@ def cps1(t: Array, mean: Array) -> float:
 def hindsight(
     case: Case, scenario: Scenario, regime: str, plant: Plant | None = None
 ) -> tuple[str, Judgement, Trajectory]:
-    """Optimise the whole scenario by sequential linear programs, or by collocation where they fail.
+    """Optimise the whole scenario by sequential linear programs, or by collocation without their optimum.
 
     Args:
         case: the grid.
@@ -94,14 +95,18 @@ def hindsight(
         return _in_windows(case, scenario, regime)
     instance = whole_instance(case, scenario)
     interval_s = case.sampling.horizon_s / (case.n_knots - 1) / FINER
-    reasons = []
+    found: dict[str, Schedule] = {}  # the last is the best
     for name, options in (("ded-slp", f"knot_s={interval_s!r}"), ("ded-radau", "")):
         solution = get_method(name).prepare(case, regime, Settings(options))(instance)
         if solution.schedule is not None:
-            trajectory = simulate(case, instance, solution.schedule, plant)
-            return name, judge_operation(case, scenario, trajectory, regime), trajectory
-        reasons.append(solution.error)
-    raise RuntimeError(f"no schedule for the whole of {scenario.id}: {reasons[-1]}")
+            found[name] = solution.schedule
+        if solution.status == Status.OPTIMAL:
+            break
+    if not found:
+        raise RuntimeError(f"no schedule for the whole of {scenario.id}: {solution.error}")
+    name, schedule = list(found.items())[-1]
+    trajectory = simulate(case, instance, schedule, plant)
+    return name, judge_operation(case, scenario, trajectory, regime), trajectory
 
 
 def _in_windows(case: Case, scenario: Scenario, regime: str) -> tuple[str, Judgement, Trajectory]:

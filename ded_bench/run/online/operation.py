@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import time
 from collections.abc import Callable, Sequence
@@ -82,7 +83,8 @@ def make_operations(
         for regime in regimes:
             artifacts = method.artifacts(case, regime, settings)
             model, policy = named(artifacts, "model"), named(artifacts, "policy")
-            seconds, source = _latency(case, timed_job(case, method, regime, settings), latency, timing)
+            timed = functools.partial(timed_latency, case, method, regime, settings, timing)
+            seconds, source = _latency(latency, timed)
             longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
             own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
             for scenario in scenarios:
@@ -139,12 +141,12 @@ def operate(
         with tqdm(total=len(todo), unit="scenario", disable=None, desc="online") as bar:
             for operation, answer in pool.imap(calls, todo):
                 row = answer if isinstance(answer, OnlineRow) else _row(operation, error=reason_of(answer))
-                row = _compared(row, results)
+                row = _compared(case, operation, row, results)
                 table.add([row])
                 on_row(row)
                 bar.update()
-    rows = [table.rows[o.row.key] for o in operations]
-    if later := [row for row in (_compared(r, results) for r in rows) if row != table.rows[row.key]]:
+    rows = [_compared(case, o, table.rows[o.row.key], results) for o in operations]
+    if later := [row for row in rows if row != table.rows[row.key]]:
         table.add(later)  # hindsight that was found after them
     table.compact()
     return [table.rows[o.row.key] for o in operations]
@@ -215,10 +217,12 @@ def _is_there(table: KeyedTable[Any, Any], row: OnlineRow | HindsightRow) -> boo
     return made and table.rows[row.key].objective is not None
 
 
-def _compared(row: OnlineRow, results: OnlineResults) -> OnlineRow:
-    """A row with its cost over hindsight, where both are known."""
+def _compared(case: Case, o: Operation, row: OnlineRow, results: OnlineResults) -> OnlineRow:
+    """A row with its cost over the hindsight of the same loads, where both are known."""
     best = results.hindsight.rows.get((row.scenario, row.regime, row.plant))
     if row.objective is None or best is None or not best.objective:
+        return row
+    if best.fingerprint != _made(case, row.plant, o.scenario)["fingerprint"]:
         return row
     return dataclasses.replace(row, increase_percent=100 * (row.objective / best.objective - 1))
 
@@ -239,12 +243,10 @@ def _made(case: Case, plant: str, scenario: Scenario, *parts: str) -> dict[str, 
     return facts | {"version": version(), "commit": commit(), "host": host(), "date": now()}
 
 
-def _latency(
-    case: Case, job: tuple[str, str, str, str], latency: str, timing: Sequence[Path]
-) -> tuple[float, str]:
-    """Seconds from measurement to plan, and where they are from."""
+def _latency(latency: str, timed: Callable[[], float]) -> tuple[float, str]:
+    """Seconds from measurement to plan, and where they are from; `timed` tells those of `timing`."""
     if latency == "timing":
-        return timed_latency(case, job, timing), "timing"
+        return timed(), "timing"
     if latency == "zero":
         return 0.0, "zero"
     try:
@@ -256,30 +258,30 @@ def _latency(
     return seconds, "given"
 
 
-def timed_job(case: Case, method: Method, regime: str, settings: Settings) -> tuple[str, str, str, str]:
-    """What times of a method are found by (see `TimingRow.job`)."""
-    model = model_name(named(method.artifacts(case, regime, settings), "model"))
-    return regime, method.name, method.canonical(settings).options, model
-
-
-def timed_latency(case: Case, job: tuple[str, str, str, str], folders: Sequence[Path]) -> float:
-    """Median build and solve time in the tables of the first folder that timed a method, s.
+def timed_latency(
+    case: Case, method: Method, regime: str, settings: Settings, folders: Sequence[Path]
+) -> float:
+    """Median build and solve time in the tables of the first folder that timed a method's present version, s.
 
     Args:
         case: the grid.
-        job: regime, method, settings and surrogate (see `TimingRow.job`).
+        method: with a regime and settings.
         folders: of results.
 
     Raises:
         InputError: none of the folders has such times (names the command that makes them).
     """
+    model = model_name(named(method.artifacts(case, regime, settings), "model"))
+    job = regime, method.name, method.canonical(settings).options, model
     for folder in folders:
         paths = ResultsFolder(folder)
         rows = [*TIMING.existing(paths.timing), *TIMING.existing(paths.latency)]
         times = [
             (row.build_s or 0.0) + (row.solve_s or 0.0)
             for row in rows
-            if row.case == case.id and row.job == job and row.counts
+            if (row.case, row.job) == (case.id, job)
+            and row.counts
+            and row.method_version in (0, method.version)  # 0: of older tables
         ]
         if times:
             return float(np.median(times))

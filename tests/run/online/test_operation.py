@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import shutil
 
 import numpy as np
@@ -19,7 +20,7 @@ from ded_bench.problem.scenario import load_scenarios
 from ded_bench.results.folder import OnlineKey
 from ded_bench.results.online_results import OnlineResults, OnlineRow
 from ded_bench.results.timing import TIMING, TimingRow
-from ded_bench.run.online.loop import LoopOptions
+from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from ded_bench.run.online.operation import make_operations, operate
 from ded_bench.run.pool import Workers
 from tests.conftest import CASE_FILES, answers_here
@@ -157,7 +158,9 @@ def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_p
         for s, more in (("every=1", 0.0), ("every=10", 1.0))
         for n, solve, error in ((n, solve + more, error) for n, solve, error in times)
     ]
-    assert timed(threebus, scenarios, tmp_path, rows, "ed", Settings("every=1")) == pytest.approx(0.45)
+    older = [dataclasses.replace(rows[1], solve_s=9.0, method_version=99)]
+    found = timed(threebus, scenarios, tmp_path, [*rows, *older], "ed", Settings("every=1"))
+    assert found == pytest.approx(0.45)
 
 
 def timed(case, scenarios, folder, rows, method, settings) -> float:
@@ -230,6 +233,34 @@ def test_the_command(scenarios, tmp_path, capsys):
     assert {(key.latency_s, key.forecast) for key in rows} == set(
         itertools.product((0.0, 1.5), ("announced", "perfect"))
     )
+
+
+@pytest.mark.usefixtures("inline")
+def test_hindsight_of_other_loads_is_compared_with_nothing(threebus, scenarios, first_run, tmp_path):
+    shutil.copy(first_run[1] / "hindsight.csv", tmp_path)
+    results = OnlineResults(tmp_path)
+    results.hindsight.add(
+        [dataclasses.replace(r, fingerprint="other") for r in results.hindsight.rows.values()]
+    )
+    rows = operate(threebus, operations(threebus, scenarios), results, look_back=False)
+    assert [row.increase_percent for row in rows] == [None, None]
+
+
+def test_planners_cannot_draw_the_scenario_again(threebus, scenarios):
+    (scenario, *_), known = load_scenarios(scenarios, threebus), []
+    run_loop(threebus, scenario, lambda now, last: known.append(now) or Planned(None), LoopOptions())
+    assert {instance.seed for instance in known} == {()}
+
+
+def test_a_scenario_that_is_not_balanced_is_refused(scenarios, tmp_path, capsys):
+    """A stranger's file, as instances are."""
+    text = json.loads(scenarios[0].read_text())
+    text["initial"]["omega"] = dict.fromkeys(text["initial"]["omega"], 60.0)
+    place = tmp_path / "mine.json"
+    place.write_text(json.dumps(text))
+    line = ["online", "--case", str(CASE_FILES["threebus"]), "--method", "ed", "--latency", "0"]
+    assert main([*line, "--scenario", str(place), "--out", str(tmp_path / "out")]) == 2
+    assert "not the frequency in Hz" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("inline")

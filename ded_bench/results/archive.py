@@ -68,9 +68,11 @@ class Archive:
         return schedule
 
     def write(self, name: str, schedule: Schedule, case: Case) -> None:
-        """Save a schedule beside the archive."""
+        """Save a schedule beside the archive; InputError if that is of other generators."""
         if _COLUMNS not in self:
             write_atomically(self._file(_COLUMNS), _bytes(np.array(columns_of(case))))
+        elif self._columns() != columns_of(case):
+            raise InputError(self.path, _COLUMNS, "are those of other generators; choose another folder")
         table = np.column_stack([schedule.t, schedule.p])
         write_atomically(self._file(name), _bytes(np.asfortranarray(table)))  # a column compresses better
 

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
 from ded_bench.files.table import LARGEST
+from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.score import Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -99,15 +100,17 @@ def rescore(
     Raises:
         InputError: none of the rows' schedules is kept.
     """
-    rows, found = [], []
+    rows, found, sound = [], [], []
     with Workers(workers) as pool:
         for old, verdict in verdicts(case, results.kept(instances), instances, results, pool):
             rows.append(scored_row(old, verdict))
+            if isinstance(verdict, Score | SimulationError):  # no worker that died, no damaged file
+                sound.append(rows[-1])
             for sentence in _differences(old, rows[-1]):
                 found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
                 on_difference(found[-1])
     if update:
-        results.add(rows)
+        results.add(sound)
         results.compact()
     return rows, found
 

@@ -130,5 +130,7 @@ def test_schedules_of_other_generators_are_refused(archive: Archive, threebus: C
     archive.write("a", schedule(), threebus)
     with pytest.raises(InputError, match=r"columns: are \['t', 'P_plant'\]"):
         archive.read("a", ninebus, HORIZON_S)
+    with pytest.raises(InputError, match="are those of other generators"):
+        archive.write("b", schedule(), ninebus)
     with pytest.raises(InputError, match="b: no such schedule"):
         archive.read("b", threebus, HORIZON_S)

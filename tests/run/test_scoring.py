@@ -91,6 +91,8 @@ def test_a_schedule_that_is_damaged_or_another_is_a_difference(threebus: Case, i
     _, differences = rescore(threebus, instances, results)
     assert "scoring failed" in next(line for line in differences if " TO a: " in line)
     assert {line.split(": ")[0] for line in differences} == {"ded default TO a", "ded default TO c"}
+    rescore(threebus, instances, results, update=True)
+    assert row_of(results, "a") == a  # what cannot be read takes no score away
 
 
 def test_update_scores_anew_what_is_kept(threebus: Case, instances, results: Results) -> None:

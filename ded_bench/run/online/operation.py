@@ -263,11 +263,6 @@ def timed_latency(
 ) -> float:
     """Median build and solve time in the tables of the first folder that timed a method's present version, s.
 
-    Args:
-        case: the grid.
-        method: with a regime and settings.
-        folders: of results.
-
     Raises:
         InputError: none of the folders has such times (names the command that makes them).
     """

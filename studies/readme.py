@@ -12,7 +12,7 @@ import pandas as pd
 
 from ded_bench.analysis.online_summary import LOOP, own_latency
 from ded_bench.analysis.reference import result_lines
-from ded_bench.analysis.summary import titled
+from ded_bench.analysis.summary import GROUP, titled
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.sources import Sources, read_sources
 
@@ -56,10 +56,15 @@ def paper() -> str:
 
 
 def methods() -> str:
-    """Of each grid and time budget the cheapest method that keeps every limit on nearly all instances."""
+    """Of each grid and time budget the cheapest method that keeps every limit on nearly all instances.
+
+    Where set-up is a part of every answer, as the first of two steps of `ded-rti`, it counts.
+    """
     rows = []
     for case in GRIDS:
-        found = run(case).outcome
+        setup = run(case).timing.set_index(GROUP)["setup_s"].rename("setup_s")
+        found = run(case).outcome.join(setup, on=GROUP)
+        found["seconds"] += found["setup_s"].fillna(0.0)
         useful = found[(found["regime"] == "TO") & (found["correct_rate"] >= KEPT) & found["alone"]]
         cells = []
         for seconds in BUDGETS.values():

@@ -82,6 +82,16 @@ def test_an_episode_is_what_the_scorer_says(env: DispatchEnv) -> None:
         env.step(actions[0])
 
 
+def test_a_step_lasts_a_second_on_any_grid_of_time(env: DispatchEnv, alter) -> None:
+    coarse = alter(env.reset(seed=1)[1]["instance"], dt_s=2 * env.case.sampling.dt_s)
+    env.reset(options={"instance": coarse})
+    steps, ended = 0, False
+    while not ended:
+        *_, ended, _, _ = env.step(np.zeros(len(env.case.generators)))
+        steps += 1
+    assert steps == np.ceil(coarse.horizon_s - 1e-9)
+
+
 def test_seeds_say_which_training_draws_come(env: DispatchEnv) -> None:
     """The same seed, the same episodes, one after the other; never an instance of another purpose."""
     drawn = []

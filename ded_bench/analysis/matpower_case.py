@@ -26,7 +26,7 @@ from ded_bench.plants.detailed.power_flow import Complex, port_network
 from ded_bench.plants.plant import SimulationError, plant_of
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.grid_files import BASE_MVA
-from ded_bench.problem.lossless_case import LosslessCase
+from ded_bench.problem.lossless_case import LosslessCase, lossless
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import rounded
 
@@ -155,7 +155,7 @@ def imported(path: str | Path, dynamics: str | Path, name: str, like: Case | Non
     grid, known = _grid(path), _dynamics(dynamics)
     voltage, generated = _power_flow(grid)
     units = _units(grid, dynamics, known, generated)
-    like = alike(len(grid.bus) + len(units)) if like is None else like
+    like = alike(len(grid.bus) + len(units)) if like is None else lossless(like)
     data = _record(grid, name, like, units, voltage)
     case = parse_record(LosslessCase, json.dumps(data), path)
     fastest = float(np.abs(plant_of(case).nominal().modes).max()) / (2 * np.pi)

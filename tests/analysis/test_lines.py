@@ -81,6 +81,15 @@ def test_the_newest_model_and_policy_count_and_of_time_limits_the_newest_row() -
     assert newest(frame[:0])[0].empty
 
 
+def test_versions_of_a_method_do_not_mix() -> None:
+    """Though the older one has more rows, and no model or policy tells them apart."""
+    old = [row(name, "ded-slp", 1.0, date="2026-01", method_version=1) for name in "abc"]
+    frame = frame_of(*old, row("a", "ded-slp", 2.0, date="2026-02", method_version=2))
+    rows, notes = newest(frame)
+    assert rows["objective"].to_list() == [2.0]
+    assert len(notes) == 1
+
+
 def test_beside_the_paper_the_usual_surrogate_stands_alone() -> None:
     frame = frame_of(
         *(row("a", "ded-ko", 1.0, model=f"{name}@1") for name in ("koopman", "linear")),

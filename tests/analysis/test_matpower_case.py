@@ -160,6 +160,24 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, capsys, old: str, new
     assert not (tmp_path / "s").exists()
 
 
+def test_regimes_are_those_of_any_lossless_case(tmp_path: Path, capsys) -> None:
+    """The paper's, too, whose file is of an older schema."""
+    grid, dynamics = files(tmp_path)
+    line = ["import", str(grid), "--dynamics", str(dynamics), "--out", str(tmp_path / "s"), "--like"]
+    assert "has no lossless network" in refused(capsys, *line, "two-area-agc")
+    assert main([*line, "9bus"]) == 0
+    assert Case.load(tmp_path / "s").regimes == Case.load("9bus").regimes
+
+
+def test_more_machines_at_a_bus_than_letters_are_refused(tmp_path: Path, capsys) -> None:
+    machine = "  3  40  0 99 -99 1.01 50 1 60 10;\n"
+    many = SMALL.replace(machine, machine.replace("40", "2").replace("60 10", "60 0") * 27)
+    grid, dynamics = files(tmp_path, many, DYNAMICS + "3,5,0.2,80,0.7\n" * 26)
+    assert "string should match" in refused(
+        capsys, "import", grid, "--dynamics", dynamics, "--out", tmp_path / "s"
+    )
+
+
 def test_what_is_read_of_a_file(tmp_path: Path) -> None:
     found = read_matpower(files(tmp_path)[0])
     assert {name: values.shape for name, values in found.items()} == {

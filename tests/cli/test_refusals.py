@@ -136,6 +136,7 @@ def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
     assert "--workers" in refused(capsys, *SOLVE, "--workers", "0", *chosen, *out)
     both = ("--workers", "1", "--scheduler", "tcp://127.0.0.1:1")
     assert "not allowed with" in refused(capsys, *SOLVE, *both, *chosen, *out)
+    assert "--delta" in refused(capsys, "certify", "--delta", "5")
     for limit in ("nan", "1e16"):  # no table could be read with the latter
         assert "--time-limit" in refused(capsys, *SOLVE, "--time-limit", limit, *chosen, *out)
     assert "'XX'" in refused(capsys, "score", *chosen, "--schedule", schedule_file, "--regime", "XX")

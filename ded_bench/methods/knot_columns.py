@@ -48,30 +48,14 @@ class OutputRows:
         """Rows of limits at places, columns by knots but the first and generators."""
         new = np.array(sorted(set(places.tolist()) - self._in_set_points.keys()), dtype=int)
         if len(new):
-            found = self._model.by_set_points(self._local(new))[:, 1:].reshape(len(new), -1)
+            point, output = np.divmod(new, self._n_out)
+            rows = self._model.output_rows(output, point)
+            found = self._model.by_set_points(rows)[:, 1:].reshape(len(new), -1)
             found[np.abs(found) < ROUND_OFF] = 0.0
             self._in_set_points.update(zip(new.tolist(), found, strict=True))
         n_columns = self._model.p_gen[1:].size
         values = [self._in_set_points[place] for place in places.tolist()]
         return sp.csc_matrix(np.array(values).reshape(-1, n_columns))
-
-    def _local(self, places: Indices) -> LocalRows:
-        """Rows in the variables of intervals; a knot's are those of the interval after it."""
-        (point, output), model = np.divmod(places, self._n_out), self._model
-        interval = np.searchsorted(model.points, point, side="right") - 1
-        steps, x = point - model.points[interval], model.output[output]
-        on_start, on_slope = np.zeros((2, len(places), model.p_gen.shape[1]))
-        for j in np.unique(interval[steps > 0]).tolist():
-            for bit, power in enumerate(model.doubled):
-                chosen = (interval == j) & (steps >> bit & 1 == 1)
-                f, g, h = (x[chosen] @ part[j] for part in power)
-                on_slope[chosen] += 2**bit * on_start[chosen] + h
-                on_start[chosen] += g
-                x[chosen] = f
-        between = steps > 0
-        x[between] = model.before_reset(x[between], interval[between])
-        on_slope[between] /= model.lengths[interval[between], None]
-        return LocalRows(interval, x, on_start - on_slope, on_slope)
 
 
 class BasisByPlaces(NamedTuple):

@@ -359,5 +359,5 @@ class KnotProgram:
         return every[np.flatnonzero(self._held)]
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
-        rows = self.model.frequency_rows(limits[:, 0], limits[:, 1])
+        rows = self.model.output_rows(limits[:, 0], limits[:, 1])
         return self._columns.matrix(len(limits), self._columns.local(rows, np.arange(len(limits))))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from ded_bench.plants.hold import Indices
@@ -87,8 +85,9 @@ def knot_weights(lengths: Indices) -> Array:
 
 def divided(points: Indices, parts: Indices) -> Indices:
     """First grid points of so many nearly equal parts of every interval between knots."""
-    ends = zip(itertools.pairwise(points), parts, strict=True)
-    return np.concatenate([np.linspace(*pair, count, endpoint=False).astype(int) for pair, count in ends])
+    start, length, count = (np.repeat(values, parts) for values in (points[:-1], np.diff(points), parts))
+    number = np.arange(len(count)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.asarray(start + length * number // count)
 
 
 def power_limits(case: Case, instance: Instance, lengths: Indices) -> tuple[Array, Array]:

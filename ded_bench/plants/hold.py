@@ -40,15 +40,24 @@ class Hold(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums over grid points as rows in x, u and Δu per step at the first of them, one for each interval."""
+    """Rows in x, u and Δu per step at some grid point, one or several for each interval."""
 
-    x: Array  # (n_intervals, n_state)
-    u: Array  # (n_intervals, n_gen)
-    slope: Array  # (n_intervals, n_gen)
+    x: Array  # (..., n_state)
+    u: Array  # (..., n_gen)
+    slope: Array  # (..., n_gen)
+
+    @staticmethod
+    def of(x: Array, u: Array) -> Sums:
+        """Rows in x and u alone."""
+        return Sums(x, u, np.zeros_like(u))
+
+    def take(self, chosen: Indices) -> Sums:
+        """Some of the rows."""
+        return Sums(*(part[chosen] for part in self))
 
     def after(self, first: Hold, steps: int) -> Sums:
-        """As rows in what is `steps` steps earlier, the map over which is `first`."""
-        x, u, slope = ((self.x[:, None] @ part)[:, 0] for part in first)
+        """As rows in what is `steps` steps earlier, the map over which is `first`: (n_maps, n_rows, ...)."""
+        x, u, slope = (self.x @ part for part in first)
         return Sums(x, u + self.u, slope + steps * self.u + self.slope)
 
 

@@ -15,7 +15,6 @@ all intervals, around its own rollout under any powers.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -32,11 +31,6 @@ class LocalRows(NamedTuple):
     x: Array  # (n_rows, n_state)
     start: Array  # (n_rows, n_gen)
     end: Array  # (n_rows, n_gen)
-
-    def take(self, interval: Indices, slot: Indices) -> LocalRows:
-        """Chosen rows of several in each interval, by interval and place."""
-        chosen = interval, slot
-        return LocalRows(interval, self.x[chosen], self.start[chosen], self.end[chosen])
 
 
 class Delivered(NamedTuple):
@@ -154,23 +148,17 @@ class TimeVarying:
         owner = np.repeat(np.arange(len(self.lengths)), self.lengths)
         return np.append(owner, owner[-1])
 
-    def frequency_rows(self, generators: Indices, points: Indices) -> LocalRows:
-        """δω at single grid points, as rows in the variables of the intervals that they lie in.
+    def output_rows(self, outputs: Indices, points: Indices) -> LocalRows:
+        """Outputs at single grid points, as rows in the variables of the intervals that they lie in.
 
         Args:
-            generators: of which generator each row is, shape (n_rows,).
-            points: at which grid point, none of them the first, shape (n_rows,).
+            outputs: which one each row is, shape (n_rows,).
+            points: at which grid point, shape (n_rows,). A knot's row is that of the interval after it; the
+                last knot's has n_intervals for it, and no u.
         """
-        interval = np.searchsorted(self.points, points) - 1
-        steps, slot = points - self.points[interval], _places(interval)
-        chosen, place = np.unique(interval, return_inverse=True)
-
-        def add(r: int, costate: Array) -> None:
-            here = np.flatnonzero(steps == r)
-            costate[place[here], slot[here]] += self.output[generators[here]]
-
-        rows = self._costates(int(slot.max(initial=-1)) + 1, add, chosen).take(place, slot)
-        return rows._replace(interval=interval)
+        interval = np.searchsorted(self.points, points, side="right") - 1
+        rows = Sums.of(self.output[outputs], np.zeros((len(points), self.p_gen.shape[1])))
+        return self._local(rows, interval, points - self.points[interval])
 
     def slack_rows(self, first: Indices) -> LocalRows:
         """Sums of δP_s over stretches of grid points, as rows in the variables of their intervals.
@@ -180,14 +168,9 @@ class TimeVarying:
                 where the next one starts. All knots but the last start one: the last is the last stretch's.
         """
         interval = np.searchsorted(self.points[:-1], first, side="right") - 1
-        ends, slot = np.append(first[1:], len(self.omega)), _places(interval)
-        begin, end = first - self.points[interval], ends - self.points[interval]
-
-        def add(r: int, costate: Array) -> None:
-            here = np.flatnonzero((begin <= r) & (r < end))
-            costate[interval[here], slot[here]] += self.slack[interval[here]]
-
-        return self._costates(int(slot.max()) + 1, add).take(interval, slot)
+        point = Sums.of(self.slack[interval], np.zeros((len(first), self.p_gen.shape[1])))
+        rows = self._summed(point, interval, np.diff(np.append(first, len(self.omega))))
+        return self._local(rows, interval, first - self.points[interval])
 
     def cost_rows(self, cost: Array) -> LocalRows:
         """Sums of cost · δP, as delivered, over the grid points of every interval, a row for each.
@@ -196,26 +179,47 @@ class TimeVarying:
             cost: of the generators, shape (n_gen,).
         """
         assert self.delivered is not None  # else its caller has another way
-        on_state, on_input = (np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2])
+        point = Sums.of(*(np.einsum("g,jgi->ji", cost, part) for part in self.delivered[:2]))
+        interval, counts = np.arange(len(self.lengths)), self.lengths.copy()
+        counts[-1] += 1  # the point at a knot is of the interval after it, the last of the last one
+        return self._local(self._summed(point, interval, counts), interval, np.zeros_like(counts))
 
-        length, count = self.lengths[:, None], self.lengths[:, None].copy()
-        count[-1] += 1  # the point at a knot is of the interval after it, the last of the last one
-        none = np.zeros_like(on_input)
-        total, block = Sums(0.0 * on_state, none, none), Sums(on_state, none, none)
-        # Blocks of 1, 2, 4, ... points, each before the shorter ones.
-        for bit in range(int(count.max()).bit_length()):
-            chosen, later, twice = (count >> bit & 1) == 1, total, block
-            if bit < len(self.doubled):
-                later, twice = (one.after(self.doubled[bit], 2**bit) for one in (total, block))
-            total = Sums(
-                *(np.where(chosen, b + t, old) for b, t, old in zip(block, later, total, strict=True))
-            )
-            block = Sums(*(b + t for b, t in zip(block, twice, strict=True)))
-        # u rises linearly over an interval: Σ r / length over its points, of which the last has one more.
-        risen = (count - 1.0) * count / 2.0 / length
-        end = on_input * risen + total.slope / length
-        start = on_input * count + total.u - end
-        return LocalRows(np.arange(len(count)), self.before_reset(total.x, np.arange(len(count))), start, end)
+    def _summed(self, block: Sums, interval: Indices, counts: Indices) -> Sums:
+        """Rows of single points, which are changed, summed over so many of them: by blocks of 1, 2, 4, ..."""
+        total = Sums(*(np.zeros_like(part) for part in block))
+        for bit in range(int(counts.max()).bit_length()):
+            here = np.flatnonzero(counts >> bit & 1)  # a block comes before the shorter ones
+            later = self._earlier(total.take(here), interval[here], bit)
+            for whole, one, rest in zip(total, block, later, strict=True):
+                whole[here] = one[here] + rest
+            here = np.flatnonzero(counts >> bit + 1)
+            later = self._earlier(block.take(here), interval[here], bit)
+            for one, rest in zip(block, later, strict=True):
+                one[here] += rest
+        return total
+
+    def _local(self, rows: Sums, interval: Indices, steps: Indices) -> LocalRows:
+        """Rows in x, u and Δu so many steps after the start of their intervals, in these ones' variables."""
+        for bit in range(len(self.doubled)):
+            here = np.flatnonzero(steps >> bit & 1)
+            moved = self._earlier(rows.take(here), interval[here], bit)
+            for whole, part in zip(rows, moved, strict=True):
+                whole[here] = part
+        end = rows.slope / np.append(self.lengths, 1)[interval, None]
+        return LocalRows(interval, self.before_reset(rows.x, interval), rows.u - end, end)
+
+    def _earlier(self, rows: Sums, interval: Indices, bit: int) -> Sums:
+        """Rows as those in x, u and Δu 2**bit grid steps earlier, all of an interval at once."""
+        if bit == len(self.doubled):  # no interval is as long: there are none, or sums of no points
+            return rows
+        chosen, place = np.unique(interval, return_inverse=True)
+        slot = _places(interval)
+        shape = len(chosen), int(slot.max(initial=-1)) + 1
+        together = Sums(*(np.zeros((*shape, part.shape[1])) for part in rows))
+        for whole, part in zip(together, rows, strict=True):
+            whole[place, slot] = part
+        moved = together.after(self.doubled[bit].take(chosen), 2**bit)
+        return Sums(*(part[place, slot] for part in moved))
 
     def gradient(self, by_omega: Array, by_p_slack: Array, by_p_gen: Array) -> Array:
         """Derivatives of any function of the outputs by the set-points at the knots, by the adjoint.
@@ -236,11 +240,12 @@ class TimeVarying:
                 on_state[k] += by_p_gen[k] @ self.delivered.c[j]
                 on_input[k] = by_p_gen[k] @ self.delivered.d[j]
 
-        def add(r: int, costate: Array) -> None:
+        rows = Sums.of(np.zeros_like(self.slack)[:, None], np.zeros((len(length), 1, self.p_gen.shape[1])))
+        for r in range(int(length.max()), -1, -1):
             here = np.flatnonzero(r < np.append(length[:-1], length[-1] + 1))
-            costate[here, 0] += on_state[self.points[here] + r]
-
-        rows = self._costates(1, add)
+            rows.x[here, 0] += on_state[self.points[here] + r]
+            rows = rows.after(self.step, 1) if r else rows
+        local = self._local(Sums(*(part[:, 0] for part in rows)), np.arange(len(length)), 0 * length)
         later = ((np.arange(len(owner)) - self.points[owner]) / length[owner])[:, None]
         found = np.zeros_like(self.p_gen)
         np.add.at(found, owner, (1.0 - later) * on_input)
@@ -248,9 +253,9 @@ class TimeVarying:
         costate = np.zeros(self.slack.shape[1])
         for j in reversed(range(len(length))):
             slope = costate @ self.across.h[j] / length[j]
-            found[j + 1] += slope + rows.end[j, 0]
-            found[j] += costate @ self.across.g[j] - slope + rows.start[j, 0]
-            costate = costate @ self.across.f[j] + rows.x[j, 0]
+            found[j + 1] += slope + local.end[j]
+            found[j] += costate @ self.across.g[j] - slope + local.start[j]
+            costate = costate @ self.across.f[j] + local.x[j]
         return found
 
     def by_set_points(self, rows: LocalRows) -> Array:
@@ -276,34 +281,6 @@ class TimeVarying:
             found[later, j] += costate[later] @ self.across.g[j] - end
             costate[later] = costate[later] @ self.across.f[j]
         return found
-
-    def _costates(
-        self, n_rows: int, add: Callable[[int, Array], None], chosen: Indices | None = None
-    ) -> LocalRows:
-        """The adjoint recursion through all intervals, or some, at once, `n_rows` weighted sums in each.
-
-        Args:
-            n_rows: sums per interval.
-            add: called with a number of steps r from the intervals' starts, and the costates there, shape
-                (n_intervals, n_rows, n_state), to which it adds the weights of δx at that point.
-            chosen: intervals, in ascending order.
-        """
-        chosen = np.arange(len(self.slack)) if chosen is None else chosen
-        lengths = self.lengths[chosen]
-        (n_state, n_gen), n = (self.slack.shape[1], self.p_gen.shape[1]), len(lengths)
-        f, g, h = self.step if n == len(self.slack) else self.step.take(chosen)
-        costate = np.zeros((n, n_rows, n_state))
-        on_start, on_slope = np.zeros((2, n, n_rows, n_gen))
-        for r in range(int(lengths.max(initial=0)), -1, -1):
-            add(r, costate)
-            if r:
-                through = costate @ g
-                on_start += through
-                on_slope += (r - 1) * through + costate @ h
-                costate = costate @ f
-        costate = self.before_reset(costate, chosen)
-        end = on_slope / lengths[:, None, None]
-        return LocalRows(np.arange(n), costate, on_start - end, end)
 
 
 def _places(interval: Indices) -> Indices:

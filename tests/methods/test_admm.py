@@ -34,6 +34,7 @@ from ded_bench.methods.admm.torch_iterations import (
 )
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
+from ded_bench.plants.plant import simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
@@ -235,6 +236,31 @@ def test_without_training_eighty_iterations_are_near_the_optimum(ninebus: Case, 
         ours, best = (score(ninebus, instance, one(instance).schedule, "TO") for one in (solve, optimal))
         assert ours.feasible
         assert ours.objective < 1.005 * best.objective
+
+
+def test_margin_is_left_free_of_the_bound(ninebus: Case, tmp_path: Path) -> None:
+    """Where the bound binds, the largest |ω| is lower by the margin, and the cost is higher."""
+    policy, path = random_policy("ded-admm", ninebus, 0.0, 60.0), tmp_path / "p.safetensors"
+    policy.save(path)
+    bound, found = ninebus.omega_bound("TO"), []
+    instance = sample_instance(ninebus, VALIDATION_SEED, 2)  # starts slowly
+    for options in ("iterations=80", "iterations=80,margin=0.3"):
+        schedule = prepare(ninebus, "TO", Settings(options, policy=path))(instance).schedule
+        largest = np.abs(simulate(ninebus, instance, schedule).omega[1:]).max()
+        found.append((largest / bound, score(ninebus, instance, schedule, "TO").objective))
+    (near, cheap), (far, dear) = found
+    assert near > 0.9
+    assert far < 0.75
+    assert dear > cheap
+
+
+@pytest.mark.parametrize(
+    ("case", "options"),
+    [("9bus", "margin=1"), ("two-area-agc", "margin=0.1")],
+)
+def test_margin_is_refused_where_there_is_none(case: str, options: str) -> None:
+    with pytest.raises(InputError, match="margin"):
+        prepare(Case.load(case), "TO", Settings(options))
 
 
 def test_weights_learned_for_few_iterations_do_not_serve_many(ninebus: Case) -> None:

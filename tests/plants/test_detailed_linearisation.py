@@ -53,8 +53,8 @@ def test_rows_are_those_of_the_rollout(made):
     plant, instance, trajectory, model = made
     u = increments(model, 0.1)
     x, n = model.states(u), len(plant.case.generators)
-    points = np.repeat([37, 38, 200, 201, 399, 400, 401, 700], n)
-    rows = model.frequency_rows(np.tile(np.arange(n), 8), points)
+    points = np.repeat([37, 38, 200, 201, 399, 400, 401, 699], n)
+    rows = model.output_rows(np.tile(np.arange(n), 8), points)
     expected = (model.outputs(u)[0] - trajectory.omega)[points, np.tile(np.arange(n), 8)]
 
     def valued(rows):

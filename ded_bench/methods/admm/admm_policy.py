@@ -41,6 +41,7 @@ class Options:
     """Parameters of `ded-admm`."""
 
     iterations: int = option(0, "iterations beyond the policy's own", lowest=0)
+    margin: float | None = option(None, "part of the bound to leave free instead of the learned", lowest=0)
 
 
 class AdmmPolicy(TrainedPolicy):
@@ -60,10 +61,10 @@ class AdmmPolicy(TrainedPolicy):
             self.grid, self.grid.bound, self.weights["nodes"], self.training["iterations"]
         )
 
-    def further(self, iterations: int) -> CompiledIterations:
+    def further(self, iterations: int, margin: float = MARGIN) -> CompiledIterations:
         """So many iterations to go on with."""
         few, nodes = self.training["iterations"] < LEARNED_FOR, self.weights["nodes"]
-        bound = (1.0 - MARGIN) * self.scope.case.omega_bound(self.scope.regime)
+        bound = (1.0 - margin) * self.scope.case.omega_bound(self.scope.regime)
         return CompiledIterations(self.grid, bound, np.zeros_like(nodes) if few else nodes, iterations)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
@@ -115,12 +116,17 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     Raises:
         InputError: there is no policy (names the command that trains one), or it does not fit.
     """
-    iterations, own = read_options(Options, settings.options).iterations, replace(settings, model="")
+    options, own = read_options(Options, settings.options), replace(settings, model="")
+    iterations, margin = options.iterations, options.margin
+    if margin is not None and (margin >= 1.0 or case.slack is None):
+        raise InputError("--set", "margin", "is a part of the bound beside a slack, less than 1")
     if case.slack is None:
         island = IslandPolicy.find(case, regime, own)
         return as_solver(island, lambda instance: island.powers(instance, iterations), iterations)
     policy = AdmmPolicy.find(case, regime, own)
-    further = policy.further(iterations) if iterations else None
+    if margin is not None:
+        policy = replace(policy, training={**policy.training, "margin": margin})
+    further = policy.further(iterations, MARGIN if margin is None else margin) if iterations else None
 
     def answer(instance: Instance) -> Array:
         return np.asarray(policy.powers(policy.problems([instance]), further)[0])

@@ -1,9 +1,11 @@
-"""Operate drawn scenarios with `ded-rti`, perhaps with other constants, and say what it costs and keeps.
+"""Operate drawn scenarios with a method, `ded-rti` perhaps with other constants: what it costs and keeps.
 
     python studies/drawn_operation.py two-area --count 50 --latency 0.05 --set ALWAYS=0.1 SWING_S=2
+    python studies/drawn_operation.py 39bus --method ded-admm --options iterations=80,margin=0.1
 
 Prints cost over hindsight, the largest excess over the bound, and the processor time of plans, of each
-scenario and of all. Names are those of constants in `methods/surprises.py` and `methods/ded_rti.py`.
+scenario and of all. Names are those of constants in `methods/surprises.py` and `methods/ded_rti.py`. Policies
+are those of the case's reference run.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -39,17 +42,26 @@ class Operated(NamedTuple):
 
 
 def operated(
-    case: Case, scenario: Scenario, options: LoopOptions, constants: Mapping[str, float]
+    case: Case,
+    scenario: Scenario,
+    options: LoopOptions,
+    constants: Mapping[str, float],
+    method: str = "ded-rti",
+    settings: str = "",
 ) -> Operated:
     """Operate a scenario with some constants changed, for all that follows in this process, too."""
     for name, value in constants.items():
         setattr(surprises if hasattr(surprises, name) else ded_rti, name, value)
-    solver, spent = get_method("ded-rti").prepare(case, REGIME, Settings()), 0.0
+    results = Path("results") / f"{case.id}-reference"
+    solver, spent = get_method(method).prepare(case, REGIME, Settings(settings, search=(results,))), 0.0
 
     def ask(instance: Instance, last: Schedule | None) -> Planned:
         nonlocal spent
         began = time.process_time()
-        plan = solver.solve(instance, None if last is None else Solution(Status.FEASIBLE, last))
+        if hasattr(solver, "solve"):
+            plan = solver.solve(instance, None if last is None else Solution(Status.FEASIBLE, last))
+        else:
+            plan = solver(instance)
         spent += time.process_time() - began
         return Planned(plan.schedule)
 
@@ -60,10 +72,10 @@ def operated(
 
 
 def _one(
-    case: Case, index: int, duration_s: float, options: LoopOptions, constants: dict[str, float]
+    case: Case, index: int, duration_s: float, options: LoopOptions, constants: dict[str, float], *method: str
 ) -> tuple[int, float, Operated]:
     scenario = sample_scenario(case, SEED, index, servable, duration_s)
-    found = operated(case, scenario, options, constants)
+    found = operated(case, scenario, options, constants, *method)
     _, best, _ = hindsight(case, scenario, REGIME)
     return index, 100 * (found.objective / best.objective - 1), found
 
@@ -83,20 +95,25 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--count", type=int, default=10)
     parser.add_argument("--duration", type=float, default=DURATION_S)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--method", default="ded-rti")
+    parser.add_argument("--options", default="")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE")
     a = parser.parse_args()
     case, options = Case.load(a.case), LoopOptions(period_s=a.period, latency_s=a.latency)
     constants = {name: float(value) for name, value in (text.split("=") for text in a.set)}
     rows = []
     with ProcessPoolExecutor(a.workers, initializer=threadpool_limits, initargs=(1,)) as pool:
-        calls = [pool.submit(_one, case, index, a.duration, options, constants) for index in range(a.count)]
+        given = a.duration, options, constants, a.method, a.options
+        calls = [pool.submit(_one, case, a.first + index, *given) for index in range(a.count)]
         for call in calls:
             index, increase, found = call.result()
             rows.append((increase, max(1e3 * found.excess_hz, 0.0), found.plans_s))
             print("{}: {:.3f} %, {:.3f} mHz, {:.1f} s".format(index, *rows[-1]), flush=True)
     increase, excess, seconds = np.array(rows).T
     print(
-        f"{a.case} {constants or ''}: {increase.mean():.3f} %, excess {excess.mean():.4f} mHz in the mean, "
+        f"{a.case} {a.method} {a.options} {constants or ''}: {increase.mean():.3f} %, "
+        f"excess {excess.mean():.4f} mHz in the mean, "
         f"{excess.max():.3f} at most, none in {int((excess == 0).sum())} of {a.count}; {seconds.mean():.1f} s"
     )
 

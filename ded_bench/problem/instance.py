@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import itertools
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +68,7 @@ class LoadPoints(Record):
         times = [t for t, _ in self.points]
         if times[0] != 0:
             raise ValueError("points: must start at t = 0")
-        if any(b <= a for a, b in itertools.pairwise(times)):
+        if not all(map(operator.lt, times, times[1:])):
             raise ValueError("points: times must increase strictly")
         return self
 

@@ -6,7 +6,7 @@ And forecasts: what is known at an instant of a scenario's loads from then on.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -242,15 +242,12 @@ def _load(load: ScenarioLoad, quality: str, now: float, until: float) -> tuple[A
     if quality == "persistence":
         return np.array([now, until]), np.full(2, load.at(np.array(now)))
     if quality == "perfect":
-        inside = load.fluctuation.times
-        inside = inside[(inside > now) & (inside < until)].tolist()
-        times = _joined([*inside, *(t for ramp in load.ramps for t in (ramp.start, ramp.end))], now, until)
+        ends = [t for ramp in load.ramps for t in (ramp.start, ramp.end)]
+        times = _joined(np.append(load.fluctuation.times, ends), now, until)
         return times, load.at(times)
     ramps = tuple(_expected(load, WORSE if quality == "worse" else 1.0, now))
-    steps = np.arange(now, until, load.fluctuation.step_s).tolist()
-    times = _joined(
-        [*steps, *(t for start, duration, _ in ramps for t in (start, start + duration))], now, until
-    )
+    ends = [t for start, duration, _ in ramps for t in (start, start + duration)]
+    times = _joined(np.append(np.arange(now, until, load.fluctuation.step_s), ends), now, until)
     decay = np.exp(-(times - now) / load.fluctuation.decay_s)
     ramped = sum(rate * ramped_for(times, start, duration) for start, duration, rate in ramps)
     return times, np.asarray(load.initial + ramped + load.fluctuation_at(np.array(now)) * decay)
@@ -266,18 +263,16 @@ def _expected(load: ScenarioLoad, wrong: float, now: float) -> Iterator[tuple[fl
             yield start, ramp.duration, ramp.rate + wrong * (ramp.announced_rate - ramp.rate)
 
 
-def _joined(times: Iterable[float], first: float, last: float) -> Array:
+def _joined(times: Array, first: float, last: float) -> Array:
     """The times strictly between two, each once, and these two."""
-    kept = [first]
-    for t in sorted(times):
-        if kept[-1] + RESOLUTION < t < last - RESOLUTION:
-            kept.append(t)
-    return np.array([*kept, last])
+    ordered = np.append(first, np.sort(times))
+    new = (ordered[1:] - np.maximum(ordered[:-1], first) > RESOLUTION) & (ordered[1:] < last - RESOLUTION)
+    return np.concatenate([[first], ordered[1:][new], [last]])
 
 
 def _points(times: Array, values: Array, start: float, horizon_s: float) -> LoadPoints:
-    chosen = _joined(times.tolist(), start, start + horizon_s)
-    relative = chosen - start
-    relative[-1] = horizon_s
-    pairs = zip(relative.tolist(), np.interp(chosen, times, values).tolist(), strict=True)
-    return LoadPoints(points=tuple(pairs))
+    end = start + horizon_s
+    inside = slice(*np.searchsorted(times, [start + RESOLUTION, end - RESOLUTION]))
+    relative = [0.0, *(times[inside] - start).tolist(), horizon_s]
+    ends = np.interp([start, end], times, values).tolist()
+    return LoadPoints(points=tuple(zip(relative, [ends[0], *values[inside].tolist(), ends[1]], strict=True)))

@@ -128,7 +128,7 @@ def validate(
     with Workers(workers) as pool:
         for row, verdict in verdicts(case, results.kept(instances), instances, results, pool, plant):
             rows.append(ValidatedRow(**vars(scored_row(dataclasses.replace(row, plant=plant), verdict))))
-    table.add(rows)
+            table.add(rows[-1:])
     table.compact()
     return rows
 

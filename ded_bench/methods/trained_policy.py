@@ -177,17 +177,23 @@ def as_solver(policy: TrainedPolicy, answer: Callable[[Instance], Array], iterat
         answer: powers at its knots, (n_knots, n_gen), pu.
         iterations: what rows tell of them, if there are any.
     """
-    scope = policy.scope
 
     def solve(instance: Instance) -> Solution:
-        started = time.perf_counter()
-        scope.check([instance])
-        schedule = Schedule(policy.knots, answer(instance))
-        elapsed = time.perf_counter() - started
-        return Solution(
-            Status.POLICY, schedule, iterations or None, solve_s=elapsed, solver_version=SOLVER_VERSION
-        )
+        return answered(policy, instance, lambda: answer(instance), iterations)
 
-    instance = sample_instance(scope.case, POLICY_SEED, 0, servable)
-    solve(instance.model_copy(update={"horizon_s": scope.horizon_s}))
+    instance = sample_instance(policy.scope.case, POLICY_SEED, 0, servable)
+    solve(instance.model_copy(update={"horizon_s": policy.scope.horizon_s}))
     return solve
+
+
+def answered(
+    policy: TrainedPolicy, instance: Instance, answer: Callable[[], Array], iterations: int = 0
+) -> Solution:
+    """Take the time of one answer; see `as_solver`."""
+    started = time.perf_counter()
+    policy.scope.check([instance])
+    schedule = Schedule(policy.knots, answer())
+    elapsed = time.perf_counter() - started
+    return Solution(
+        Status.POLICY, schedule, iterations or None, solve_s=elapsed, solver_version=SOLVER_VERSION
+    )

@@ -6,7 +6,8 @@ And forecasts: what is known at an instant of a scenario's loads from then on.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -82,6 +83,12 @@ class ScenarioLoad(Record):
         """Injection in pu at times `t` in s (any shape)."""
         ramped = sum(ramp.rate * ramped_for(t, ramp.start, ramp.duration) for ramp in self.ramps)
         return np.asarray(self.initial + ramped + self.fluctuation_at(t))
+
+    def courses(self, count: int) -> Array:
+        """Start, duration, rate, announced start and rate of ramps, (5, count); unannounced: NaN."""
+        given = [(r.start, r.duration, r.rate, r.announced_start, r.announced_rate) for r in self.ramps]
+        none = [(np.inf, 0.0, 0.0, None, None)] * (count - len(given))
+        return np.array(given + none, dtype=np.float64).reshape(count, 5).T
 
     def fluctuation_at(self, t: Array) -> Array:
         """Fluctuation in pu at times `t` in s (any shape)."""
@@ -235,39 +242,43 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
         now: when the forecast is made.
         until: the end of what is asked for; after `now`.
     """
-    return Forecast(tuple(_load(scenario.load[bus], quality, now, until) for bus in case.loads))
-
-
-def _load(load: ScenarioLoad, quality: str, now: float, until: float) -> tuple[Array, Array]:
+    loads = [scenario.load[bus] for bus in case.loads]
     if quality == "persistence":
-        return np.array([now, until]), np.full(2, load.at(np.array(now)))
+        return Forecast(tuple((np.array([now, until]), np.full(2, load.at(np.array(now)))) for load in loads))
     if quality == "perfect":
-        ends = [t for ramp in load.ramps for t in (ramp.start, ramp.end)]
-        times = _joined(np.append(load.fluctuation.times, ends), now, until)
-        return times, load.at(times)
-    ramps = tuple(_expected(load, WORSE if quality == "worse" else 1.0, now))
-    ends = [t for start, duration, _ in ramps for t in (start, start + duration)]
-    times = _joined(np.append(np.arange(now, until, load.fluctuation.step_s), ends), now, until)
-    decay = np.exp(-(times - now) / load.fluctuation.decay_s)
-    ramped = sum(rate * ramped_for(times, start, duration) for start, duration, rate in ramps)
-    return times, np.asarray(load.initial + ramped + load.fluctuation_at(np.array(now)) * decay)
+        return Forecast(tuple(_true(load, now, until) for load in loads))
+    # All loads at once: an operator's hour asks for 3,600 forecasts.
+    most = max(len(load.ramps) for load in loads)
+    start, duration, rate, told_start, told_rate = np.stack([load.courses(most) for load in loads], axis=1)
+    wrong = WORSE if quality == "worse" else 1.0
+    begun = start <= now
+    start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))
+    rate = np.where(begun, rate, rate + wrong * (told_rate - rate))
+    start, rate = np.where(np.isnan(rate), np.inf, start), np.nan_to_num(rate)  # nobody told of these
+    fluctuations = [load.fluctuation for load in loads]
+    step, decay = np.array([(f.step_s, f.decay_s) for f in fluctuations]).T[:, :, None]
+    steps = now + step * np.arange(math.ceil((until - now) / step.min()) + 1)
+    times = np.sort(np.concatenate([np.minimum(steps, until), start, start + duration], axis=1), axis=1)
+    times = np.clip(times, now, until)
+    gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
+    fallen = np.exp((now - times) / decay)
+    present = np.array([(load.initial, float(load.fluctuation_at(np.array(now)))) for load in loads])
+    values = present[:, :1] + (gone_on @ rate[:, :, None])[:, :, 0] + present[:, 1:] * fallen
+    return Forecast(tuple(map(_distinct, times, values)))
 
 
-def _expected(load: ScenarioLoad, wrong: float, now: float) -> Iterator[tuple[float, float, float]]:
-    """Start, duration and rate of ramps that are known at `now`; announcements are `wrong` times as wrong."""
-    for ramp in load.ramps:
-        if ramp.start <= now:
-            yield ramp.start, ramp.duration, ramp.rate
-        elif ramp.announced_start is not None and ramp.announced_rate is not None:
-            start = max(ramp.start + wrong * (ramp.announced_start - ramp.start), now)
-            yield start, ramp.duration, ramp.rate + wrong * (ramp.announced_rate - ramp.rate)
+def _true(load: ScenarioLoad, now: float, until: float) -> tuple[Array, Array]:
+    ends = [t for ramp in load.ramps for t in (ramp.start, ramp.end)]
+    times = np.sort(np.concatenate([[now, until], load.fluctuation.times, ends]).clip(now, until))
+    return _distinct(times, load.at(times))
 
 
-def _joined(times: Array, first: float, last: float) -> Array:
-    """The times strictly between two, each once, and these two."""
-    ordered = np.append(first, np.sort(times))
-    new = (ordered[1:] - np.maximum(ordered[:-1], first) > RESOLUTION) & (ordered[1:] < last - RESOLUTION)
-    return np.concatenate([[first], ordered[1:][new], [last]])
+def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
+    """Points in order, without all but the first, and the last, of those at the same time."""
+    new = np.empty(len(times), dtype=bool)
+    new[0], new[-1] = True, True
+    new[1:-1] = (times[1:-1] - times[:-2] > RESOLUTION) & (times[1:-1] < times[-1] - RESOLUTION)
+    return times[new], values[new]
 
 
 def _points(times: Array, values: Array, start: float, horizon_s: float) -> LoadPoints:
@@ -275,4 +286,5 @@ def _points(times: Array, values: Array, start: float, horizon_s: float) -> Load
     inside = slice(*np.searchsorted(times, [start + RESOLUTION, end - RESOLUTION]))
     relative = [0.0, *(times[inside] - start).tolist(), horizon_s]
     ends = np.interp([start, end], times, values).tolist()
-    return LoadPoints(points=tuple(zip(relative, [ends[0], *values[inside].tolist(), ends[1]], strict=True)))
+    points = tuple(zip(relative, [ends[0], *values[inside].tolist(), ends[1]], strict=True))
+    return LoadPoints.model_construct(points=points)  # times increase; checks would take as long as the plant

@@ -13,20 +13,23 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import (
     FORGOTTEN,
     RAMP_MARGIN,
+    RESOLUTION,
     IslandGrid,
     IslandIterations,
     swings_by,
 )
-from ded_bench.methods.island.island_policy import IslandPolicy
+from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
 from ded_bench.methods.island.island_training import FIRST, train
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.solution import Settings
+from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
+from ded_bench.solvers.status import Status
+from tests.methods.test_on_island import followed
 
 HORIZON = 8.0
 
@@ -116,3 +119,17 @@ def test_further_iterations_are_no_dearer(island: Case, instance: Instance) -> N
     cost, more = (score(island, instance, one, "TO") for one in (own, further))
     assert more.feasible
     assert more.objective <= cost.objective * (1.0 + 1e-5)
+
+
+def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instance: Instance) -> None:
+    """Set-points from the true state, to their resolution; others from what is measured alone."""
+    made = policy(island)
+    solver = IslandSolver(made, 0)
+    first = solver.solve(instance).schedule
+    assert first is not None
+    np.testing.assert_array_equal(first.p, made.powers(instance))
+    true, later, in_force = followed(island, instance, first)
+    plan = solver.solve(later, Solution(Status.FEASIBLE, in_force)).schedule
+    assert plan is not None
+    np.testing.assert_allclose(plan.p, made.powers(later, state=true), rtol=0, atol=2 * RESOLUTION)
+    assert np.abs(plan.p - made.powers(later)).max() > 100 * RESOLUTION

@@ -22,7 +22,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.detailed.detailed_plant import LEAST_LEAD_S, DetailedPlant
-from ded_bench.plants.plant import SimulationError, plant_of, simulate
+from ded_bench.plants.plant import PlantState, SimulationError, plant_of, simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -97,29 +97,28 @@ def test_outputs_of_condensed_programs_are_those_of_the_model(island: Case, inst
     np.testing.assert_allclose(change, (expected - program.model.omega)[1:], rtol=0, atol=1e-13)
 
 
-def test_an_estimate_under_a_forecast_that_comes_true_is_the_state(island: Case, instance: Instance) -> None:
-    """All of it, from plan to plan; what is measured alone leaves fluxes, exciters and gates open."""
-    plant, dt, steps = plant_of(island), instance.dt_s, 100
-    estimate, true = StateEstimate(plant), plant.initial(instance)
-    schedule = ed.dispatch(island, instance, None)
-    estimate.keep(instance, estimate.initial(instance, None), schedule)
-    piece = plant.advance(
-        true, schedule.at(instance.grid[: steps + 1]), instance.p_load(island)[: steps + 1], dt
-    )
-    passed, horizon = steps * dt, instance.horizon_s
+def followed(case: Case, instance: Instance, schedule: Schedule) -> tuple[PlantState, Instance, Schedule]:
+    """After a second under a schedule: where the plant is, what is measured, what goes on."""
+    plant, steps = plant_of(case), round(1.0 / instance.dt_s)
+    passed, horizon = steps * instance.dt_s, instance.horizon_s
+    p_set, p_load = schedule.at(instance.grid[: steps + 1]), instance.p_load(case)[: steps + 1]
+    end = plant.advance(plant.initial(instance), p_set, p_load, instance.dt_s).end
     inside = schedule.t[(schedule.t > passed) & (schedule.t <= horizon)] - passed
     times = np.concatenate([[0.0], inside, [horizon]])
-    in_force = Schedule(times, schedule.at(times + passed))
-    later = instance.model_copy(
-        update={
-            "schema_": "ded-bench/instance/2",
-            "initial": plant.observed(piece.end).initial(island),
-        }
-    )
+    measured = {"schema_": "ded-bench/instance/2", "initial": plant.observed(end).initial(case)}
+    return end, instance.model_copy(update=measured), Schedule(times, schedule.at(times + passed))
+
+
+def test_an_estimate_under_a_forecast_that_comes_true_is_the_state(island: Case, instance: Instance) -> None:
+    """All of it, from plan to plan; what is measured alone leaves fluxes, exciters and gates open."""
+    plant = plant_of(island)
+    estimate, schedule = StateEstimate(plant), ed.dispatch(island, instance, None)
+    estimate.keep(instance, estimate.initial(instance, None), schedule)
+    true, later, in_force = followed(island, instance, schedule)
     found, blind = estimate.initial(later, in_force), plant.initial(later)
-    np.testing.assert_allclose(found.x, piece.end.x, rtol=0, atol=1e-9)
-    assert np.abs(blind.x - piece.end.x).max() > 1e-4
-    other = Schedule(times, in_force.p + 1e-3)  # somebody else's plan
+    np.testing.assert_allclose(found.x, true.x, rtol=0, atol=1e-9)
+    assert np.abs(blind.x - true.x).max() > 1e-4
+    other = Schedule(in_force.t, in_force.p + 1e-3)  # somebody else's plan
     np.testing.assert_array_equal(estimate.initial(later, other).x, blind.x)
 
 

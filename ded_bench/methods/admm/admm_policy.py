@@ -18,7 +18,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
 from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import problems_of
-from ded_bench.methods.island.island_policy import IslandPolicy
+from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver
 from ded_bench.methods.stacked_instances import StackedInstances
@@ -121,8 +121,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     if margin is not None and (margin >= 1.0 or case.slack is None):
         raise InputError("--set", "margin", "is a part of the bound beside a slack, less than 1")
     if case.slack is None:
-        island = IslandPolicy.find(case, regime, own)
-        return as_solver(island, lambda instance: island.powers(instance, iterations), iterations)
+        return IslandSolver(IslandPolicy.find(case, regime, own), iterations)
     policy = AdmmPolicy.find(case, regime, own)
     if margin is not None:
         policy = replace(policy, training={**policy.training, "margin": margin})

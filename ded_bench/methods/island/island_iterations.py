@@ -20,6 +20,7 @@ import numpy as np
 
 from ded_bench.methods.knots import knot_points, track, transfer_room
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
+from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
@@ -120,8 +121,8 @@ class IslandGrid:
         back = swings.reshape(n_gen, -1).T
         return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in (mean, recent, back)))
 
-    def ask(self, instance: Instance) -> IslandProblem:
-        """Read an instance.
+    def ask(self, instance: Instance, state: DetailedState | None = None) -> IslandProblem:
+        """Read an instance, which begins in its own state or another.
 
         Raises:
             InputError, SimulationError: it has no start.
@@ -140,7 +141,7 @@ class IslandGrid:
         if case.transfers:
             room = transfer_room(case, instance, knot_points(self.knots, instance.dt_s)) - TRANSFER_MARGIN
         start = self.within(start, p_initial, room)
-        return IslandProblem(self.coarse.begin(instance), p_initial, cost, room, start)
+        return IslandProblem(self.coarse.begin(instance, state), p_initial, cost, room, start)
 
     def _merit_order(self, cost: Array, demand: Array, room: Array) -> Array:
         """Cheapest powers, whatever losses they cause; transfers are kept; (n_knots, n_gen)."""

@@ -15,10 +15,14 @@ import numpy as np
 
 from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import SETTINGS, IslandGrid, IslandIterations, IslandProblem
-from ded_bench.methods.trained_policy import TrainedPolicy
+from ded_bench.methods.solution import Solution
+from ded_bench.methods.state_estimate import StateEstimate
+from ded_bench.methods.trained_policy import TrainedPolicy, answered, as_solver
+from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.schedule import Schedule
 
 #: Penalties of mending, and no price.
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
@@ -49,15 +53,16 @@ class IslandPolicy(TrainedPolicy):
         """See `TrainedPolicy.answers`."""
         return np.stack([self.powers(instance) for instance in instances])
 
-    def powers(self, instance: Instance, further: int = 0) -> Array:
+    def powers(self, instance: Instance, further: int = 0, state: DetailedState | None = None) -> Array:
         """Set-points at the knots, (n_knots, n_gen), pu.
 
         Args:
             instance: to answer, within the scope.
             further: iterations with costs along the answer, after which it is mended again.
+            state: at t = 0; None: what is not measured is stationary.
         """
         try:
-            asked = self.grid.ask(instance)
+            asked = self.grid.ask(instance, state)
         except SimulationError as error:
             raise InputError(f"instance {instance.id}", "initial", str(error)) from None
         counts = [self.training["iterations"], *([further] if further else [])]
@@ -93,6 +98,36 @@ class IslandPolicy(TrainedPolicy):
             if not (isinstance(count, int) and 0 < count < 1000):
                 raise ValueError(f"number of {name} is missing or mistyped")
         return {"settings": (len(SETTINGS),)}
+
+
+class IslandSolver:
+    """The policy as a method.
+
+    Args:
+        policy: that answers.
+        further: see `IslandPolicy.powers`.
+    """
+
+    def __init__(self, policy: IslandPolicy, further: int) -> None:
+        self._policy, self._further = policy, further
+        self._alone = as_solver(policy, lambda instance: policy.powers(instance, further), further)
+        self._estimate = StateEstimate(policy.grid.plant)
+
+    def __call__(self, instance: Instance) -> Solution:
+        """Answer a single instance."""
+        return self._alone(instance)
+
+    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Answer in operation: what is not measured comes from a simulation of the plan in force."""
+        in_force = None if last is None else last.schedule
+
+        def powers() -> Array:
+            state = self._estimate.initial(instance, in_force)
+            found = self._policy.powers(instance, self._further, state)
+            self._estimate.keep(instance, state, Schedule(self._policy.knots, found))
+            return found
+
+        return answered(self._policy, instance, powers, self._further)
 
 
 @functools.lru_cache(maxsize=8)

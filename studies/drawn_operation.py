@@ -66,8 +66,9 @@ def operated(
         return Planned(plan.schedule)
 
     trajectory = run_loop(case, scenario, ask, options).trajectory
-    largest = float(np.abs(trajectory.omega[1:]).max())  # where it begins is given
-    excess = (largest - case.omega_bound(REGIME)) / (2 * np.pi)
+    bounds = case.bounds(REGIME)
+    beyond = bounds.beyond(trajectory.omega @ bounds.matrix.T)[1:]  # where it begins is given
+    excess = float(beyond.max()) / (2 * np.pi)
     return Operated(judge_operation(case, scenario, trajectory, REGIME).objective, excess, spent)
 
 

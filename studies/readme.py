@@ -10,14 +10,16 @@ from pathlib import Path
 
 import pandas as pd
 
-from ded_bench.analysis.online_summary import LOOP, own_latency
+from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.reference import result_lines
 from ded_bench.analysis.summary import GROUP, titled
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.scenario import QUALITIES
 from ded_bench.report.sources import Sources, read_sources
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 GRIDS = ("9bus", "two-area", "39bus", "68bus", "140bus")
+ISLANDS = ("two-area-agc", "39bus-agc")
 #: Heading and seconds of a time budget.
 BUDGETS = {"1 ms": 1e-3, "10 ms": 1e-2, "1 s": 1.0, "offline": float("inf")}
 #: A method is of use if it keeps every limit on so many instances.
@@ -76,37 +78,21 @@ def methods() -> str:
     return markdown(["Grid", *BUDGETS], rows)
 
 
-def loop() -> str:
-    """Cost and excess in the closed loop: static dispatch, the cheapest plans, those that exceed least.
-
-    Of the methods that operated all scenarios of static dispatch.
-    """
+def practice() -> str:
+    """Today's practice and other plans on islands, in the longest scenarios, loads as announced."""
     rows = []
-    for case in GRIDS:
-        operations = run(case).online
-        if not len(operations):
-            continue
-        operations = operations[operations["regime"] == "TO"]
-        is_static = (operations["method"] == "ed") & (operations["settings"] == "every=1")
-        shared = set(operations.loc[is_static, "scenario"])
-        everywhere = operations.groupby(LOOP)["scenario"].transform(shared.issubset)
-        found = titled(own_latency(operations[everywhere & operations["scenario"].isin(shared)]))
-        planned = found[found["method"] != "ed"]
-        chosen = [
-            found[(found["method"] == "ed") & (found["settings"] == "every=1")].iloc[0],
-            planned.loc[planned["increase_percent_mean"].idxmin()],
-            planned.loc[planned["max_excess_mhz_mean"].idxmin()],
-        ]
-        rows.append([case, str(len(shared)), *(operated(line) for line in chosen)])
-    heads = ["Grid", "scenarios", "static dispatch every second", "cheapest plans", "least excess"]
-    return markdown(heads, rows)
-
-
-def operated(line: pd.Series) -> str:
-    """A method in the loop: cost over hindsight and mean of the largest excess."""
-    cost, excess = line["increase_percent_mean"], line["max_excess_mhz_mean"]
-    often = "" if line["period_s"] == 1 else f" every {line['period_s']:.2g} s"
-    return f"{line['title']}{often}: {cost:+.2g} %, {excess:.2g} mHz"
+    for case in ISLANDS:
+        lines = titled(practice_lines(run(case).practice))
+        lines = lines[(lines["regime"] == "TO") & (lines["forecast"] == QUALITIES[0])]
+        lines = lines[lines["minutes"] == lines["minutes"].max()]
+        for line in lines.sort_values("mean_peak_mhz", ascending=False).to_dict("records"):
+            places = {"mean_peak_mhz": 0, "swing_peak_mhz": 1, "agc_travel_pu": 1, "cps1": 0}
+            numbers = (f"{line[name]:.{digits}f}" for name, digits in places.items())
+            scenarios = f"{line['n']} of {line['n'] + line['failures']}"
+            cost = f"{line['over_practice_percent']:+.2f}"
+            rows.append([case, line["title"], f"{line['period_s']:g}", scenarios, *numbers, cost])
+    heads = ["Grid", "plans", "every (s)", "hours", "peak of the mean (mHz)", "largest swing (mHz)"]
+    return markdown([*heads, "AGC travel (pu)", "CPS1 (%)", "cost over practice (%)"], rows)
 
 
 def number(value: float) -> str:
@@ -116,7 +102,7 @@ def number(value: float) -> str:
 
 def filled(text: str) -> str:
     """A page whose tables are made anew."""
-    for make in (methods, loop, paper):
+    for make in (methods, practice, paper):
         marks = rf"(<!-- {make.__name__} -->\n).*?(<!-- end -->)"
         made = make()
         text, count = re.subn(marks, lambda m, made=made: f"{m[1]}\n{made}{m[2]}", text, flags=re.S)

@@ -167,33 +167,26 @@ def weights_of(network: nn.Module) -> Weights:
 
 
 def as_solver(policy: TrainedPolicy, answer: Callable[[Instance], Array], iterations: int = 0) -> Solver:
-    """Return a policy as a method; `solve_s` is all from the instance to the powers at the knots.
-
-    What the first answer costs (compilation, libraries, tables) is paid here, by a draw of policy training,
-    so that no answer is computed twice.
-
-    Args:
-        policy: whose scope is checked.
-        answer: powers at its knots, (n_knots, n_gen), pu.
-        iterations: what rows tell of them, if there are any.
-    """
-
-    def solve(instance: Instance) -> Solution:
-        return answered(policy, instance, lambda: answer(instance), iterations)
-
-    instance = sample_instance(policy.scope.case, POLICY_SEED, 0, servable)
-    solve(instance.model_copy(update={"horizon_s": policy.scope.horizon_s}))
+    """Return a policy as a method; see `answered`."""
+    solve = functools.partial(answered, policy, answer, iterations)
+    warm_up(policy.scope, solve)
     return solve
 
 
 def answered(
-    policy: TrainedPolicy, instance: Instance, answer: Callable[[], Array], iterations: int = 0
+    policy: TrainedPolicy, answer: Callable[[Instance], Array], iterations: int, instance: Instance
 ) -> Solution:
-    """Take the time of one answer; see `as_solver`."""
+    """Answer an instance by powers at the policy's knots; `solve_s` is all from the one to the others."""
     started = time.perf_counter()
     policy.scope.check([instance])
-    schedule = Schedule(policy.knots, answer())
+    schedule = Schedule(policy.knots, answer(instance))
     elapsed = time.perf_counter() - started
     return Solution(
         Status.POLICY, schedule, iterations or None, solve_s=elapsed, solver_version=SOLVER_VERSION
     )
+
+
+def warm_up(scope: Scope, solver: Solver) -> None:
+    """Pay what the first answer costs (compilation, libraries, tables), by a draw of policy training."""
+    instance = sample_instance(scope.case, POLICY_SEED, 0, servable)
+    solver(instance.model_copy(update={"horizon_s": scope.horizon_s}))

@@ -275,8 +275,7 @@ def _true(load: ScenarioLoad, now: float, until: float) -> tuple[Array, Array]:
 
 def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
     """Points in order, without all but the first, and the last, of those at the same time."""
-    new = np.empty(len(times), dtype=bool)
-    new[0], new[-1] = True, True
+    new = np.ones(len(times), dtype=bool)
     new[1:-1] = (times[1:-1] - times[:-2] > RESOLUTION) & (times[1:-1] < times[-1] - RESOLUTION)
     return times[new], values[new]
 

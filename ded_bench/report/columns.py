@@ -88,7 +88,7 @@ OUTCOME = (
     Column("seconds", "median time", "s"),
 )
 #: Beside it, of islands.
-ISLAND = (
+ISLAND = MEAN_PEAK, MEAN_RMS, SWING_PEAK, AGC_TRAVEL = (
     Column("mean_peak_mhz", "peak of the mean frequency", "mHz", ".2f"),
     Column("mean_rms_mhz", "its rms", "mHz", ".2f"),
     Column("swing_peak_mhz", "largest swing", "mHz", ".2f"),
@@ -173,12 +173,8 @@ PRACTICE = (
     Column("minutes", "minutes", form="g"),
     Column("period_s", "plans every", "s", "g"),
     Column("latency_s", "latency", "s", ".2g"),
-    Column("mean_peak_mhz", "peak of the mean frequency", "mHz", ".2f"),
-    Column("peak_ratio", "practice's over it", form=".2f"),
-    Column("mean_rms_mhz", "rms", "mHz", ".2f"),
-    Column("swing_peak_mhz", "largest swing", "mHz", ".2f"),
-    Column("agc_travel_pu", "AGC travel", "pu", ".2f"),
-    Column("travel_ratio", "practice's over it", form=".2f"),
+    *(MEAN_PEAK, Column("peak_ratio", "practice's over it", form=".2f"), MEAN_RMS, SWING_PEAK),
+    *(AGC_TRAVEL, Column("travel_ratio", "practice's over it", form=".2f")),
     Column("cps1", "CPS1", "%", ".1f"),
     Column("over_practice_percent", "cost over practice", "%", ".3f"),
     Column("increase_percent", "cost over hindsight", "%", ".3f"),

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.files.errors import InputError
 from ded_bench.methods.island.island_iterations import SETTINGS, IslandGrid, IslandIterations, IslandProblem
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.state_estimate import StateEstimate
-from ded_bench.methods.trained_policy import TrainedPolicy, answered, as_solver
+from ded_bench.methods.trained_policy import TrainedPolicy, answered, warm_up
 from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
@@ -61,13 +60,9 @@ class IslandPolicy(TrainedPolicy):
             further: iterations with costs along the answer, after which it is mended again.
             state: at t = 0; None: what is not measured is stationary.
         """
-        try:
-            asked = self.grid.ask(instance, state)
-        except SimulationError as error:
-            raise InputError(f"instance {instance.id}", "initial", str(error)) from None
-        counts = [self.training["iterations"], *([further] if further else [])]
+        asked = self.grid.ask(instance, state)
         answer = asked.start
-        for count in counts:
+        for count in filter(None, (self.training["iterations"], further)):
             answer = self._improved(asked, answer, count)
         return answer
 
@@ -101,33 +96,25 @@ class IslandPolicy(TrainedPolicy):
 
 
 class IslandSolver:
-    """The policy as a method.
-
-    Args:
-        policy: that answers.
-        further: see `IslandPolicy.powers`.
-    """
+    """The policy as a method; in operation what is not measured comes from a simulation of its last plan."""
 
     def __init__(self, policy: IslandPolicy, further: int) -> None:
         self._policy, self._further = policy, further
-        self._alone = as_solver(policy, lambda instance: policy.powers(instance, further), further)
         self._estimate = StateEstimate(policy.grid.plant)
+        warm_up(policy.scope, self)
 
-    def __call__(self, instance: Instance) -> Solution:
-        """Answer a single instance."""
-        return self._alone(instance)
+    def __call__(self, instance: Instance, last: Solution | None = None) -> Solution:
+        """Answer; `last` is the plan in force."""
 
-    def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
-        """Answer in operation: what is not measured comes from a simulation of the plan in force."""
-        in_force = None if last is None else last.schedule
-
-        def powers() -> Array:
-            state = self._estimate.initial(instance, in_force)
+        def powers(instance: Instance) -> Array:
+            state = self._estimate.initial(instance, None if last is None else last.schedule)
             found = self._policy.powers(instance, self._further, state)
             self._estimate.keep(instance, state, Schedule(self._policy.knots, found))
             return found
 
-        return answered(self._policy, instance, powers, self._further)
+        return answered(self._policy, powers, self._further, instance)
+
+    solve = __call__
 
 
 @functools.lru_cache(maxsize=8)

@@ -211,7 +211,7 @@ def representative(sources: Sources, regime: str) -> pd.DataFrame:
 #: Static dispatch that is drawn, method and settings; what moves most comes first, below the others.
 STATICS = ((PRACTICE[0], "every=300"), PRACTICE, STATIC)
 #: At most so many methods beside it, and generators, are drawn of a scenario.
-METHODS_SHOWN, GENERATORS_SHOWN = 2, 3
+METHODS_SHOWN, GENERATORS_SHOWN = 2, 2
 
 
 def draw_scenario(sources: Sources) -> Iterator[Picture]:
@@ -234,14 +234,16 @@ def draw_scenario(sources: Sources) -> Iterator[Picture]:
 def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     """A scenario of the tightest regime and trajectories to show; none if none is kept.
 
-    Of the scenarios with most lines, the one whose worst excess is the median; static dispatch, and of the
-    other methods those of least excess, each with its best line.
+    Of the longest scenarios with most lines, the one whose worst excess is the median; static dispatch, and
+    of the other methods those of least excess, each with its best line.
     """
     files, rows = sources.results.paths, sources.online if sources.case.slack else sources.practice
     rows = rows[(rows["regime"] == sources.tightest) & (rows["forecast"] == QUALITIES[0])]
     rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
     if not len(rows):
         return "", []
+    if "minutes" in rows:
+        rows = rows[rows["minutes"] == rows["minutes"].max()]
     lines = rows.groupby("scenario")["key"].transform("size")
     excess = rows[lines == lines.max()].groupby("scenario")["max_excess_hz"].max()
     scenario = str(excess.sort_values(kind="stable").index[len(excess) // 2])

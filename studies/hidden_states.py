@@ -1,7 +1,7 @@
 """What knowing the states that nobody measures is worth to plans in operation.
 
-Scenarios are drawn, none of them committed. `ded-rti` plans every second, blind or with its estimate of
-fluxes, exciters and valves (`methods/state_estimate.py`); static dispatch every second stands beside it.
+Scenarios are drawn, none of them committed. `ded-rti` and the case's policy plan every second, blind or with
+an estimate of fluxes, exciters and valves (`methods/state_estimate.py`); static dispatch stands beside them.
 
     python studies/hidden_states.py CASE REGIME COUNT DURATION_S
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -31,7 +32,8 @@ def asked(case: Case, regime: str, method: str, options: str, remembers: bool, s
     """Plans of one method; without memory it is prepared anew for each."""
 
     def prepared() -> Callable[..., Solution]:
-        solver = get_method(method).prepare(case, regime, Settings(options))
+        results = Path("results") / f"{case.id}-reference"
+        solver = get_method(method).prepare(case, regime, Settings(options, search=(results,)))
         return getattr(solver, "solve", solver)
 
     solve = prepared()
@@ -57,6 +59,8 @@ def main(name: str, regime: str, count: str, duration_s: str) -> None:
         ("`ed`", "ed", "", True),
         ("`ded-rti`, blind", "ded-rti", "", False),
         ("`ded-rti`", "ded-rti", "", True),
+        ("`ded-admm`, blind", "ded-admm", "", False),
+        ("`ded-admm`", "ded-admm", "", True),
     ]
     print(COLUMNS + "\n| --- | --- |" + " ---: |" * 5)
     for forecast in ("perfect", "announced"):

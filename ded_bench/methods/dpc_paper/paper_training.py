@@ -154,7 +154,7 @@ def train(
     with torch.random.fork_rng():
         torch.manual_seed(options.seed)
         network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
-    run = _PaperTraining(network.to(options.device), loss, data, options.seed, out)
+    run = PaperTraining(network.to(options.device), loss, data, options.seed, out)
     facts = run.train(options, EPOCHS, f"{PaperPolicy.method} {regime}") | {
         "instances": len(instances),
         "held_out": 0,
@@ -166,7 +166,7 @@ def train(
     return policy
 
 
-class _PaperTraining(TrainingRun):
+class PaperTraining(TrainingRun):
     """The paper's recipe: a constant learning rate, gradients as they are, the last weights."""
 
     clip_norm, average_decay, looks = math.inf, 0.0, 90

@@ -251,10 +251,9 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     is_static = one["method"] == STATIC[0]
     statics = [one[is_static & (one["settings"] == settings)][:1] for _, settings in STATICS]
     chosen = pd.concat([*statics, one[~is_static].drop_duplicates("method")[:METHODS_SHOWN]])
-    paths = {
-        (row["method"], f"{row['title']}, {row['latency_s']:.2g} s"): files.trajectory(row["key"])
-        for row in chosen.to_dict("records")
-    }
+    late = chosen["latency_s"].map(", latency {:.2g} s".format).where(chosen["latency_s"] > 0.0, "")
+    places = zip(chosen["method"], chosen["title"] + late, strict=True)
+    paths = dict(zip(places, map(files.trajectory, chosen["key"]), strict=True))
     hindsight = files.hindsight_trajectory(scenario, sources.tightest, sources.case.plant_name)
     if hindsight.is_file():  # first, below the others
         paths = {("", "hindsight"): hindsight} | paths

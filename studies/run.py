@@ -4,11 +4,11 @@
     python studies/run.py online --case 9bus --list
 
 A file has a list for each step: commands, and names of other steps, which come first and only once. A command
-is a table of its options by name; those that all commands share are added here. A file takes the steps that
-it does not list from its `base`, `default.toml` unless it says so; grids without a file have that one,
-islands `island.toml`. Entries with `when = "train"` run only if `--train` is given, those with `when =
-"policies"` also where the results folder or the case's reference run has trained policies. The first command
-that fails ends it, as in make.
+is a table of its options by name, `true` for those without a value; those that all commands share are added
+here. A file takes the steps that it does not list from its `base`, `default.toml` unless it says so; grids
+without a file have that one, islands `island.toml`. Entries with `when = "train"` run only if `--train` is
+given, those with `when = "policies"` also where the results folder or the case's reference run has trained
+policies. The first command that fails ends it, as in make.
 """
 
 import argparse
@@ -93,7 +93,8 @@ def command_line(entry: Entry, asked: argparse.Namespace) -> list[str]:
             options[name] = min((int(n) for n in (value, options.get(name)) if n), default="")
         else:
             options.setdefault(name, value)
-    words = [word for name, value in options.items() if value != "" for word in (f"--{name}", str(value))]
+    given = {name: () if value is True else (str(value),) for name, value in options.items() if value != ""}
+    words = [word for name, values in given.items() for word in (f"--{name}", *values)]
     return [str(Path(sys.executable).parent / "ded-bench"), command, *words, *shlex.split(extra)]
 
 

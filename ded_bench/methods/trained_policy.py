@@ -180,10 +180,8 @@ def answered(
     started = time.perf_counter()
     policy.scope.check([instance])
     schedule = Schedule(policy.knots, answer(instance))
-    elapsed = time.perf_counter() - started
-    return Solution(
-        Status.POLICY, schedule, iterations or None, solve_s=elapsed, solver_version=SOLVER_VERSION
-    )
+    spent = time.perf_counter() - started
+    return Solution(Status.POLICY, schedule, iterations or None, solve_s=spent, solver_version=SOLVER_VERSION)
 
 
 def warm_up(scope: Scope, solver: Solver) -> None:

@@ -97,7 +97,7 @@ def checkpoint_file(policy: Path) -> Path:
 
 
 def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:
-    """Write the history of a policy's training, see the top of this module.
+    """Write the history of a policy's training, to nine digits; see the top of this module.
 
     Args:
         rows: numbers by column; `epoch` and `seconds` are needed.
@@ -105,5 +105,5 @@ def write_history(policy: Path, rows: Sequence[Mapping[str, float]]) -> None:
     columns = dict.fromkeys([*HISTORY, *(name for row in rows for name in row)])
     import pandas as pd  # help waits for no data frames
 
-    text = pd.DataFrame(rows, columns=list(columns)).to_csv(index=False)
+    text = pd.DataFrame(rows, columns=list(columns)).to_csv(index=False, float_format="%.9g")
     write_atomically(policy.with_suffix(".history.csv"), text)

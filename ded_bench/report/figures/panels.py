@@ -209,7 +209,7 @@ def representative(sources: Sources, regime: str) -> pd.DataFrame:
 
 
 #: Static dispatch that is drawn, method and settings; what moves most comes first, below the others.
-STATICS = ((PRACTICE[0], "every=300"), PRACTICE, STATIC)
+STATICS = (PRACTICE, STATIC)
 #: At most so many methods beside it, and generators, are drawn of a scenario.
 METHODS_SHOWN, GENERATORS_SHOWN = 2, 2
 
@@ -252,10 +252,13 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     statics = [one[is_static & (one["settings"] == settings)][:1] for _, settings in STATICS]
     chosen = pd.concat([*statics, one[~is_static].drop_duplicates("method")[:METHODS_SHOWN]])
     late = chosen["latency_s"].map(", latency {:.2g} s".format).where(chosen["latency_s"] > 0.0, "")
-    places = zip(chosen["method"], chosen["title"] + late, strict=True)
+    places = zip(chosen["method"], chosen["settings"], chosen["title"] + late, strict=True)
     paths = dict(zip(places, map(files.trajectory, chosen["key"]), strict=True))
     hindsight = files.hindsight_trajectory(scenario, sources.tightest, sources.case.plant_name)
     if hindsight.is_file():  # first, below the others
-        paths = {("", "hindsight"): hindsight} | paths
+        paths = {("", "", "hindsight"): hindsight} | paths
     read = [(*key, read_arrays(path)[0]) for key, path in paths.items()]
-    return scenario, [Shown(m, label, i, **arrays) for i, (m, label, arrays) in enumerate(read)]
+    return scenario, [  # static dispatch of every second has a colour of its own beside practice
+        Shown(m if (m, settings) != STATIC else settings, label, i, **arrays)
+        for i, (m, settings, label, arrays) in enumerate(read)
+    ]

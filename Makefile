@@ -73,8 +73,9 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 # Each process has tests that stand together, and so share their fixtures.
+# A hundred processes import the package: bytecode is kept, whatever the environment says.
 tests: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 clean:  ## remove the virtual environment, caches and results/quick (other results stay)
 	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache results/quick

@@ -85,9 +85,9 @@ theirs = ded_bench.solve(instance, "ded-slp", "TO").schedule
 verdict, other = (ded_bench.score(instance, s, "TO") for s in (mine, theirs))
 assert verdict.feasible, verdict
 assert verdict.objective < 1.01 * other.objective, (verdict, other)
-scenario = sample_scenario(case, 0, 0, duration_s=2.0)
+scenario = sample_scenario(case, 0, 0, duration_s=1.0)
 ask = lambda i, _: Planned(do_mpc_dispatch.solve(i, "TO", case))
-assert len(run_loop(case, scenario, ask, LoopOptions()).answers) == 2
+assert len(run_loop(case, scenario, ask, LoopOptions()).answers) == 1
 """
     run_example(code, tmp_path)
 

@@ -20,7 +20,6 @@ from typing import Any, Literal
 
 import pandas as pd
 from pydantic import Field, model_validator
-from scipy.stats import binomtest
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
@@ -168,6 +167,8 @@ def clopper_pearson(successes: int, count: int, delta: float) -> float:
 
     Clopper and Pearson 1934, one-sided: exact for independent trials.
     """
+    from scipy.stats import binomtest  # a second to import, and all commands know certificates
+
     test = binomtest(successes, count, alternative="greater")
     return float(test.proportion_ci(confidence_level=1.0 - delta, method="exact").low)
 

@@ -19,7 +19,6 @@ from ded_bench.problem.instance import Instance, LoadPoints, State
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.koopman import Koopman
-from ded_bench.surrogates.linear import linear_model
 
 if TYPE_CHECKING:
     from ded_bench.plants.detailed.coarse import CoarsePlant
@@ -125,6 +124,8 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
         problem = f"there is none of case {case.id}, whose plant is {case.plant_name}; use {known}"
         raise InputError("--model", name, problem)
     if name == "linear":
+        from ded_bench.surrogates.linear import linear_model  # with SciPy, which most commands do without
+
         return linear_model(case)
     files, problem = [Path(name)], f"no such file and no such model (known: {', '.join(MODELS)})"
     if name in TRAINED:

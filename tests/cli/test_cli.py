@@ -72,7 +72,7 @@ def test_solve_ends_with_a_table(problem: Path, tmp_path: Path, capsys) -> None:
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
     """First one of the workers is killed, then the main process, whose workers go with it."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "ded_bench", "solve", "--method", "ded", "--regime", "NO,TO"]
+    command = [sys.executable, "-m", "ded_bench", "solve", "--method", "tests.run.online.faulty_methods:slow"]
     command += ["--case", str(problem), "--split", "all", "--workers", "2", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     workers: list[psutil.Process] = []

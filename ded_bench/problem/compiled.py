@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core.event import Listener, register
 from numba.core.types import unliteral
+from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -54,6 +55,13 @@ def compiled(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile into every compiled function that calls it: a call of its own would count array references."""
     return cast(Function, numba.njit(inline="always")(function))
+
+
+@inlined
+def copy_row(source: NDArray[Any], target: NDArray[Any]) -> None:
+    """Copy one row: an assignment of arrays, whose shapes Numba checks, takes longer to compile."""
+    for i in range(len(target)):
+        target[i] = source[i]
 
 
 @functools.cache

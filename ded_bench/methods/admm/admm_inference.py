@@ -30,7 +30,7 @@ from ded_bench.methods.admm.modal_kernels import (
 from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array32
 
 #: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
@@ -204,27 +204,44 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
     bounded, moved = np.empty((2, n, n_gen)), np.empty((2, n, n_gen))
     speeds, slack = np.empty((2, n_points, n_gen), np.float32), np.empty((2, n_points))
     for b in range(batch):
-        p[:] = powers[b]
-        _respond(p, given, b, limits, modes, omega, p_slack)
-        first = _loss(p, omega, p_slack, given, b, limits, modes)
-        bounded[0], speeds[0], slack[0] = p, omega, p_slack
-        moved[0, 0], moved[0, 1:] = 0.0, p[1:] - p[:-1]
-        bounded[1], moved[1], speeds[1], slack[1] = 0.0, 0.0, 0.0, 0.0
-        for i in range(len(settings)):
-            if i > 0:
-                _respond(p, given, b, limits, modes, omega, p_slack)
-            _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
-            _project_response(
-                (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
-            )
-            _improve(p, gradient, given, b, limits, settings[i])
-        track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
-        _respond(p, given, b, limits, modes, omega, p_slack)
-        if _loss(p, omega, p_slack, given, b, limits, modes) <= first:
-            powers[b] = p
+        first = 0.0
+        for j in range(n):
+            copy_row(powers[b, j], p[j])
+        for i in range(len(settings) + 1):
+            if i == len(settings):
+                track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
+            _respond(p, given, b, limits, modes, omega, p_slack)
+            loss = _loss(p, omega, p_slack, given, b, limits, modes) if i % len(settings) == 0 else 0.0
+            if i == 0:
+                first = loss
+                _begin(p, omega, p_slack, bounded, moved, speeds, slack)
+            if i < len(settings):
+                _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
+                _project_response(
+                    (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
+                )
+                _improve(p, gradient, given, b, limits, settings[i])
+            elif loss <= first:
+                for j in range(n):
+                    copy_row(p[j], powers[b, j])
 
 
-@compiled
+@inlined
+def _begin(
+    p: Array, omega: Array32, p_slack: Array32, bounded: Array, moved: Array, speeds: Array32, slack: Array
+) -> None:
+    """First copies are what the first schedule does; duals are zero."""
+    bounded[1], moved[1], speeds[1], slack[1] = 0.0, 0.0, 0.0, 0.0
+    for j in range(len(p)):
+        copy_row(p[j], bounded[0, j])
+        for g in range(p.shape[1]):
+            moved[0, j, g] = p[j, g] - p[max(j - 1, 0), g]
+    copy_row(p_slack, slack[0])
+    for k in range(len(p_slack)):
+        copy_row(omega[k], speeds[0, k])
+
+
+@inlined
 def _project_powers(
     p: Array, cost: Array, limits: AdmmLimits, setting: Array, bounded: Array, moved: Array, gradient: Array
 ) -> None:
@@ -252,7 +269,7 @@ def _project_powers(
             gradient[j - 1, g] -= force
 
 
-@compiled
+@inlined
 def _project_response(
     outcome: tuple[Array32, Array32],
     copies: tuple[Array32, Array],
@@ -298,11 +315,15 @@ def _project_response(
             for m in range(n_modes):
                 on_knots[j, m] += (np.float32(1.0) - later) * on_v[0, j * points + i, m]
                 on_knots[j + 1, m] += later * on_v[0, j * points + i, m]
-    on_knots[n - 1] += on_v[0, n_points - 1]
-    gradient += np.dot(on_knots, limits.gain.T)
+    for m in range(n_modes):
+        on_knots[n - 1, m] += on_v[0, n_points - 1, m]
+    asked = np.dot(on_knots, limits.gain.T)
+    for j in range(n):
+        for g in range(n_gen):
+            gradient[j, g] += asked[j, g]
 
 
-@compiled
+@inlined
 def _improve(
     p: Array, gradient: Array, given: AdmmProblems, b: int, limits: AdmmLimits, setting: Array
 ) -> None:
@@ -316,10 +337,13 @@ def _improve(
     modes, change = given.mean.powers[b], np.empty_like(p)
     modal = np.dot(gradient, modes)
     modal_change(given.mean.maps[b], given.mean.outputs[b], weights, modal, change)
-    p += np.dot(change, modes.T)
+    step = np.dot(change, modes.T)
+    for j in range(p.shape[0]):
+        for g in range(p.shape[1]):
+            p[j, g] += step[j, g]
 
 
-@compiled
+@inlined
 def _loss(
     p: Array, omega: Array32, p_slack: Array32, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes
 ) -> float:
@@ -340,7 +364,7 @@ def _loss(
     return float(cost + PRICE * penalty * 2.0 * modes.half)
 
 
-@compiled
+@inlined
 def _respond(
     powers: Array,
     given: AdmmProblems,
@@ -356,15 +380,15 @@ def _respond(
     force = np.empty((1, n_points, n_modes), np.float32)
     q, speed = np.empty_like(force), np.empty_like(force)
     at_knots = np.dot(powers.astype(np.float32), limits.gain)
-    force[0] = given.offset[b]
+    for m in range(n_modes):
+        q[0, 0, m], speed[0, 0, m] = given.state[b, 0, m], given.state[b, 1, m]
+        force[0, n_points - 1, m] = given.offset[b, n_points - 1, m] + at_knots[n - 1, m]
     for j in range(n - 1):
         for i in range(points):
             later = np.float32(i / points)
             for m in range(n_modes):
                 here = at_knots[j, m] + later * (at_knots[j + 1, m] - at_knots[j, m])
-                force[0, j * points + i, m] += here
-    force[0, n_points - 1] += at_knots[n - 1]
-    q[0, 0], speed[0, 0] = given.state[b, 0], given.state[b, 1]
+                force[0, j * points + i, m] = given.offset[b, j * points + i, m] + here
     swing(modes, given.change[b : b + 1], force, q, speed)
     np.dot(speed[0], limits.shape, omega)
     for k in range(n_points):

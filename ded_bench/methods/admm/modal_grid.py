@@ -24,7 +24,7 @@ from ded_bench.plants.hold import Indices
 from ded_bench.plants.lossless import algebraic
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row
 from ded_bench.problem.quantities import largest_divisor
 
 #: Mismatch of a power flow that is good enough here, pu.
@@ -94,7 +94,9 @@ class ModalGrid:
         buses = np.concatenate([network.generators, network.algebraic])
         self._whole, grid = (g._replace(mismatch=MISMATCH) for g in (network.grid_of(buses), network.grid))
         self._grids = grid, network.grid_of(buses, kept=n_gen)
-        self._factors = [algebraic.factorised(g, self.theta) for g in (self._whole, grid)]
+        self._factors = [np.empty(len(g.algebraic) + len(g.elimination.met)) for g in (self._whole, grid)]
+        for g, factor in zip((self._whole, grid), self._factors, strict=True):
+            algebraic.factorise(g, self.theta, factor)
 
     def _linearise_nominal(self) -> None:
         self.theta = self.network.power_flow(self.case.p_nominal, self.case.load_nominal)
@@ -129,6 +131,7 @@ class ModalGrid:
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
         mean_cost, schedule = ramp_limited_schedules(
             (problems.load, problems.cost, problems.p_initial),
+            np.argsort(problems.cost[:, 1:], kind="stable"),
             taken,
             (self.compliance, self.stiffness),
             (self.case.p_min, self.case.p_max, self.ramp),
@@ -256,7 +259,7 @@ def follow_trajectory(
     """
     grid, reduced = grids
     n, n_gen, at = len(grid.algebraic), angles.shape[1], 0
-    angle, injection, before, change = theta.copy(), np.empty_like(theta), theta.copy(), np.zeros_like(theta)
+    angle, injection, before, change = theta.copy(), np.empty_like(theta), theta.copy(), np.zeros(len(theta))
     full, eliminated = np.empty((n_gen + n, n_gen + n)), np.empty(n + len(reduced.elimination.met))
     for k in range(len(angles)):
         for i in range(n):
@@ -266,15 +269,16 @@ def follow_trajectory(
             angle[grid.generators[g]] = angles[k, g]
         if not algebraic.solve_algebraic(grid, wanted[k], factor, angle, injection, CONTRACTION):
             return False
-        if k > 0:
-            change[:] = angle - before
-        before[:] = angle
+        for i in range(len(angle)):
+            change[i] = angle[i] - before[i] if k > 0 else 0.0
+            before[i] = angle[i]
         for g in range(n_gen):
             f[k, g] = injection[grid.generators[g]]
         if at < len(taken) and taken[at] == k:
-            factor[:] = algebraic.factorised(grid, angle)
+            algebraic.factorise(grid, angle, factor)
             algebraic.set_jacobian(reduced, angle, full)
             algebraic.eliminate(reduced.elimination, full, eliminated)
-            stiffness[at] = full[:n_gen, :n_gen]
+            for g in range(n_gen):
+                copy_row(full[g], stiffness[at, g])
             at += 1
     return True

@@ -50,26 +50,36 @@ def oscillators(squares: Array, rate: float, h: float) -> Array:
     Returns:
         (n_modes, 2, 4).
     """
-    maps, column, term = np.empty((len(squares), 2, 4)), np.empty(4), np.empty(4)
+    maps, exact, square, term = (
+        np.empty((len(squares), 2, 4)),
+        np.empty((4, 4)),
+        np.empty((4, 4)),
+        np.empty(4),
+    )
     for m in range(len(squares)):
         halvings = 0
         while (abs(squares[m]) * h + rate + 1.0) * h > 0.5 * 2.0**halvings:
             halvings += 1
-        short, exact = h / 2.0**halvings, np.zeros((4, 4))  # of (q, q̇, v, v̇)
-        for c in range(4):
-            column[:], term[:] = 0.0, 0.0
-            column[c] = term[c] = 1.0
+        short = h / 2.0**halvings
+        for c in range(4):  # columns of the exponential for (q, q̇, v, v̇)
+            for r in range(4):
+                exact[r, c] = term[r] = 1.0 if r == c else 0.0
             for power in range(1, 15):
                 part = short / power
                 fall = -(squares[m] * term[0] + rate * term[1]) + term[2]
                 term[0], term[1], term[2], term[3] = part * term[1], part * fall, part * term[3], 0.0
-                column += term
-            exact[:, c] = column
+                for r in range(4):
+                    exact[r, c] += term[r]
         for _ in range(halvings):
-            exact = np.dot(exact, exact)
-        maps[m, :, :2] = exact[:2, :2]
-        maps[m, :, 3] = exact[:2, 3] / h
-        maps[m, :, 2] = exact[:2, 2] - maps[m, :, 3]
+            for r in range(4):
+                for c in range(4):
+                    square[r, c] = 0.0
+                    for i in range(4):
+                        square[r, c] += exact[r, i] * exact[i, c]
+            exact, square = square, exact
+        for r in range(2):
+            maps[m, r, 0], maps[m, r, 1], maps[m, r, 3] = exact[r, 0], exact[r, 1], exact[r, 3] / h
+            maps[m, r, 2] = exact[r, 2] - maps[m, r, 3]
     return maps
 
 
@@ -206,23 +216,26 @@ def swing_adjoint(modes: Modes, change: Floats, on_q: Floats, on_speed: Floats, 
                 by_q[i] = step[0, 0, i] * by_q[i] + step[1, 0, i] * by_speed[i]
 
 
-@compiled
 def interval_maps(step: Array, points: int) -> Array:
-    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the grid points between, (POINTS + 1, 2, 4, n_modes)."""
-    maps = np.zeros((points + 1, 2, 4, len(step)))
-    maps[0, 0, 0] = maps[0, 1, 1] = 1.0
+    """(q, q̇, v, v⁺) of two knots to (q, q̇) at the grid points between.
+
+    Args:
+        step: of `oscillators`, (..., n_modes, 2, 4).
+        points: how many grid points make an interval between knots.
+
+    Returns:
+        (..., points + 1, 2, 4, n_modes).
+    """
+    maps = np.zeros((*step.shape[:-2], points + 1, 2, 4))
+    maps[..., 0, :, :2] = np.eye(2)
+    shares = np.linspace([1.0, 0.0], [0.0, 1.0], points + 1)  # of v and v⁺ in the input at a point
+    inputs = step[..., None, :, 2:3] * shares[:-1, None] + step[..., None, :, 3:4] * shares[1:, None]
     for i in range(points):
-        for r in range(2):
-            for c in range(4):
-                maps[i + 1, r, c] = step[:, r, 0] * maps[i, 0, c] + step[:, r, 1] * maps[i, 1, c]
-            for c, share in ((2, 1.0 - i / points), (3, i / points)):
-                maps[i + 1, r, c] += step[:, r, 2] * share
-            for c, share in ((2, 1.0 - (i + 1) / points), (3, (i + 1) / points)):
-                maps[i + 1, r, c] += step[:, r, 3] * share
-    return maps
+        maps[..., i + 1, :, :] = step[..., :2] @ maps[..., i, :, :]
+        maps[..., i + 1, :, 2:] += inputs[..., i, :, :]
+    return np.ascontiguousarray(np.moveaxis(maps, -4, -1))
 
 
-@compiled
 def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, points: int) -> MeanModes:
     """Modes of stiffnesses, in which powers weigh by the inverse of inertia.
 
@@ -234,21 +247,14 @@ def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, 
         h: time from one grid point to the next, s.
         points: how many of them make an interval between knots.
     """
-    (batch, n, _), root = mean.shape, np.sqrt(mass)
-    into, outputs = np.empty((batch, n, n)), np.empty((batch, 2, n))
-    maps = np.empty((batch, points + 1, 2, 4, n))
-    for b in range(batch):
-        squares, u = np.linalg.eigh(mean[b] / np.outer(root, root))
-        maps[b] = interval_maps(oscillators(squares / inertia, rate, h), points)
-        maps[b, :, :, 2:] /= inertia
-        for m in range(n):
-            speeds, slack = 0.0, 0.0
-            for g in range(n):
-                into[b, g, m] = root[g] * u[g, m]
-                speeds += (u[g, m] / root[g]) ** 2
-                slack += mean[b, g].sum() * u[g, m] / root[g]
-            outputs[b, 0, m], outputs[b, 1, m] = speeds, slack**2
-    return MeanModes(into, maps, outputs)
+    root = np.sqrt(mass)
+    squares, u = np.linalg.eigh(mean / np.outer(root, root))
+    steps = oscillators(squares.ravel() / inertia, rate, h).reshape(*squares.shape, 2, 4)
+    maps = interval_maps(steps, points)
+    maps[:, :, :, 2:] /= inertia
+    shapes = u / root[:, None]
+    slack = (mean.sum(axis=2)[:, None] @ shapes)[:, 0]
+    return MeanModes(root[:, None] * u, maps, np.stack([(shapes**2).sum(axis=1), slack**2], axis=1))
 
 
 @compiled
@@ -285,9 +291,10 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
                         stage[at, m] += on_speed * maps[i, 1, r, mode] * maps[i, 1, c, mode]
                         stage[at, m] += on_q * maps[i, 0, r, mode] * maps[i, 0, c, mode]
                     at += 1
-        stage[7] += weights[1]
-        stage[8] -= weights[1]
-        stage[9] += weights[1] + weights[0]
+        for m in range(LANES):
+            stage[7, m] += weights[1]
+            stage[8, m] -= weights[1]
+            stage[9, m] += weights[1] + weights[0]
         for k in range(n - 2, -1, -1):
             for m in range(used):
                 pull[m] = gradient[k + 1, first + m]

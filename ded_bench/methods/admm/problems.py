@@ -9,6 +9,7 @@ import numpy as np
 
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
@@ -99,6 +100,7 @@ def sampled(segments: Array, points: Array) -> Array:
 @compiled
 def ramp_limited_schedules(
     problem: tuple[Array, Array, Array],
+    order: Indices,
     taken: Array,
     grid: tuple[Array, Array],
     limits: tuple[Array, Array, Array],
@@ -113,6 +115,7 @@ def ramp_limited_schedules(
     Args:
         problem: loads at the grid points (batch, n_points, n_load), pu; costs of slack and generators
             (batch, 1 + n_gen); P_0 (batch, n_gen), pu.
+        order: generators from the cheapest to the dearest, (batch, n_gen).
         taken: T (L - L_0) at the grid points, (batch, n_points, n_gen), pu.
         grid: inverse of the stiffness, and the stiffness, (n_gen, n_gen), rad/pu and pu/rad.
         limits: of powers, from below and above, and of their change between two knots, (n_gen,), pu.
@@ -128,9 +131,10 @@ def ramp_limited_schedules(
     points = (load.shape[1] - 1) // (n - 1)  # of the time grid, from one knot to the next
     least, room, dispatch = np.empty(n_gen), np.empty(n_gen), np.empty(n_gen)
     for b in range(batch):
-        order, angles = np.argsort(cost[b, 1:], kind="mergesort"), np.empty((n, n_gen))
+        angles = np.empty((n, n_gen))
         mean_cost[b] = 0.0
-        dispatch[:] = p_initial[b]
+        for g in range(n_gen):
+            dispatch[g] = start[b, 0, g] = p_initial[b, g]
         for j in range(n):
             reach = 0.0 if j == 0 else 1.0
             demand = -load[b, j * points].sum()
@@ -139,7 +143,7 @@ def ramp_limited_schedules(
                 room[g] = min(high[g], dispatch[g] + reach * step[g]) - least[g]
                 demand -= least[g]
             price = 0.0
-            for g in order:
+            for g in order[b]:
                 raised = min(max(demand, 0.0), room[g]) if cost[b, 1 + g] < cost[b, 0] else 0.0
                 demand -= raised
                 dispatch[g] = least[g] + raised
@@ -152,7 +156,6 @@ def ramp_limited_schedules(
             for g in range(n_gen):
                 angles[j, g] = min(max(angles[j, g], angles[j - 1, g] - rate), angles[j - 1, g] + rate)
         powers = np.dot(angles, stiffness)
-        start[b, 0] = p_initial[b]
         for j in range(1, n):
             for g in range(n_gen):
                 start[b, j, g] = powers[j, g] + p_initial[b, g] + taken[b, j * points, g]

@@ -16,7 +16,7 @@ import numpy as np
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.quantities import Array32
 from ded_bench.surrogates.koopman import hat_functions
@@ -212,7 +212,7 @@ def fill_machines(
                 p_slack -= p_gen
                 sequence[b, 2 * n_load + g, j] = start[b, g, j] = p_gen
             sequence[b, 2 * n_load + n_gen, j] = p_slack
-        start[b, :, 0] = p_initial[b]
+        copy_row(p_initial[b], start[b, :, 0])
         own, of, k, total = cost[b], constants[b], 0, 0.0
         for i in range(1 + n_gen):
             total += own[i]

@@ -14,7 +14,7 @@ import numpy as np
 from ded_bench.methods.dpc.channels import Channels, Response, n_channels
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array32
 
 #: How many stages there are, channels of their hidden layers, and of the layer that constants pass through.
@@ -121,20 +121,20 @@ def _windows(weight: np.ndarray) -> np.ndarray:
     return weight.transpose(0, 2, 1).reshape(len(weight), -1)
 
 
-@compiled
+@inlined
 def _see(p_gen: Array, sequence: Array, free_response: Array32, of_power: Array32, inputs: Array32) -> None:
     """Set what a stage sees: the schedule so far, its response and the instance, (n_inputs, n_knots)."""
     n_gen, n = p_gen.shape
     n_outputs, p32 = len(free_response), np.empty(n_gen * n, np.float32)
     for g in range(n_gen):
-        _copy(p_gen[g], p32[g * n : (g + 1) * n])
-        _copy(p_gen[g], inputs[g])
+        copy_row(p_gen[g], p32[g * n : (g + 1) * n])
+        copy_row(p_gen[g], inputs[g])
     forced = np.dot(p32, of_power)
     for i in range(n_outputs):
         for j in range(n):
             inputs[n_gen + i, j] = free_response[i, j] + forced[i * n + j]
     for i in range(len(sequence)):
-        _copy(sequence[i], inputs[n_gen + n_outputs + i])
+        copy_row(sequence[i], inputs[n_gen + n_outputs + i])
 
 
 @compiled
@@ -163,7 +163,9 @@ def add_corrections(
     mean, enter, enter_bias, embed, embed_bias, first, spread, mix, mix_bias, last, last_bias = weights
     _, n_gen, n = p_gen.shape
     width, n_in = first.shape[1], mean.shape[1]
-    margin = dilations.max()
+    margin = 0
+    for dilation in dilations:
+        margin = max(margin, dilation)
     inputs, hidden = np.empty((n_in, n + 2), np.float32), np.zeros((width, n + 2 * margin), np.float32)
     input_columns, columns = np.empty((3 * n_in, n), np.float32), np.empty((3 * width, n), np.float32)
     inner, change = np.empty((width, n), np.float32), np.empty((width, n), np.float32)
@@ -210,14 +212,7 @@ def add_corrections(
 # Loops run over views of one row: of elements by two indices Numba makes no vector instructions.
 
 
-@compiled
-def _copy(values: Array | Array32, out: Array32) -> None:
-    """From one row to another; in float32."""
-    for j in range(len(out)):
-        out[j] = values[j]
-
-
-@compiled
+@inlined
 def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
     """What a convolution sees at each knot: those `dilation` before, themselves, those after."""
     n_channels, n = len(padded), columns.shape[1]
@@ -225,4 +220,4 @@ def _gather(padded: Array32, dilation: int, columns: Array32) -> None:
     for tap in range(3):
         at = first + tap * dilation
         for i in range(n_channels):
-            _copy(padded[i, at : at + n], columns[tap * n_channels + i])
+            copy_row(padded[i, at : at + n], columns[tap * n_channels + i])

@@ -25,7 +25,7 @@ import numpy as np
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array32, largest_divisor
 from ded_bench.surrogates.koopman import CondensedRollout, Koopman, free_response
 from ded_bench.surrogates.linear import by_angles, linear_model
@@ -285,14 +285,14 @@ def predict(
                     push[i] += power[i]
                     for m in range(n_psi):
                         push[i] += model.advance[i, m] * psi[m]
-                psi[:] = push
+                copy_row(push, psi)
             for g in range(n_gen):
                 omega[b, g, k] = psi[g]
                 exceeds |= abs(psi[g]) > limit[k]
     return exceeds
 
 
-@compiled
+@inlined
 def _load_pushes(load: Array, of_load: Array, spacing: float, pushes: Array) -> None:
     """What changes of an instance's loads from one point to the next add to the state, (n_points, n_psi)."""
     pushes[:] = 0.0

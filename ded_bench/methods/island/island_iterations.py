@@ -23,7 +23,7 @@ from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.plant import plant_of
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, inlined
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import Array32
 
@@ -270,70 +270,80 @@ def swings_by(maps: Maps, change: Array32) -> Array32:
     """Swings by changes of set-points (n, n_gen), (n, n_swings)."""
     n, n_gen = change.shape
     memory = len(maps.swing) // n_gen
-    recent = np.zeros((n, memory, n_gen), dtype=np.float32)
+    recent = np.zeros((n, memory * n_gen), dtype=np.float32)
     for k in range(n):
         for lag in range(min(memory, k + 1)):
-            recent[k, memory - 1 - lag] = change[k - lag]
-    swings: Array32 = np.dot(recent.reshape(n, memory * n_gen), maps.swing)
+            for g in range(n_gen):
+                recent[k, (memory - 1 - lag) * n_gen + g] = change[k - lag, g]
+    swings: Array32 = np.dot(recent, maps.swing)
     return swings
 
 
-@compiled
-def rows_by(maps: Maps, given: Iterated, change: Array32) -> Array32:
-    """All rows by changes of set-points, (n_rows,)."""
+@inlined
+def _set_rows(maps: Maps, given: Iterated, change: Array32, rows: Array32) -> None:
+    """All rows, (n_rows,), by changes of set-points."""
     n, n_gen = change.shape
-    rows = np.empty_like(given.offset)
-    rows[:n] = np.dot(maps.mean, change.ravel())
-    at = n + n * maps.swing.shape[1]
-    rows[n:at] = swings_by(maps, change).ravel()
-    rows[at : at + change.size] = change.ravel()
-    at += change.size
-    for g in range(n_gen):
-        rows[at + g] = change[0, g] / given.step[g]
-        for k in range(1, n):
-            rows[at + k * n_gen + g] = (change[k, g] - change[k - 1, g]) / given.step[g]
-    rows[at + change.size :] = np.dot(change, given.by_transfer.T).ravel()
-    return rows
+    mean, swings = np.dot(maps.mean, change.reshape(n * n_gen)), swings_by(maps, change)
+    flows, n_swings = np.dot(change, given.by_transfer.T), swings.shape[1]
+    at = n + n * n_swings
+    transfers, ramps = at + 2 * n * n_gen, at + n * n_gen
+    for k in range(n):
+        rows[k] = mean[k] + given.offset[k]
+        for i in range(n_swings):
+            row = n + k * n_swings + i
+            rows[row] = swings[k, i] + given.offset[row]
+        for g in range(n_gen):
+            row = k * n_gen + g
+            rows[at + row] = change[k, g] + given.offset[at + row]
+            ramp = change[k, g] - change[k - 1, g] if k else change[k, g]
+            rows[ramps + row] = ramp / given.step[g] + given.offset[ramps + row]
+        for i in range(len(given.by_transfer)):
+            row = transfers + k * len(given.by_transfer) + i
+            rows[row] = flows[k, i] + given.offset[row]
 
 
-@compiled
-def changes_by(maps: Maps, given: Iterated, rows: Array32, shape: tuple[int, int]) -> Array32:
-    """The transpose of `rows_by`, each kind of rows times its penalty, (n_columns,)."""
+@inlined
+def _pulled(maps: Maps, given: Iterated, rows: Array32, shape: tuple[int, int]) -> Array32:
+    """The transpose of `_set_rows`, each kind of rows times its penalty, (n_columns,)."""
     (n, n_gen), n_swings = shape, maps.swing.shape[1]
-    found: Array32 = given.penalties[0] * np.dot(rows[:n], maps.mean)
     at, memory = n + n * n_swings, len(maps.swing) // n_gen
-    swings = rows[n:at].reshape(n, n_swings)
-    ahead = np.zeros((n, memory, n_swings), dtype=np.float32)
+    transfers, ramps = at + 2 * n * n_gen, at + n * n_gen
+    ahead = np.zeros((n, memory * n_swings), dtype=np.float32)
     for k in range(n):
         for lag in range(min(memory, n - k)):
-            ahead[k, lag] = swings[k + lag]
-    found += given.penalties[1] * np.dot(ahead.reshape(n, memory * n_swings), maps.back).ravel()
-    found += given.penalties[2] * rows[at : at + n * n_gen]
-    at += n * n_gen
-    for g in range(n_gen):
-        for k in range(n):
-            ramp = rows[at + k * n_gen + g]
-            if k + 1 < n:
-                ramp -= rows[at + (k + 1) * n_gen + g]
-            found[k * n_gen + g] += given.penalties[3] * ramp / given.step[g]
-    transfers = rows[at + n * n_gen :].reshape(n, len(given.by_transfer))
-    found += given.penalties[4] * np.dot(transfers, given.by_transfer).ravel()
+            for i in range(n_swings):
+                ahead[k, lag * n_swings + i] = rows[n + (k + lag) * n_swings + i]
+    asked = np.dot(rows[transfers:].reshape(n, len(given.by_transfer)), given.by_transfer)
+    swings = np.dot(ahead, maps.back)
+    found: Array32 = np.dot(rows[:n], maps.mean)
+    for k in range(n):
+        for g in range(n_gen):
+            row = k * n_gen + g
+            ramp = rows[ramps + row] - rows[ramps + row + n_gen] if k + 1 < n else rows[ramps + row]
+            pull = given.penalties[0] * found[row] + given.penalties[1] * swings[k, g]
+            pull += given.penalties[2] * rows[at + row]
+            pull += given.penalties[3] * ramp / given.step[g]
+            found[row] = pull + given.penalties[4] * asked[k, g]
     return found
 
 
 @compiled
 def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: int) -> None:
     """Iterate `count` times; set-points less the given ones (n, n_gen) and dual variables are changed."""
-    relaxed = np.float32(RELAXATION)
-    kept = np.empty_like(dual)
+    relaxed, (n, n_gen) = np.float32(RELAXATION), change.shape
+    kept, rows = np.empty_like(dual), np.empty_like(dual)
     for i in range(len(dual)):
         ahead = given.offset[i] + dual[i]
         kept[i] = min(max(ahead, given.low[i]), given.high[i])
         dual[i] = ahead - kept[i]
     for _ in range(count):
-        wanted = changes_by(maps, given, kept - dual - given.offset, change.shape)
-        change[:] = (np.dot(given.inverse, wanted) - given.pull).reshape(change.shape)
-        rows = rows_by(maps, given, change) + given.offset
+        for i in range(len(dual)):
+            rows[i] = kept[i] - dual[i] - given.offset[i]
+        found = np.dot(given.inverse, _pulled(maps, given, rows, change.shape))
+        for k in range(n):
+            for g in range(n_gen):
+                change[k, g] = found[k * n_gen + g] - given.pull[k * n_gen + g]
+        _set_rows(maps, given, change, rows)
         for i in range(len(dual)):
             ahead = relaxed * rows[i] + (np.float32(1.0) - relaxed) * kept[i] + dual[i]
             kept[i] = min(max(ahead, given.low[i]), given.high[i])

@@ -43,7 +43,7 @@ from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, i
 from ded_bench.plants.detailed.start import start
 from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row
 from ded_bench.problem.quantities import Array
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ def advance(
         flat[maps.moving[i]] = nominal[maps.moving[i]]
     for k in range(len(states)):
         now = states[k].ravel()
-        now[:] = flat
+        copy_row(flat, now)
         for i in range(n):
             now[maps.moving[i]] = nominal[maps.moving[i]] + both[i]
         for i in range(len(bent)):  # rates are linear in all others, which stay nominal here

@@ -25,7 +25,7 @@ from ded_bench.plants.detailed.equations import (
 )
 from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
 from ded_bench.plants.hold import Indices
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array
 
 #: Slopes of loads are renewed where voltages take more fixed-point steps than this, but not within so many
@@ -72,18 +72,16 @@ class CarriedVoltages(NamedTuple):
     age: Indices  # integrator steps since the slopes are these, (1,)
 
 
-@compiled
 def carried_voltages(network: CompiledNetwork, drawn: Array, v: Array) -> CarriedVoltages:
     """What a state without a past has, at loads (n_load,) and voltages (2 n_port,), pu."""
     n_load = len(drawn)
     load = LoadSlopes(np.empty((n_load, 4)), np.empty((len(v), len(v))))
     renew(network, drawn, v, load)
-    recent = np.empty((4, 4, 2 * n_load))
-    recent[:, :] = v[: 2 * n_load]
+    recent = np.tile(v[: 2 * n_load], (4, 4, 1))
     return CarriedVoltages(recent, load, np.zeros(1, dtype=np.intp))
 
 
-@compiled
+@inlined
 def _next_voltages(
     network: CompiledNetwork, drawn: Array, source: Array, carried: CarriedVoltages, s: int, v: Array
 ) -> bool:
@@ -96,17 +94,19 @@ def _next_voltages(
     for i in range(n):
         v[i] = 4.0 * (recent[0, s, i] + recent[2, s, i]) - 6.0 * recent[1, s, i] - recent[3, s, i]
     needed = solve_voltages(network, drawn, source, load, v, FIXED_POINT_STEPS)
-    if needed > FIXED_POINT_STEPS:
-        v[:n] = recent[0, s]  # those of the step before
-        if not solve_afresh(network, drawn, source, load, v):
-            return False
+    solved = needed <= FIXED_POINT_STEPS
+    if not solved:
+        for i in range(n):
+            v[i] = recent[0, s, i]  # those of the step before
+        solved = solve_afresh(network, drawn, source, load, v)
         age[0] = 0
     elif needed > SLOW and age[0] > RENEWED_AFTER:
         renew(network, drawn, v, load)
         age[0] = 0
-    recent[3, s], recent[2, s], recent[1, s] = recent[2, s], recent[1, s], recent[0, s]
-    recent[0, s] = v[:n]
-    return True
+    for i in range(n):
+        recent[3, s, i], recent[2, s, i], recent[1, s, i] = recent[2, s, i], recent[1, s, i], recent[0, s, i]
+        recent[0, s, i] = v[i]
+    return solved
 
 
 @compiled
@@ -165,7 +165,10 @@ def integrate_plant(
                     return k
                 machine_rates(data, stage, v, p_ref, inputs.v_ref, rates, p_e)
                 if s == 0 and j == 0:
-                    states.x[k], states.v[k], states.p_e[k] = x, v, p_e
+                    for q in range(N_STATES):
+                        copy_row(x[q], states.x[k, q])
+                    copy_row(v, states.v[k])
+                    copy_row(p_e, states.p_e[k])
                     if k == n - 1:
                         return n
                 for q in range(N_STATES):

@@ -20,7 +20,7 @@ import numpy as np
 
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.machine_arrays import MachineArrays
-from ded_bench.problem.compiled import compiled, inlined
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array
 
 #: The fixed point gives up after so many steps, Newton's method, which renews W in each, after so many.
@@ -57,7 +57,9 @@ def renew(network: CompiledNetwork, drawn: Array, v: Array, load: LoadSlopes) ->
         for row in range(2):
             for column in range(2):
                 matrix[2 * i + column, 2 * i + row] -= load.slopes[i, 2 * row + column]
-    load.answer[:] = np.linalg.inv(matrix)
+    inverse = np.linalg.inv(matrix)
+    for j in range(len(matrix)):
+        copy_row(inverse[j], load.answer[j])
 
 
 @compiled
@@ -113,7 +115,8 @@ def solve_voltages(
             slope = load.slopes[i]
             current[2 * i] = -(p * re + q * im) / square - slope[0] * re - slope[1] * im
             current[2 * i + 1] = -(p * im - q * re) / square - slope[2] * re - slope[3] * im
-        new[:n] = base[:n]
+        for i in range(n):
+            new[i] = base[i]
         for j in range(n):
             row, factor = load.answer[j], current[j]
             for i in range(n):
@@ -126,7 +129,8 @@ def solve_voltages(
             worst = max(worst, off)
             v[i] = new[i]
         if worst < network.change:
-            v[n:] = base[n:]
+            for i in range(n, n_all):
+                v[i] = base[i]
             for j in range(n):
                 row, factor = load.answer[j], current[j]
                 for i in range(n, n_all):

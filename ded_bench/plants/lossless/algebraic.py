@@ -111,13 +111,12 @@ def solve_factorised(elimination: Elimination, factor: Array, x: Array) -> None:
 
 
 @compiled
-def factorised(grid: CompiledGrid, angle: Array) -> Array:
+def factorise(grid: CompiledGrid, angle: Array, factor: Array) -> None:
     """Factors of the algebraic buses' Jacobian (`eliminate`)."""
     n = len(grid.algebraic)
-    jacobian, factor = np.empty((n, n)), np.empty(n + len(grid.elimination.met))
+    jacobian = np.empty((n, n))
     set_jacobian(grid, angle, jacobian)
     eliminate(grid.elimination, jacobian, factor)
-    return factor
 
 
 @compiled
@@ -136,7 +135,7 @@ def solve_algebraic(
     Returns:
         Whether there is a solution; if there is none, angles and f mean nothing.
     """
-    last = np.inf
+    last, correction = np.inf, np.empty(len(wanted))
     for _ in range(NEWTON_STEPS):
         worst = _mismatch(grid, wanted, angle, f)
         if worst < grid.mismatch:
@@ -144,11 +143,13 @@ def solve_algebraic(
         if not worst < np.inf:
             return False
         if worst > contraction * last:
-            factor[:] = factorised(grid, angle)
+            factorise(grid, angle, factor)
         last = worst
-        correction = f[grid.algebraic] - wanted
+        for i in range(len(wanted)):
+            correction[i] = f[grid.algebraic[i]] - wanted[i]
         solve_factorised(grid.elimination, factor, correction)
-        angle[grid.algebraic] -= correction
+        for i in range(len(wanted)):
+            angle[grid.algebraic[i]] -= correction[i]
     return False
 
 
@@ -165,8 +166,10 @@ def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> b
     Returns:
         Whether there is a solution for all.
     """
+    factor = np.empty(len(grid.algebraic) + len(grid.elimination.met))
     for b in range(len(theta)):
-        if not solve_algebraic(grid, wanted[b], factorised(grid, theta[b]), theta[b], f[b], 0.0):
+        factorise(grid, theta[b], factor)
+        if not solve_algebraic(grid, wanted[b], factor, theta[b], f[b], 0.0):
             return False
     return True
 

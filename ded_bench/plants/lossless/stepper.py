@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ded_bench.plants.hold import Indices
-from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorised, solve_algebraic
+from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorise, solve_algebraic
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled, inlined
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 
 #: Dormand and Prince's method of order 5 (Hairer, Norsett, Wanner: Solving ODEs I, II.5); SciPy loads slowly.
 STAGES = np.zeros((6, 5))
@@ -67,20 +67,19 @@ class Work(NamedTuple):
     f: Array  # injections of all buses, (n_bus,), pu
 
 
-@compiled
 def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
     """What a state without a past has, at angles (n_bus,)."""
     n, n_gen = len(grid.algebraic), len(grid.generators)
     carried = Carried(
         recent=np.empty((RECENT, n)),
-        factor=factorised(grid, theta),
+        factor=np.empty(n + len(grid.elimination.met)),
         ahead=np.empty(n),
         past=np.zeros((len(BASHFORTH), 2, n_gen)),
         linear=np.zeros(1, np.int_),
         slope=np.zeros(n_gen + n),
     )
-    for i in range(n):
-        carried.recent[:, i] = carried.ahead[i] = theta[grid.algebraic[i]]
+    factorise(grid, theta, carried.factor)
+    carried.recent[:] = carried.ahead[:] = theta[grid.algebraic]
     return carried
 
 
@@ -123,17 +122,21 @@ def integrate(
         elif _bends(inputs, k, carried.slope):
             carried.linear[0] = 0
         for j in range(steps):
-            angle[grid.algebraic] = carried.ahead
+            for i in range(len(carried.ahead)):
+                angle[grid.algebraic[i]] = carried.ahead[i]
             if not _evaluate(grid, inputs, (k, j / steps), carried, 0, state, work):
                 return k
             if j == 0:
-                theta[k], omega[k], p_slack[k] = angle, state[1], f[grid.slack]
+                copy_row(angle, theta[k])
+                copy_row(state[1], omega[k])
+                p_slack[k] = f[grid.slack]
                 if k == n - 1:
                     return n
             if _adams(grid, inputs, (k, (j + 1) / steps), h, carried, work):
                 continue
             for s in range(1, n_stages):
-                stage[:] = state
+                copy_row(state[0], stage[0])
+                copy_row(state[1], stage[1])
                 for r in range(s):
                     for q in range(2):
                         for g in range(n_gen):
@@ -146,18 +149,18 @@ def integrate(
                     for g in range(n_gen):
                         state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
             _extrapolate(grid, carried.recent, 1.0, angle)
-            carried.ahead[:] = angle[grid.algebraic]
+            _step_begins(grid, angle, carried.ahead)
     return n
 
 
-@compiled
+@inlined
 def _set_apart(carried: Carried) -> Carried:
     """With angles and factors of its own, which a step at the last point may change."""
     recent, factor, ahead, past, linear, slope = carried
     return Carried(recent.copy(), factor.copy(), ahead, past, linear, slope)
 
 
-@compiled
+@inlined
 def _adams(
     grid: CompiledGrid, inputs: GridInputs, end: tuple[int, float], h: float, carried: Carried, work: Work
 ) -> bool:
@@ -175,13 +178,14 @@ def _adams(
         Whether it is.
     """
     past, predicted, rates = carried.past, work.stage, work.rates[-1]
-    for i in range(len(past) - 1, 0, -1):
-        past[i] = past[i - 1]
-    past[0] = work.rates[0]
+    for q in range(2):
+        for i in range(len(past) - 1, 0, -1):
+            copy_row(past[i - 1, q], past[i, q])
+        copy_row(work.rates[0, q], past[0, q])
+        copy_row(work.state[q], predicted[q])
     carried.linear[0] += 1
     if carried.linear[0] < len(past):
         return False
-    predicted[:] = work.state
     for i in range(len(past)):
         for q in range(2):
             for g in range(predicted.shape[1]):
@@ -200,18 +204,31 @@ def _adams(
             predicted[q, g] = corrected
     if not off < ADAMS_TOLERANCE:
         return False
-    work.state[:] = predicted
-    carried.ahead[:] = work.angle[grid.algebraic]
+    copy_row(predicted[0], work.state[0])
+    copy_row(predicted[1], work.state[1])
+    _step_begins(grid, work.angle, carried.ahead)
     return True
+
+
+@inlined
+def _step_begins(grid: CompiledGrid, angle: Array, ahead: Array) -> None:
+    """Keep the algebraic angles near which the next step begins."""
+    for i in range(len(ahead)):
+        ahead[i] = angle[grid.algebraic[i]]
 
 
 @inlined
 def _bends(inputs: GridInputs, k: int, slope: Array) -> bool:
     """Whether powers or loads change otherwise after a point than before it; `slope` becomes their change."""
-    n_gen, before = inputs.p_gen.shape[1], slope.copy()
-    slope[:n_gen] = inputs.p_gen[k + 1] - inputs.p_gen[k]
-    slope[n_gen:] = inputs.injection[k + 1] - inputs.injection[k]
-    return bool(np.abs(slope - before).max() > LINEAR)
+    n_gen, bend = inputs.p_gen.shape[1], 0.0
+    for i in range(len(slope)):
+        before = slope[i]
+        if i < n_gen:
+            slope[i] = inputs.p_gen[k + 1, i] - inputs.p_gen[k, i]
+        else:
+            slope[i] = inputs.injection[k + 1, i - n_gen] - inputs.injection[k, i - n_gen]
+        bend = max(bend, abs(slope[i] - before))
+    return bend > LINEAR
 
 
 @inlined

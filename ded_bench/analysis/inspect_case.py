@@ -26,9 +26,9 @@ class CaseCheck:
     """Nominal operating point, modes around it, and what becomes of drawn instances."""
 
     nominal: NominalPoint
-    frequency_hz: Array  # natural frequencies |λ|/2π of the modes, ascending; on islands those that oscillate
+    frequency_hz: Array  # |λ|/2π of the modes, ascending; with full machine models those that oscillate
     damping: Array  # their damping ratios -Re λ/|λ|
-    knots: int | None  # suggested number, see `suggested_knots`; None on islands, whose knots are AGC's
+    knots: int | None  # suggested number, see `suggested_knots`; None for full machine models
     drawn: int  # instances
     served: int  # of these at the first draw
     redrawn_loads: int  # because their sign changed; not in case/1
@@ -43,7 +43,7 @@ def check_case(case: Case, count: int) -> CaseCheck:
         SimulationError: the nominal powers have no equilibrium.
     """
     nominal = plant_of(case).nominal()
-    modes = nominal.modes[nominal.modes.imag >= (0.0 if case.slack else 1e-6)]
+    modes = nominal.modes[nominal.modes.imag >= (0.0 if isinstance(case, LosslessCase) else 1e-6)]
     modes = modes[np.argsort(np.abs(modes))]
     drawn = list(drawn_with_redraws(case, VALIDATION_SEED, count))
     served = [found for instance, _ in drawn if (found := servable(case, instance))]
@@ -57,7 +57,7 @@ def check_case(case: Case, count: int) -> CaseCheck:
         nominal=nominal,
         frequency_hz=frequency,
         damping=-modes.real / np.abs(modes),
-        knots=suggested_knots(case, float(frequency[-1])) if case.slack else None,
+        knots=suggested_knots(case, float(frequency[-1])) if isinstance(case, LosslessCase) else None,
         drawn=count,
         served=len(served),
         redrawn_loads=sum(redraws for _, redraws in drawn),

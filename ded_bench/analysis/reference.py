@@ -141,7 +141,7 @@ def _against(lines: pd.DataFrame, name: str, failures: str = "failures") -> NDAr
     return np.select([~known, behind, ours < papers], ["", "behind", "ahead"], "equal")
 
 
-#: References of cases without a paper's numbers, the first that has objectives.
+#: References of cases without a paper's numbers: the first that has feasible rows, more than infeasible ones.
 ACCURATE = ("ded-radau", "ded-slp")
 #: What stands for a method where none of these has objectives: the best feasible row of each instance counts.
 BEST = ""
@@ -185,7 +185,13 @@ def choose_reference(rows: pd.DataFrame, paper: Paper | None, shipped: Sequence[
     usable = OBJECTIVES.frame([o for o in shipped if (o.instance, o.problems_version) in ours])
     for method in candidates:
         is_reference = (rows["method"] == method) & (rows["settings"] == DEFAULT)
-        own = _by_instance(rows[is_reference].dropna(subset=["objective"]))
+        own_rows = rows[is_reference].dropna(subset=["objective"])
+        if not paper:
+            confirmed = own_rows["feasible"] == True  # noqa: E712
+            if 2 * confirmed.sum() < len(own_rows):
+                continue
+            own_rows = own_rows[confirmed]
+        own = _by_instance(own_rows)
         objectives = own.combine_first(_by_instance(usable[usable["method"] == method]))
         if len(objectives):
             return Reference(method, objectives, len(objectives) - len(own))

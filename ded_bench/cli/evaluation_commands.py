@@ -21,7 +21,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method, registered
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import servable
-from ded_bench.problem.benchmark import problem_folder, select_split, validation_instances
+from ded_bench.problem.benchmark import select_split, validation_instances
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.results.folder import ResultsFolder, default_results, reference_run, search_folders
 from ded_bench.solvers.status import Status
@@ -70,6 +70,7 @@ def add_commands(commands: Any) -> None:
         metavar="DIR",
         help="one case each; default: each shipped case's own results, else its reference run",
     )
+    p.add_argument("--case", nargs="+", default=(), metavar="DIR", help="folders of cases that do not ship")
     p.add_argument("--out", type=Path, default=Path("results/overview"), help="default: results/overview")
     p.set_defaults(run=_overview)
 
@@ -159,7 +160,7 @@ def _report(a: argparse.Namespace) -> int:
         say(f"tables and figures of {counted(rows, 'row')} in {folder}")
     from ded_bench.report.report import write_report
 
-    written = write_report(case, folder, problem_folder(a.case, case), print)
+    written = write_report(case, folder, case.folder, print)
     OBJECTIVES.write(ResultsFolder(folder).objectives, objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0
@@ -181,6 +182,6 @@ def _overview(a: argparse.Namespace) -> int:
         say(f"tables and figures over {', '.join(map(str, folders))}")
     from ded_bench.report.overview import write_overview
 
-    written = write_overview(folders, a.out)
+    written = write_overview(folders, a.out, tuple(map(Case.load, a.case)))
     print(f"wrote {len(written)} files; read {a.out / 'overview.html'} or {a.out / 'overview.md'}")
     return 0

@@ -22,7 +22,7 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import PLANTS, plant_of
-from ded_bench.problem.benchmark import problem_folder, scenario_files
+from ded_bench.problem.benchmark import scenario_files
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import check_plausible
 from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
@@ -74,7 +74,7 @@ def _online(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
-    files = a.scenario or scenario_files(problem_folder(a.case, case) / "scenarios", a.scenarios)
+    files = a.scenario or scenario_files(case.folder / "scenarios", a.scenarios)
     scenarios = load_scenarios(files, case)
     for file, scenario in zip(a.scenario or (), scenarios, strict=False):  # the tests check those shipped
         check_plausible(case, first := scenario.snapshot(case, 0.0), file)

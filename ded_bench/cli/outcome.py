@@ -12,7 +12,6 @@ from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.reference import choose_reference, read_paper
 from ded_bench.analysis.summary import HEAD, gaps, named, outcome, own_first, titled
 from ded_bench.cli.arguments import counted, say
-from ded_bench.problem.benchmark import problem_folder
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import ONLINE, OUTCOME
 from ded_bench.report.page import PageTable
@@ -25,10 +24,10 @@ from ded_bench.results.rows import ROWS, Results, Row, reference_objectives
 _LOOP = (*HEAD, "latency_s", "n", "failures", "increase_percent_mean", "max_excess_mhz_mean", "failed")
 
 
-def tell_solved(case: Case, place: str | None, results: Results, rows: Sequence[Row], out: TextIO) -> None:
-    """Print what became of some rows of a results folder; `place` is the case as the user named it."""
+def tell_solved(case: Case, results: Results, rows: Sequence[Row], out: TextIO) -> None:
+    """Print what became of some rows of a results folder."""
     everything = results.frame()
-    paper = read_paper(problem_folder(place or case.id, case))
+    paper = read_paper(case.folder)
     reference = choose_reference(everything[everything["case"] == case.id], paper, reference_objectives(case))
     found = outcome(gaps(named(ROWS.frame(rows)), reference.objectives))
     print(_text(PageTable(own_first(found), OUTCOME)), file=out)

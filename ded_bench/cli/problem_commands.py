@@ -21,7 +21,6 @@ from ded_bench.problem.benchmark import (
     copy_case,
     load_manifest,
     load_split,
-    problem_folder,
     write_benchmark,
     write_scenarios,
 )
@@ -81,7 +80,7 @@ def add_commands(commands: Any) -> None:
 
 def _instances(a: argparse.Namespace) -> int:
     case = Case.load(a.case)
-    home = problem_folder(a.case, case)
+    home = case.folder
     split = load_split(home) if (home / "split.json").is_file() else None
     test, seed = a.test, SEED if split is None else split.seed
     there = 0 if split is None else len(split.train) + len(split.test)
@@ -242,7 +241,7 @@ def _scenarios(a: argparse.Namespace) -> int:
         check_whole_steps(f"a scenario's duration of {DURATION_S:g} s", DURATION_S, case.sampling.dt_s)
     except ValueError as error:
         raise InputError(a.case, "sampling", str(error)) from None
-    folder = a.out or problem_folder(a.case, case) / "scenarios"
+    folder = a.out or case.folder / "scenarios"
     hours = len(list(folder.glob("*-h[0-9]*.json"))) if a.hours is None else a.hours
 
     def draw(folder: Path) -> Manifest:

@@ -30,7 +30,6 @@ from ded_bench.problem.benchmark import (
     Selection,
     check_own_name,
     instance_file,
-    problem_folder,
     select_files,
     select_split,
 )
@@ -126,7 +125,7 @@ def _solve(a: argparse.Namespace) -> int:
     rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
     from ded_bench.cli.outcome import tell_solved
 
-    tell_solved(case, a.case, results, rows, sys.stderr if a.instance else sys.stdout)
+    tell_solved(case, results, rows, sys.stderr if a.instance else sys.stdout)
     print(f"{counted(len(rows), 'row')} in {results.path} ({len(finished)} there already)", file=sys.stderr)
     unanswered = Status.INFEASIBLE, Status.TIME_LIMIT  # results, too
     return 1 if any(row.objective is None and row.status not in unanswered for row in rows) else 0
@@ -284,7 +283,7 @@ def _score_folder(a: argparse.Namespace) -> int:
             _print_row(results, row)
     from ded_bench.cli.outcome import tell_solved
 
-    tell_solved(chosen.case, a.case, results, rows, sys.stderr if a.json else sys.stdout)
+    tell_solved(chosen.case, results, rows, sys.stderr if a.json else sys.stdout)
     print(f"{counted(len(rows), 'row')} in {results.path}", file=sys.stderr)
     return 1 if any(row.objective is None for row in rows) else 0
 
@@ -296,15 +295,14 @@ def _chosen(a: argparse.Namespace) -> Selection:
     else:
         a.instance = [instance_file(name, a.case) for name in a.instance]
         chosen = select_files(a.instance, Case.load(a.case) if a.case else None)
-    problems = problem_folder(a.case or chosen.case.id, chosen.case)
-    if not a.instance and SHIPPED_CASES in problems.parents:
+    if not a.instance and SHIPPED_CASES in chosen.case.folder.parents:
         return chosen  # the tests check those that are shipped
     places = a.instance or [f"instance {instance.id}" for instance, _ in chosen.instances]
     for place, (instance, _) in zip(places, chosen.instances, strict=True):
         check_plausible(chosen.case, instance, place)
         plant_of(chosen.case).check_servable(instance, str(place))
         if a.instance:
-            check_own_name(instance, place, problems, chosen.case)
+            check_own_name(instance, place, chosen.case.folder, chosen.case)
     return chosen
 
 

@@ -56,7 +56,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """
     if case.slack is None:
         raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
-    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
+    surrogate = find_surrogate(case, settings.model, settings.search)
     solver = read_options(Options, settings.options).solver
     if solver != "piqp" and not isinstance(surrogate, Koopman):
         raise InputError("--set", f"solver={solver}", f"only piqp solves `ded-ko` on {surrogate.kind}")

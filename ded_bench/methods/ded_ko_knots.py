@@ -27,7 +27,7 @@ VERSION = 1
 
 def prepare(case: Case, regime: str, settings: Settings) -> KnotSolver:
     """Return a solver of single instances on the surrogate that the settings name."""
-    surrogate = find_surrogate(case, settings.model or "koopman", settings.search)
+    surrogate = find_surrogate(case, settings.model, settings.search)
     return KnotSolver(case, surrogate, regime, settings.time_limit_s)
 
 

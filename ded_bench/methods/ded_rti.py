@@ -53,7 +53,7 @@ NEAR_S = 30.0
 
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
-    surrogate = find_surrogate(case, settings.model or TRAJECTORY, settings.search)
+    surrogate = find_surrogate(case, settings.model, settings.search, TRAJECTORY)
     return RealTimeSolver(case, surrogate, regime, settings.time_limit_s)
 
 

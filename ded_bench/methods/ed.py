@@ -50,11 +50,17 @@ class Options:
     lead: bool = option(False, "on islands: turbines deliver the dispatch, governors' lags are led")
 
 
-def prepare(case: Case, regime: str, settings: Settings) -> Solver:
-    """Return a dispatcher of single instances; both regimes get the same schedules."""
+def check(case: Case, settings: Settings) -> Options:
+    """The options; InputError if the case has no governors to lead."""
     options = read_options(Options, settings.options)
     if options.lead and case.slack is not None:
         raise InputError("--set", "lead", f"needs an island; case {case.id} has a slack")
+    return options
+
+
+def prepare(case: Case, regime: str, settings: Settings) -> Solver:
+    """Return a dispatcher of single instances; both regimes get the same schedules."""
+    options = check(case, settings)
 
     def solve(instance: Instance) -> Solution:
         started = time.perf_counter()

@@ -1,13 +1,14 @@
 """METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`plugin`).
 
 A method's module offers `Options`, its parameters (see `methods.options`); `VERSION`, a whole number that is
-raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If it plans with
-a surrogate, its line here names the usual one. If it depends on other trained models or policies, it offers
-`artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy to be trained, its
-line here names the module whose `train` does it (see `training_record`), and `ded-bench train-dpc` knows it.
-What `prepare` returns may also have `solve(instance, last=None)`, which the closed loop calls: it may start
-from the plan in force, and where no schedule meets every limit it may answer `Infeasible` with the schedule
-that exceeds them least.
+raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If there are
+cases that it does not plan on, `check(case, settings)` says so. If it plans with a surrogate, its line here
+names the usual one. If it depends on other trained models or policies, it offers `artifacts(case, regime,
+settings) -> tuple[Artifact, ...]`, all of them. If it is a policy to be trained, its line here names the
+module whose `train` does it (see `training_record`), and `ded-bench train-dpc` knows it. What `prepare`
+returns may also have `solve(instance, last=None)`, which the closed loop calls: it may start from the plan in
+force, and where no schedule meets every limit it may answer `Infeasible` with the schedule that exceeds them
+least.
 """
 
 from __future__ import annotations
@@ -78,10 +79,13 @@ class Method:
         """All models and policies that answers depend on.
 
         Raises:
-            InputError: unknown options, or a model or policy that is missing or does not fit.
+            InputError: unknown options, a case that it does not plan on, or a model or policy that is
+                missing or does not fit.
         """
-        find = getattr(self._answering, "artifacts", None)
+        find, check = (getattr(self._answering, name, None) for name in ("artifacts", "check"))
         own = self.canonical(settings)
+        if check:
+            check(case, own)
         if find:
             return tuple(find(case, regime, own))
         return (model_artifact(case, own, self.model),) if self.model else ()

@@ -73,10 +73,9 @@ def model_artifact(case: Case, settings: Settings, default: str = "koopman") -> 
     Raises:
         InputError: there is no such model, or its file is wrong.
     """
-    name = settings.model or default
     from ded_bench.surrogates.find import find_surrogate  # and SciPy: the door does without
 
-    model = find_surrogate(case, name, settings.search)
+    model = find_surrogate(case, settings.model, settings.search, default)
     return Artifact("model", model.kind, model.fingerprint, getattr(model, "path", None))
 
 

@@ -46,7 +46,7 @@ def find_policy_file(method: str, case: Case, regime: str, settings: Settings) -
         path = policy_file(folder, method, regime, settings.model)
         if path.is_file():
             return path
-    command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.id}"
+    command = f"ded-bench train-dpc --method {method} --regime {regime} --case {case.place}"
     command += "" if settings.model in ("", DEFAULT_MODEL) else f" --model {settings.model}"
     raise InputError("--policy", "", f"no {method} policy for {regime} yet; run `{command}`")
 

@@ -65,14 +65,6 @@ def load_manifest(folder: Path) -> Manifest | None:
     return read_record(Manifest, path) if path.is_file() else None
 
 
-def problem_folder(name: str | Path, case: Case) -> Path:
-    """The folder that holds a case's instances: the one given, or that of the shipped case."""
-    path = Path(name)
-    if (path / "case.json").is_file():
-        return path
-    return path.parent if path.is_file() else SHIPPED_CASES / case.id
-
-
 def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
     if not (folder / MANIFEST).is_file():
@@ -215,7 +207,7 @@ def select_split(
         InputError: there is no such case or split, or a file is missing or wrong.
     """
     case = Case.load(name)
-    folder = problem_folder(name, case)
+    folder = case.folder
     if split == "validation":
         manifest = load_manifest(folder)
         count = VALIDATION_COUNT if limit is None else limit
@@ -252,7 +244,7 @@ def instance_file(name: Path, case: str | None = None) -> Path:
     """
     if name.exists() or name.name != str(name) or name.suffix:
         return name
-    folders = [problem_folder(case, Case.load(case))] if case else sorted(SHIPPED_CASES.glob("*"))
+    folders = [Case.load(case).folder] if case else sorted(SHIPPED_CASES.glob("*"))
     for folder in folders:
         if (found := folder / "instances" / f"{name}.json").is_file():
             return found

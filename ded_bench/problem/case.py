@@ -100,6 +100,7 @@ class Case(Fingerprinted, Extended):
     #: Whether it is nothing without the files of its grid beside it.
     needs_grid: ClassVar[bool] = False
     _grid: GridFiles | None = PrivateAttr(default=None)
+    _folder: Path | None = PrivateAttr(default=None)
 
     @staticmethod
     def load(name_or_path: str | Path) -> Case:
@@ -113,7 +114,8 @@ class Case(Fingerprinted, Extended):
         """
         path = case_file(name_or_path)
         text = read_text(path)
-        case = parse_record(_record_of(text), text, path)
+        case = parse_record(_record_of(text, path), text, path)
+        case._folder = path.parent
         if case.needs_grid or all((path.parent / name).is_file() for name in GRID_FILES):
             case._grid = load_grid_files(path.parent, case.id, case.f0_hz)
             case._check_grid(case._grid, path.parent)
@@ -128,6 +130,16 @@ class Case(Fingerprinted, Extended):
             raise InputError(folder / where, "machines", problem)
         if unknown := set(self.loads) - {bus.id for bus in grid.network.buses}:
             raise InputError(folder / NETWORK_FILE, "buses", f"there is no bus {min(unknown)} of a load")
+
+    @property
+    def folder(self) -> Path:
+        """Of its instances and scenarios: where it was read, else that of the shipped case of its name."""
+        return self._folder or SHIPPED_CASES / self.id
+
+    @property
+    def place(self) -> str:
+        """What `--case` finds it by."""
+        return self.id if self.folder.parent == SHIPPED_CASES else str(self.folder)
 
     def __eq__(self, other: object) -> bool:
         """Equal content, also of the files beside the case."""
@@ -293,14 +305,20 @@ class Case(Fingerprinted, Extended):
                 )
 
 
-def _record_of(text: str) -> type[Case]:
-    """The record of a file's schema; what names none of them is refused as the oldest."""
+def _record_of(text: str, path: Path) -> type[Case]:
+    """The record of a file's schema; a file that is none of JSON is refused as the oldest.
+
+    Raises:
+        InputError: there is no such schema.
+    """
     try:
         data = json.loads(text)
     except (ValueError, RecursionError):
         data = None
-    schema = str(data.get("schema")) if isinstance(data, dict) else ""
-    record: type[Case] = pkgutil.resolve_name(SCHEMAS[schema if schema in SCHEMAS else min(SCHEMAS)])
+    schema = str(data.get("schema")) if isinstance(data, dict) else min(SCHEMAS)
+    if schema not in SCHEMAS:
+        raise InputError(path, "schema", f"is {schema[:60]!r}, not one of {', '.join(SCHEMAS)}")
+    record: type[Case] = pkgutil.resolve_name(SCHEMAS[schema])
     return record
 
 

@@ -15,7 +15,7 @@ from ded_bench.analysis.summary import GROUP, findings, groups, main_lines, reco
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of
-from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.case import Case
 from ded_bench.report.columns import CASE, GRIDS, ONLINE, REGIME, TITLE, Column
 from ded_bench.report.page import Block, PageTable, bullets, folded, write_page
 from ded_bench.report.sources import Sources, read_sources
@@ -34,20 +34,23 @@ EXPLANATION = (
 )
 
 
-def write_overview(folders: Sequence[Path], out: Path) -> list[Path]:
+def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = ()) -> list[Path]:
     """Write `overview.md`, `overview.html` and tables as CSV.
 
     Args:
-        folders: results folders, one shipped case each.
+        folders: results folders, one case each.
         out: folder of the page.
+        cases: those of them that do not ship.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: a folder holds no results, or not those of one shipped case.
+        InputError: a folder holds no results, or not those of one case that is known.
     """
-    grids = sorted((read_grid(folder) for folder in folders), key=lambda grid: len(grid.case.generators))
+    grids = sorted(
+        (read_grid(folder, cases) for folder in folders), key=lambda grid: len(grid.case.generators)
+    )
     found = points(grids)
     made: list[Block] = [
         f"# Dynamics-aware economic dispatch on {len(grids)} grids",
@@ -109,11 +112,11 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, list[Bloc
     }
 
 
-def read_grid(folder: Path) -> Sources:
-    """Read the results of one shipped case.
+def read_grid(folder: Path, cases: Sequence[Case] = ()) -> Sources:
+    """Read the results of one case: one of these, or one that ships.
 
     Raises:
-        InputError: no results, several cases or one that is not shipped, or a table that is wrong.
+        InputError: no results, several cases or one that is unknown, or a table that is wrong.
     """
     path = ResultsFolder(folder).results
     if not path.is_file():
@@ -121,8 +124,8 @@ def read_grid(folder: Path) -> Sources:
     names = sorted({row.case for row in Results(folder).rows.values()})
     if len(names) != 1:
         raise InputError(path, "case", f"is not one: {', '.join(names) or 'no rows'}")
-    case = Case.load(names[0])
-    return read_sources(case, folder, SHIPPED_CASES / case.id)
+    case = next((case for case in cases if case.id == names[0]), None) or Case.load(names[0])
+    return read_sources(case, folder, case.folder)
 
 
 def sizes(grids: Sequence[Sources]) -> pd.DataFrame:

@@ -213,7 +213,7 @@ def alarms(sources: Sources) -> list[str]:
     """Why a report has nothing to compare; empty if it has."""
     case, judged, reference = sources.case, sources.judged, sources.reference
     method = reference.method or reference.wanted
-    solve = f"ded-bench solve --case {case.id} --method {method} --regime {','.join(case.regimes)}"
+    solve = f"ded-bench solve --case {case.place} --method {method} --regime {','.join(case.regimes)}"
     if not len(sources.rows):
         return [f"No rows yet: `{solve}` makes some."]
     if not judged["objective"].notna().any():

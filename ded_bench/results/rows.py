@@ -207,7 +207,9 @@ class Results(KeyedTable[Key, Row]):
         """
         kept = [row for row in self.rows.values() if row.instance in instances and self.has_schedule(row)]
         if not kept:
-            raise InputError(self.paths.schedules, "", "holds no schedule of these rows")
+            known = any(row.instance in instances for row in self.rows.values())
+            whose = "these rows" if known else "instances that are known here; name them by --instance"
+            raise InputError(self.paths.schedules, "", f"holds no schedule of {whose}")
         return kept
 
     def pack(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -70,7 +70,7 @@ class AtNominalPoint(AlongTrajectory):
 
     plant: DetailedPlant
     kind: str = "linear"
-    _made: dict[tuple[bytes, float], TimeVarying] = field(default_factory=dict, compare=False, repr=False)
+    _made: dict[Hashable, TimeVarying] = field(default_factory=dict, compare=False, repr=False)
     _coarse: dict[float, CoarsePlant] = field(default_factory=dict, compare=False, repr=False)
 
     def along(
@@ -80,7 +80,7 @@ class AtNominalPoint(AlongTrajectory):
         from ded_bench.plants.detailed.coarse import CoarsePlant  # and with it Numba
 
         start = self.plant.initial(instance) if state is None else state
-        key = points.tobytes(), start.next_s
+        key = points.tobytes(), instance.dt_s, start.next_s
         if key not in self._made:
             self._made[key] = self._at_rest(instance, points, start.next_s)
         model, dt_s = self._made[key], instance.dt_s
@@ -95,7 +95,7 @@ class AtNominalPoint(AlongTrajectory):
         """Maps of set-points along the nominal equilibrium."""
         case, system = self.plant.case, self.plant.system
         power = system.network.nominal().power.real[system.scheduled]
-        nominal = zip(case.loads, case.load_nominal.tolist(), strict=True)
+        nominal = zip(case.loads, (-system.network.p_drawn[system.load_ports]).tolist(), strict=True)
         load = {bus: LoadPoints(points=((0.0, p), (instance.horizon_s, p))) for bus, p in nominal}
         initial = State(None, np.zeros(len(power)), power).initial(case)
         rest = instance.model_copy(update={"initial": initial, "load": load})
@@ -108,13 +108,16 @@ class AtNominalPoint(AlongTrajectory):
 Surrogate = Koopman | AlongTrajectory
 
 
-def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
+def find_surrogate(case: Case, name: str, search: Sequence[Path], usual: str = "koopman") -> Surrogate:
     """Return a surrogate by its kind, from the first folder that has it, or by its file's path.
+
+    No name means the usual one, and `trajectory` on plants whose usual one nobody identifies.
 
     Raises:
         InputError: there is no such model yet (names the command that makes it), its file is wrong, or there
             is none of this kind on the case's plant.
     """
+    name = name or (usual if case.plant_name == "lossless" else TRAJECTORY)
     if name == TRAJECTORY:
         return AlongTrajectory(plant_of(case))
     if name == "linear" and case.plant_name == "detailed" and case.slack is None:
@@ -130,7 +133,7 @@ def find_surrogate(case: Case, name: str, search: Sequence[Path]) -> Surrogate:
     files, problem = [Path(name)], f"no such file and no such model (known: {', '.join(MODELS)})"
     if name in TRAINED:
         files = [ResultsFolder(folder).model(name) for folder in search]
-        problem = f"not there yet; run `ded-bench train-ko --case {case.id}`, or use --model {TRAJECTORY}"
+        problem = f"not there yet; run `ded-bench train-ko --case {case.place}`, or use --model {TRAJECTORY}"
     for file in files:
         if file.is_file():
             return Koopman.load(file, case)

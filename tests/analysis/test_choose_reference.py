@@ -23,10 +23,13 @@ def test_the_papers_reference_where_a_case_carries_its_numbers() -> None:
 def test_an_accurate_method_elsewhere_whichever_has_scored_rows() -> None:
     ded, slp, radau = row("a", "ded", 100.0), row("a", "ded-slp", 50.0), row("b", "ded-radau", 60.0)
     coarse = row("b", "ded-radau", 60.0, settings="coarse")
+    wrong = row("c", "ded-radau", 60.0, feasible=False)
     for rows, method in (
         ((ded, slp, radau), "ded-radau"),
         ((ded, slp, row("b", "ded-radau")), "ded-slp"),
         ((ded, slp, coarse), "ded-slp"),
+        ((slp, radau, wrong), "ded-radau"),
+        ((slp, wrong), "ded-slp"),
         ((row("a", "ded"),), "ded-radau"),
         ((), "ded-radau"),
     ):

@@ -131,6 +131,7 @@ def test_bad_choices(instance_file, schedule_file, tmp_path, capsys) -> None:
     chosen = ("--instance", instance_file)
     assert "magic" in refused(capsys, "solve", "--method", "magic", "--regime", "NO", *chosen, *out)
     assert "'XX'" in refused(capsys, "solve", "--method", "ded", "--regime", "XX", *chosen, *out)
+    assert "lead" in refused(capsys, "solve", "--method", "ed", "--set", "lead=on", *chosen, *out)
     assert "magic" in refused(capsys, *SOLVE, "--settings", "magic", *chosen, *out)
     assert "nowhere.json" in refused(capsys, *SOLVE, "--instance", tmp_path / "nowhere.json", *out)
     assert "--workers" in refused(capsys, *SOLVE, "--workers", "0", *chosen, *out)

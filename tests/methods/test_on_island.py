@@ -31,6 +31,7 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
+from ded_bench.surrogates.find import find_surrogate
 
 #: `ded-admm` needs a policy, and says so (`test_island_policy`).
 PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots", "ded-radau")
@@ -212,9 +213,26 @@ def test_others_refuse_with_one_line(island: Case, instance: Instance, method: s
         assert "\n" not in str(refusal.value)
 
 
-def test_full_ded_refuses_before_it_has_an_instance(island: Case) -> None:
-    with pytest.raises(InputError, match="has no lossless network"):
-        get_method("ded").prepare(island, "TO", Settings())
+@pytest.mark.parametrize(
+    ("case", "method", "options"), [("island", "ded", "default"), ("threebus", "ed", "lead=on")]
+)
+def test_a_case_that_a_method_does_not_plan_on(case: str, method: str, options: str, request) -> None:
+    """Before any row is made."""
+    with pytest.raises(InputError, match=r"has no lossless network|needs an island"):
+        get_method(method).artifacts(request.getfixturevalue(case), "TO", Settings(options))
+
+
+def test_one_solver_for_instances_of_different_grids_of_time(island: Case, instance: Instance) -> None:
+    """The same grid points at other times make other maps."""
+    other = instance.model_copy(update={"id": "other", "dt_s": instance.dt_s / 2}).until(
+        instance.horizon_s / 2
+    )
+    points = np.arange(0, instance.steps + 1, 100)
+    p_gen = np.tile(instance.p_initial(island), (len(points), 1))
+    used, fresh = (find_surrogate(island, "linear", ()) for _ in range(2))
+    used.along(other, p_gen, points)
+    expected, found = fresh.along(instance, p_gen, points), used.along(instance, p_gen, points)
+    np.testing.assert_array_equal(found.across.f, expected.across.f)
 
 
 def test_islands_start_at_rest_whatever_is_drawn(island: Case) -> None:

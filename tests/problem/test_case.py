@@ -57,6 +57,9 @@ def test_a_case_resolves_from_name_folder_and_file(ninebus, tmp_path, monkeypatc
         Case.load("nowhere")
     with pytest.raises(InputError, match=r"case.json: cannot be read"):
         Case.load(tmp_path)
+    (tmp_path / "case.json").write_text('{"schema": "ded-bench/case/4", "mean_hz": 1}')
+    with pytest.raises(InputError, match=r"case.json: schema: is 'ded-bench/case/4', not one of"):
+        Case.load(tmp_path)
 
 
 def _set(path: str, value: object):

@@ -63,13 +63,17 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     assert not list(page.every("img"))
 
 
-def test_folders_without_results_of_one_shipped_case_are_refused(folders, tmp_path, capsys) -> None:
+def test_folders_without_results_of_one_shipped_case_are_refused(folders, threebus, tmp_path, capsys) -> None:
     with pytest.raises(InputError, match="is missing"):
         read_grid(tmp_path)
     row = Row("a", "test", "TO", "ed", "default", "Optimal", objective=1.0, case="9bus")
     Results(tmp_path / "two").add([row, dataclasses.replace(row, instance="b", case="39bus")])
     with pytest.raises(InputError, match="is not one: 39bus, 9bus"):
         read_grid(tmp_path / "two")
+    Results(tmp_path / "own").add([dataclasses.replace(row, case="threebus")])
+    with pytest.raises(InputError, match="threebus: no such case"):
+        read_grid(tmp_path / "own")
+    assert read_grid(tmp_path / "own", [threebus]).case == threebus
     assert main(["overview", "--results", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
     assert "typo/results.csv: is missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -10,20 +10,25 @@ import pytest
 from scipy.optimize import linprog
 
 from ded_bench.files.errors import InputError
+from ded_bench.methods.ed import static_dispatch, within_ramps
 from ded_bench.methods.island.island_iterations import (
     FORGOTTEN,
     RAMP_MARGIN,
     RESOLUTION,
+    Found,
     IslandGrid,
     IslandIterations,
+    IslandProblem,
     swings_by,
 )
 from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
 from ded_bench.methods.island.island_training import FIRST, train
+from ded_bench.methods.knots import knot_points
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions
+from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -133,3 +138,30 @@ def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instan
     assert plan is not None
     np.testing.assert_allclose(plan.p, made.powers(later, state=true), rtol=0, atol=2 * RESOLUTION)
     assert np.abs(plan.p - made.powers(later)).max() > 100 * RESOLUTION
+
+
+@pytest.mark.parametrize("carried", [1, 3])
+def test_a_start_that_the_plant_cannot_carry(
+    carried: int, island: Case, instance: Instance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then it goes on from the static dispatch, towards what is carried; or that is the answer."""
+    made = policy(island)
+    follow, start, seen = made.grid.follow, made.grid.ask(instance).start, []
+
+    def refusing(asked: IslandProblem, schedule: np.ndarray) -> Found:
+        if np.array_equal(schedule, start) or len(seen) == carried:
+            raise SimulationError("no voltages")
+        seen.append(schedule)
+        return follow(asked, schedule)
+
+    monkeypatch.setattr(made.grid, "follow", refusing)
+    answer = made.powers(instance)
+    served = within_ramps(
+        island,
+        instance,
+        static_dispatch(island, instance, lead=False),
+        knot_points(made.knots, instance.dt_s),
+    )
+    np.testing.assert_array_equal(seen[0], served)
+    assert any(np.array_equal(answer, one) for one in seen)
+    assert np.array_equal(answer, served) == (carried == 1)

@@ -7,13 +7,22 @@ set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ded_bench.methods.island.island_iterations import SETTINGS, IslandGrid, IslandIterations, IslandProblem
+from ded_bench.methods.ed import static_dispatch, within_ramps
+from ded_bench.methods.island.island_iterations import (
+    SETTINGS,
+    Found,
+    IslandGrid,
+    IslandIterations,
+    IslandProblem,
+)
+from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.trained_policy import TrainedPolicy, answered, warm_up
@@ -29,6 +38,8 @@ MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 NEAR = 0.05
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
 MENDED, WIDENED = 5, 2.0
+#: Parts of the way to an answer that are tried, each half of the one before.
+HALVINGS = 4
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 #: Iterations without costs, made once for all settings.
@@ -63,29 +74,38 @@ class IslandPolicy(TrainedPolicy):
             state: at t = 0; None: what is not measured is stationary.
         """
         asked = self.grid.ask(instance, state)
-        answer = asked.start
-        for count in filter(None, (self.training["iterations"], further)):
-            answer = self._improved(asked, answer, count)
-        return answer
-
-    def _improved(self, asked: IslandProblem, start: Array, count: int) -> Array:
-        """The first far enough from the bounds, else that with the least excess."""
-        answer, dual, seen, margins = start, None, [], np.exp(self.weights["settings"][len(MENDING) :])
         try:
-            for _ in range(self.training["rounds"]):
-                seen.append(self.grid.follow(asked, answer))
-                answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
-            for more in np.linspace(1.0, WIDENED, MENDED):
-                seen.append(self.grid.follow(asked, answer))
-                if seen[-1].excess <= -NEAR:
-                    return answer
-                count = self.training["mending"]
-                answer, _ = mending_of(self.grid)(asked, seen[-1], count, more * margins)
-            seen.append(self.grid.follow(asked, answer))
-        except SimulationError:
-            if not seen:
-                return start
-        return min(seen, key=lambda found: found.excess).schedule
+            first = self.grid.follow(asked, asked.start)
+        except SimulationError:  # static dispatch is what every instance can be served by
+            case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
+            served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
+            try:
+                first = self.grid.follow(asked, served)
+            except SimulationError:
+                return served
+        for count in filter(None, (self.training["iterations"], further)):
+            first = self._improved(asked, first, count)
+        return first.schedule
+
+    def _improved(self, asked: IslandProblem, first: Found, count: int) -> Found:
+        """The first far enough from the bounds, else that with the least excess."""
+        dual, seen, margins = None, [first], np.exp(self.weights["settings"][len(MENDING) :])
+        for _ in range(self.training["rounds"]):
+            answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
+            seen.append(self._followed(asked, seen[-1], answer))
+        for more in np.linspace(1.0, WIDENED, MENDED):
+            if seen[-1].excess <= -NEAR:
+                return seen[-1]
+            answer, _ = mending_of(self.grid)(asked, seen[-1], self.training["mending"], more * margins)
+            seen.append(self._followed(asked, seen[-1], answer))
+        return min(seen, key=lambda found: found.excess)
+
+    def _followed(self, asked: IslandProblem, last: Found, answer: Array) -> Found:
+        """An answer, or as much of the way to it as the plant can carry, in halves."""
+        for part in 0.5 ** np.arange(HALVINGS):
+            with contextlib.suppress(SimulationError):
+                return self.grid.follow(asked, last.schedule + part * (answer - last.schedule))
+        return last
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

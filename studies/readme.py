@@ -30,7 +30,7 @@ KEPT = 0.95
 def run(case: str) -> Sources:
     """The reference run of a grid."""
     folder = REPOSITORY / "results" / f"{case}-reference"
-    return read_sources(Case.load(SHIPPED_CASES / case), folder, SHIPPED_CASES / case)
+    return read_sources(Case.load(SHIPPED_CASES / case), folder)
 
 
 def markdown(heads: list[str], rows: list[list[str]]) -> str:

@@ -160,7 +160,7 @@ def _report(a: argparse.Namespace) -> int:
         say(f"tables and figures of {counted(rows, 'row')} in {folder}")
     from ded_bench.report.report import write_report
 
-    written = write_report(case, folder, case.folder, print)
+    written = write_report(case, folder, print)
     OBJECTIVES.write(ResultsFolder(folder).objectives, objectives_of(Results(folder).rows.values()))
     print(f"wrote {len(written)} files; read {folder / 'report.html'} or {folder / 'report.md'}")
     return 0

@@ -302,7 +302,7 @@ def _chosen(a: argparse.Namespace) -> Selection:
         check_plausible(chosen.case, instance, place)
         plant_of(chosen.case).check_servable(instance, str(place))
         if a.instance:
-            check_own_name(instance, place, chosen.case.folder, chosen.case)
+            check_own_name(instance, place, chosen.case)
     return chosen
 
 

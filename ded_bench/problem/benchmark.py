@@ -207,19 +207,17 @@ def select_split(
         InputError: there is no such case or split, or a file is missing or wrong.
     """
     case = Case.load(name)
-    folder = case.folder
     if split == "validation":
-        manifest = load_manifest(folder)
         count = VALIDATION_COUNT if limit is None else limit
         drawn = validation_instances(case, count, servable=servable)
-        return Selection(case, tuple((i, split) for i in drawn), manifest.version if manifest else "")
-    known = load_split(folder)
+        return Selection(case, tuple((i, split) for i in drawn), _version(case.folder))
+    known = load_split(case.folder)
     named = {"train": known.train, "test": known.test, "all": known.train + known.test}
     if split not in named:
         raise InputError("split", split, f"is not one of {', '.join(SPLITS)}")
     ids = sorted(named[split])[:limit]
-    instances, case = load_instances([folder / "instances" / f"{i}.json" for i in ids], case)
-    return _selection(case, instances, folder)
+    instances, case = load_instances([case.folder / "instances" / f"{i}.json" for i in ids], case)
+    return _selection(case, instances, case.folder)
 
 
 def validation_instances(
@@ -261,24 +259,25 @@ def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selec
     return _selection(case, instances, Path(paths[0]).resolve().parent.parent)
 
 
+def _version(folder: Path) -> str:
+    manifest = load_manifest(folder)
+    return manifest.version if manifest else ""
+
+
 def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selection:
     split = load_split(folder) if (folder / "split.json").is_file() else None
     named = {} if split is None else dict.fromkeys(split.test, "test") | dict.fromkeys(split.train, "train")
     chosen = tuple((instance, named.get(instance.id, "none")) for instance in instances)
-    manifest = load_manifest(folder)
-    return Selection(case, chosen, manifest.version if manifest else "")
+    return Selection(case, chosen, _version(folder))
 
 
-def check_own_name(instance: Instance, source: str | Path, problems: Path, case: Case) -> None:
+def check_own_name(instance: Instance, source: str | Path, case: Case) -> None:
     """Check that an instance does not carry the name of another one of its case, whose rows it would replace.
-
-    Args:
-        problems: folder of the case's benchmark.
 
     Raises:
         InputError: the benchmark has an instance of this name with other contents.
     """
-    namesake = problems / "instances" / f"{instance.id}.json"
+    namesake = case.folder / "instances" / f"{instance.id}.json"
     if namesake.is_file() and Instance.load_file(namesake, case)[0] != instance:
         problem = f"{instance.id} is the name of {namesake}, which says something else: choose another"
         raise InputError(source, "id", problem)

@@ -125,7 +125,7 @@ def read_grid(folder: Path, cases: Sequence[Case] = ()) -> Sources:
     if len(names) != 1:
         raise InputError(path, "case", f"is not one: {', '.join(names) or 'no rows'}")
     case = next((case for case in cases if case.id == names[0]), None) or Case.load(names[0])
-    return read_sources(case, folder, case.folder)
+    return read_sources(case, folder)
 
 
 def sizes(grids: Sequence[Sources]) -> pd.DataFrame:

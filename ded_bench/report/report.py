@@ -71,9 +71,7 @@ OTHERS = (
 )
 
 
-def write_report(
-    case: Case, folder: Path, problems: Path, tell: Callable[[str], None] = lambda _: None
-) -> list[Path]:
+def write_report(case: Case, folder: Path, tell: Callable[[str], None] = lambda _: None) -> list[Path]:
     """Write tables, figures and the report of a results folder into it; nothing is solved.
 
     Whatever is missing (times, policies, a method) is said in the report.
@@ -81,7 +79,6 @@ def write_report(
     Args:
         case: whose rows count.
         folder: the results folder.
-        problems: folder of the case's instances, split and manifest.
         tell: called with each finding, a sentence.
 
     Returns:
@@ -90,7 +87,7 @@ def write_report(
     Raises:
         InputError: the folder holds no results of this case, or a table in it is wrong.
     """
-    sources = read_sources(case, folder, problems)
+    sources = read_sources(case, folder)
     for sentence in findings(sources.outcome, sources.reference.title):
         tell(sentence.replace("**", ""))
     pictures = {topic: list(draw(sources)) for topic, draw in FIGURES.items()}

@@ -25,7 +25,7 @@ from ded_bench.analysis.summary import (
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import SimulationError, simulate
-from ded_bench.problem.benchmark import load_manifest, load_split
+from ded_bench.problem.benchmark import load_split, select_split
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Trajectory
@@ -115,13 +115,12 @@ class Sources:
             self.notes.append(text)
 
 
-def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
+def read_sources(case: Case, folder: Path) -> Sources:
     """Read a results folder and the benchmark that it is about.
 
     Args:
-        case: whose rows count.
+        case: whose rows count; its folder has the instances and the paper's numbers.
         folder: the results folder.
-        problems: folder of the case's instances, split, manifest and the paper's numbers.
 
     Raises:
         InputError: there is no such folder, nothing in it, only rows of other cases, or something wrong.
@@ -137,7 +136,7 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
         raise InputError(paths.results, "case", f"holds rows of {others}, not of {case.id}; give --case")
     (counting, left_out), (judged, _) = newest(ours), newest(judged_rows(ours))
     notes += left_out
-    reference = choose_reference(counting, read_paper(problems), reference_objectives(case))
+    reference = choose_reference(counting, read_paper(case.folder), reference_objectives(case))
     newest_of = everything.groupby("method")["method_version"].max().to_dict()
 
     def is_of_today(one: Row | RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
@@ -150,11 +149,11 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     }
 
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]
-    instances, test_count, version = _benchmark(case, problems, notes)
+    instances, test_count, version = _benchmark(case, notes)
     return Sources(
         case=case,
         results=results,
-        paper=_paper(case, problems, notes),
+        paper=_paper(case, notes),
         reference=reference,
         rows=judged_elsewhere(gaps(counting, reference.objectives), judgements),
         judged=judged_elsewhere(gaps(judged, reference.objectives), judgements),
@@ -167,24 +166,22 @@ def read_sources(case: Case, folder: Path, problems: Path) -> Sources:
     )
 
 
-def _benchmark(case: Case, problems: Path, notes: list[str]) -> tuple[dict[str, Instance], int, str]:
+def _benchmark(case: Case, notes: list[str]) -> tuple[dict[str, Instance], int, str]:
     """Instances by id, how many of them are for testing, and the version of the files."""
-    instances: dict[str, Instance] = {}
     try:
-        split = load_split(problems)
-        manifest = load_manifest(problems)
-        for name in (*split.test, *split.train):
-            instances[name] = Instance.load_file(problems / "instances" / f"{name}.json", case)[0]
+        found, tests = select_split(case.folder, "all"), load_split(case.folder).test
     except InputError as error:
         notes.append(f"The problem files cannot be read: {error}")
-        return instances, 0, ""
-    return instances, len(split.test), manifest.version if manifest else ""
+        return {}, 0, ""
+    return {instance.id: instance for instance, _ in found.instances}, len(tests), found.version
 
 
-def _paper(case: Case, problems: Path, notes: list[str]) -> Paper | None:
-    paper = read_paper(problems)
+def _paper(case: Case, notes: list[str]) -> Paper | None:
+    paper = read_paper(case.folder)
     if paper and (unknown := sorted(set(paper.regimes) - set(case.regimes))):
-        raise InputError(problems / "paper.json", f"regimes.{unknown[0]}", f"is no regime of case {case.id}")
+        raise InputError(
+            case.folder / "paper.json", f"regimes.{unknown[0]}", f"is no regime of case {case.id}"
+        )
     if paper and paper.case_fingerprint != case.fingerprint:
         notes.append("The paper's numbers are about another version of the case and left out.")
         return None

@@ -74,14 +74,16 @@ def test_an_edited_copy_needs_a_name_of_its_own(
     threebus: Case, quiet_instance, alter, tmp_path: Path
 ) -> None:
     instance = quiet_instance(threebus)
+    write_record(threebus, tmp_path / "case.json")
+    case = Case.load(tmp_path)
     place = tmp_path / "instances" / f"{instance.id}.json"
-    check_own_name(instance, "copy.json", tmp_path, threebus)
+    check_own_name(instance, "copy.json", case)
     write_record(instance, place)
-    check_own_name(instance, "copy.json", tmp_path, threebus)  # the same instance, wherever it lies
+    check_own_name(instance, "copy.json", case)  # the same instance, wherever it lies
     edited = alter(instance, horizon_s=2 * instance.horizon_s)
     with pytest.raises(InputError, match=rf"copy.json: id: {instance.id} is the name of .*: choose another"):
-        check_own_name(edited, "copy.json", tmp_path, threebus)
-    check_own_name(alter(edited, id="mine"), "copy.json", tmp_path, threebus)
+        check_own_name(edited, "copy.json", case)
+    check_own_name(alter(edited, id="mine"), "copy.json", case)
 
 
 def test_a_copy_of_a_benchmark_has_its_version(tmp_path: Path, threebus: Case) -> None:

@@ -50,7 +50,7 @@ def folder(threebus, tmp_path_factory):
 @pytest.mark.usefixtures("sketched")
 def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     """Tables in files, too; nothing about the loop without its rows."""
-    write_report(threebus, folder, tmp_path / "no-problems")
+    write_report(threebus, folder)
     assert "## The closed loop" in (folder / "report.md").read_text()
     own = pd.read_csv(folder / "tables" / "online_methods.csv")
     assert own["increase_percent_mean"].tolist() == pytest.approx([1.0])
@@ -58,7 +58,7 @@ def test_the_report_has_a_part_of_its_own(threebus, folder, tmp_path):
     names = {path.name for path in (folder / "figures").iterdir()}
     assert "online_scenario.png" in names
     Results(tmp_path / "other").add([Row("x", "test", "TO", "ed", "default", "Feasible", objective=1.0)])
-    write_report(threebus, tmp_path / "other", tmp_path / "no-problems")
+    write_report(threebus, tmp_path / "other")
     assert "The closed loop" not in (tmp_path / "other" / "report.md").read_text()
 
 
@@ -77,7 +77,7 @@ def test_an_island_s_report_sets_plans_beside_practice(tmp_path):
         keep_trajectory(results.files.trajectory(row.key), trajectory)
         failed = OnlineRow(**known | {"scenario": "lost", "plans": 0}, error="the system cannot follow")
         results.table.add([row, failed])
-    write_report(case, results.files.path, tmp_path / "no-problems")
+    write_report(case, results.files.path)
     practice, static = pd.read_csv(tmp_path / "island" / "tables" / "practice.csv").to_dict("records")
     rows = {row.settings: row for row in results.table.rows.values() if not row.error}
     assert (practice["n"], practice["failures"], practice["minutes"]) == (1, 1, 2)

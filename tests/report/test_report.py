@@ -88,7 +88,7 @@ def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
         {"w": np.zeros(2)},
         {"method": "ded-dpc", "training": {"seconds": 123.5, "epochs": 7, "seed": 42, "model": "koopman"}},
     )
-    return write_report(ninebus, finished, problems)
+    return write_report(Case.load(problems), finished)
 
 
 def copy(finished: Path, tmp_path: Path) -> Path:
@@ -186,7 +186,7 @@ def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
 
 def test_the_instance_shown_is_usual(ninebus: Case, problems: Path, finished: Path) -> None:
     """Of five instances one of the two with gaps nearest to the median; the reference comes first."""
-    sources = read_sources(ninebus, finished, problems)
+    sources = read_sources(Case.load(problems), finished)
     rows = sources.judged[(sources.judged["regime"] == "TO") & (sources.judged["method"] == "ded-dpc-paper")]
     gap = rows.set_index("instance")["gap_percent"]
     nearest = (gap - gap.median()).abs().sort_values().index.to_list()
@@ -203,7 +203,7 @@ def test_broken_pieces_are_named_and_left_out(ninebus, problems: Path, finished:
     archive.write_bytes(b"no archive")
     (folder / "policies").mkdir(exist_ok=True)
     (folder / "policies" / "bad.safetensors").write_bytes(b"\xffrubbish")
-    write_report(ninebus, folder, problems)
+    write_report(Case.load(problems), folder)
     text = (folder / "report.md").read_text()
     assert "policies/bad.safetensors" in text
     assert archive.name in text
@@ -220,7 +220,7 @@ def test_strangers_text_stays_text(ninebus: Case, problems: Path, finished: Path
     instance, _ = Instance.load_file(problems / "instances" / f"{row.instance}.json", ninebus)
     results.keep(strange, results.schedule(row, ninebus, instance), ninebus)
     results.add([dataclasses.replace(strange, regime="XX")])
-    write_report(ninebus, folder, problems)
+    write_report(Case.load(problems), folder)
     page = Page((folder / "report.html").read_text())
     assert "script" not in {tag for tag, _ in page.tags}
     assert all(str(attributes["src"]).startswith("data:") for attributes in page.every("img"))

@@ -20,9 +20,9 @@ from tests.detailed_cases import MIXED
 
 
 @pytest.mark.usefixtures("sketched")
-def test_nothing_at_all(ninebus: Case, problems: Path, tmp_path: Path) -> None:
+def test_nothing_at_all(ninebus: Case, tmp_path: Path) -> None:
     (tmp_path / "empty" / "policies").mkdir(parents=True)
-    files = write_report(ninebus, tmp_path / "empty", problems)
+    files = write_report(ninebus, tmp_path / "empty")
     made = pd.read_csv(tmp_path / "empty" / "tables" / "table_v.csv")
     assert made["paper_solve_s"].tolist() == [32.34, 17.34, *[6.8e-4] * 2, 32.38, 18.8, *[6.8e-4] * 2]
     assert (made["n"] == 0).all()
@@ -36,7 +36,7 @@ def test_a_case_without_a_paper_has_none_of_its_columns(threebus: Case, tmp_path
     rows = [Row("x", "test", "TO", name, "default", "Optimal", **facts) for name in ("ded-slp", "ed")]
     rows[1] = dataclasses.replace(rows[1], objective=103.0)
     Results(tmp_path).add([*rows, dataclasses.replace(rows[0], instance="y", case="elsewhere")])
-    write_report(threebus, tmp_path, tmp_path / "no-problems")
+    write_report(threebus, tmp_path)
     made = pd.read_csv(tmp_path / "tables" / "methods.csv").set_index("method")
     assert made.loc["ed", "gap_percent"] == pytest.approx(3.0)
     assert made.loc["ed", ["rows", "solved", "feasible"]].to_list() == [1, 1, 1]
@@ -53,7 +53,7 @@ def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path, ro
     tasks = make_tasks(threebus, instances, ["ed"], ["NO"], Settings())
     run(threebus, tasks, Results(tmp_path))
     said: list[str] = []
-    write_report(threebus, tmp_path, problem, said.append)
+    write_report(Case.load(problem), tmp_path, said.append)
     text = (tmp_path / "report.md").read_text()
     assert "Nobody ran DED (SLP): gaps are to the best feasible schedule" in text
     assert "(figures/schedule_NO.png)" in text
@@ -80,7 +80,7 @@ def test_an_island_shows_what_frequencies_and_agc_did(tmp_path: Path) -> None:
         for name, peak in (("x", 0.004), ("y", 0.006))
     ]
     Results(tmp_path).add(rows)
-    write_report(case, tmp_path, tmp_path / "no-problems")
+    write_report(case, tmp_path)
     made = pd.read_csv(tmp_path / "tables" / "methods.csv").iloc[0]
     assert made[["mean_peak_mhz", "swing_peak_mhz", "agc_travel_pu"]].tolist() == pytest.approx(
         [5.0, 1.0, 2.0]
@@ -93,15 +93,15 @@ def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_pat
     """And nothing is written into it."""
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no results"):
-        write_report(threebus, tmp_path / "empty", tmp_path)
+        write_report(threebus, tmp_path / "empty")
     with pytest.raises(InputError, match="is no folder"):
-        write_report(threebus, tmp_path / "typo", tmp_path)
+        write_report(threebus, tmp_path / "typo")
     assert not (tmp_path / "typo").exists()
     assert not list((tmp_path / "empty").iterdir())
     other = Row("x", "test", "TO", "ed", "default", "Optimal", objective=1.0, case="elsewhere")
     Results(tmp_path / "other").add([other])
     with pytest.raises(InputError, match="holds rows of elsewhere, not of"):
-        write_report(threebus, tmp_path / "other", tmp_path)
+        write_report(threebus, tmp_path / "other")
 
 
 @pytest.mark.usefixtures("sketched")
@@ -110,12 +110,10 @@ def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_pat
     ["results.csv", "timing.csv", "certificate.json"],
 )
 @pytest.mark.parametrize("text", ["", "a,b\n1,2,3,4\n1\n"])
-def test_a_wrong_table_is_bad_input(
-    ninebus: Case, problems: Path, tmp_path: Path, name: str, text: str
-) -> None:
+def test_a_wrong_table_is_bad_input(ninebus: Case, tmp_path: Path, name: str, text: str) -> None:
     """An error, not a gap in the report."""
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError) as caught:
-        write_report(ninebus, tmp_path, problems)
+        write_report(ninebus, tmp_path)
     assert name in str(caught.value)

@@ -28,7 +28,15 @@ CASE_FILES = {
     "fivemachine": Path(__file__).parent / "cases" / "fivemachine" / "case.json",
 }
 
+#: Their tests compile more than all others; what stands first in the list goes to one process.
+LEARNED = ("test_admm.py", "test_policies.py")
+
 R = TypeVar("R", bound=Record)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of learned methods stand together, so that two processes do not compile the same at once."""
+    items.sort(key=lambda item: item.path.name not in LEARNED)
 
 
 @pytest.fixture(scope="session", params=list(CASE_FILES))

@@ -43,14 +43,14 @@ from tests.methods.policies import HORIZON, random_policy
 
 #: Every kind of file: where it lies, and how many damaged ones are tried.
 FILES = {
-    "instance": ("instance.json", 500),
-    "case": ("case.json", 400),
-    "schedule": ("schedule.csv", 250),
+    "instance": ("instance.json", 250),
+    "case": ("case.json", 200),
+    "schedule": ("schedule.csv", 150),
     "compressed schedule": ("schedule.csv.gz", 150),
     "split": ("split.json", 100),
     "manifest": ("MANIFEST.json", 100),
-    "results": ("results.csv", 200),
-    "model": ("model.safetensors", 200),
+    "results": ("results.csv", 100),
+    "model": ("model.safetensors", 120),
     "ded-dpc-paper": ("ded-dpc-paper.safetensors", 120),
     "ded-dpc": ("ded-dpc.safetensors", 120),
     "ded-admm": ("ded-admm.safetensors", 120),

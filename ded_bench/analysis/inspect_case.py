@@ -32,7 +32,7 @@ class CaseCheck:
     drawn: int  # instances
     served: int  # of these at the first draw
     redrawn_loads: int  # because their sign changed; not in case/1
-    peak_hz: dict[str, Array]  # by kind of bound: largest values under static dispatch, ascending
+    peak_hz: dict[str, Array]  # by kind of bound: largest under static dispatch, ascending; ∞: collapse
     violating: dict[str, float]  # by regime: share that static dispatch takes beyond a bound
 
 
@@ -53,6 +53,9 @@ def check_case(case: Case, count: int) -> CaseCheck:
         regime: [omega is None or max(case.bounds(regime).excess_hz(omega).values()) > 0 for omega in runs]
         for regime in case.regimes
     }
+    bounds = case.bounds(next(iter(case.regimes)))
+    free, collapsed = bounds.tightened(part=1.0), dict.fromkeys(bounds.kinds, np.inf)
+    peaks = [collapsed if omega is None else free.excess_hz(omega) for omega in runs]
     return CaseCheck(
         nominal=nominal,
         frequency_hz=frequency,
@@ -61,7 +64,7 @@ def check_case(case: Case, count: int) -> CaseCheck:
         drawn=count,
         served=len(served),
         redrawn_loads=sum(redraws for _, redraws in drawn),
-        peak_hz=_peaks(case, runs),
+        peak_hz={kind: np.sort([one[kind] for one in peaks]) for kind in collapsed},
         violating={regime: float(np.mean(found)) if found else 0.0 for regime, found in beyond.items()},
     )
 
@@ -111,11 +114,3 @@ def _static(case: Case, instance: Instance) -> Array | None:
         return simulate(case, instance, ed.dispatch(case, instance)).omega
     except SimulationError:
         return None
-
-
-def _peaks(case: Case, runs: list[Array | None]) -> dict[str, Array]:
-    """Largest values of what the case bounds, Hz, ascending over runs; ∞ for those that collapse."""
-    bounds = case.bounds(next(iter(case.regimes)))
-    free = bounds.tightened(part=1.0)
-    found = [dict.fromkeys(bounds.kinds, np.inf) if run is None else free.excess_hz(run) for run in runs]
-    return {kind: np.sort([peaks[kind] for peaks in found]) for kind in dict.fromkeys(bounds.kinds)}

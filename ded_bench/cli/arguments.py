@@ -150,7 +150,7 @@ def chosen_methods(
 
 
 def say(sentence: str) -> None:
-    """Tell on stderr what a command is about to do, before the imports and the work that take seconds."""
+    """Tell on stderr: what went wrong, or what is about to be done, before imports and work take seconds."""
     print(f"ded-bench: {sentence}", file=sys.stderr, flush=True)
 
 

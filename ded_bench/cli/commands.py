@@ -14,7 +14,7 @@ from ded_bench.cli import (
     solve_commands,
     training_commands,
 )
-from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser
+from ded_bench.cli.arguments import ROAD, OneLinePerCommand, Parser, say
 from ded_bench.files.errors import InputError
 from ded_bench.run.environment import version
 from ded_bench.run.pool import WorkersLostError
@@ -45,18 +45,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = parser().parse_args(argv)
         if sys.stderr.isatty():  # the first imports take a second, and some commands work for minutes
-            print(f"ded-bench: {arguments.task} ...", file=sys.stderr, flush=True)
+            say(f"{arguments.task} ...")
         code: int = arguments.run(arguments)
         return code
-    except InputError as error:
-        print(f"ded-bench: {error}", file=sys.stderr)
-        return 2
-    except WorkersLostError as error:
-        print(f"ded-bench: {error}", file=sys.stderr)
-        return 1
+    except (InputError, WorkersLostError) as error:
+        say(str(error))
+        return 2 if isinstance(error, InputError) else 1
     except BrokenPipeError:
         return 1
     except OSError as error:  # a full disk, a folder that is read-only or a file
         place = f"{error.filename}: " if error.filename else ""
-        print(f"ded-bench: {place}{error.strerror or error}", file=sys.stderr)
+        say(f"{place}{error.strerror or error}")
         return 2

@@ -21,6 +21,7 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.methods.registry import get_method
+from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import PLANTS, plant_of
 from ded_bench.problem.benchmark import scenario_files
 from ded_bench.problem.case import Case
@@ -79,9 +80,10 @@ def _online(a: argparse.Namespace) -> int:
     for file, scenario in zip(a.scenario or (), scenarios, strict=False):  # the tests check those shipped
         check_plausible(case, first := scenario.snapshot(case, 0.0), file)
         plant_of(case, a.plant).check_servable(first, str(file))
-    if "timing" in a.latency and not _timed(a, case, search_folders(case, folder)):
+    methods = chosen_methods(a, search_folders(case, folder))
+    if "timing" in a.latency and not _timed(a, case, methods):
         return 1
-    operations = _operations(a, case, folder, scenarios)
+    operations = _operations(a, case, methods, scenarios)
     say(f"{counted(len(operations), 'row')} asked for, each a scenario of some minutes")
     rows = operate(case, operations, OnlineResults(folder), a.workers, _print_row, not a.no_hindsight)
     from ded_bench.cli.outcome import tell_operated
@@ -91,21 +93,19 @@ def _online(a: argparse.Namespace) -> int:
 
 
 def _operations(
-    a: argparse.Namespace, case: Case, folder: Path, scenarios: Sequence[Scenario]
+    a: argparse.Namespace, case: Case, methods: Sequence[tuple[str, Settings]], scenarios: Sequence[Scenario]
 ) -> list[Operation]:
     """Every row asked for: all methods, then the next latency or forecast."""
     from ded_bench.run.online.loop import LIMIT_S, PERIOD_S, LoopOptions
     from ded_bench.run.online.operation import make_operations
 
-    search = search_folders(case, folder)
-    methods = chosen_methods(a, search)
     return [
         operation
         for forecast, latency, method in itertools.product(a.forecast, a.latency, methods)
         for operation in make_operations(
             case,
             scenarios,
-            [method],
+            method,
             a.regime or tuple(case.regimes),
             LoopOptions(
                 a.period or get_method(method[0]).interval_s(method[1]) or PERIOD_S,
@@ -114,25 +114,24 @@ def _operations(
                 warm=not a.cold,
             ),
             latency,
-            search,
             a.time_limit or LIMIT_S,
             a.plant,
         )
     ]
 
 
-def _timed(a: argparse.Namespace, case: Case, search: tuple[Path, ...]) -> bool:
+def _timed(a: argparse.Namespace, case: Case, methods: Sequence[tuple[str, Settings]]) -> bool:
     """Time methods whose times no results folder has; whether all have an answer to be timed."""
     from ded_bench.run.bench import FEW, Job, measure
     from ded_bench.run.online.operation import timed_latency
 
     case.check_regimes(a.regime or ())
-    for (name, settings), regime in itertools.product(chosen_methods(a, search), a.regime or case.regimes):
+    for (name, settings), regime in itertools.product(methods, a.regime or case.regimes):
         try:
-            timed_latency(case, get_method(name), regime, settings, search)
+            timed_latency(case, get_method(name), regime, settings)
         except InputError:
             say(f"{name} {regime} is not timed yet: its latency is measured on {FEW} drawn instances first")
-            rows = measure(case, Job(name, regime, settings), ResultsFolder(search[0]).latency)
+            rows = measure(case, Job(name, regime, settings), ResultsFolder(settings.search[0]).latency)
             if not any(row.counts for row in rows):
                 say(f"{name} {regime} has no answer to any of them: {rows[-1].error}")
                 return False

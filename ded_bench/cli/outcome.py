@@ -34,8 +34,7 @@ def tell_solved(case: Case, results: Results, rows: Sequence[Row], out: TextIO) 
     print(
         f"gaps are to {reference.title}; times are of this run, `ded-bench bench` takes better ones", file=out
     )
-    errors = ((f"{row.method} {row.regime}", row.error) for row in rows if row.objective is None)
-    _tell_failures(errors, results.paths)
+    _tell_failures((row for row in rows if row.objective is None), results.paths)
 
 
 def tell_operated(rows: Sequence[OnlineRow], paths: ResultsFolder) -> None:
@@ -46,13 +45,12 @@ def tell_operated(rows: Sequence[OnlineRow], paths: ResultsFolder) -> None:
     columns = tuple(column for column in ONLINE if column.name in _LOOP)
     for forecast, part in frame.groupby("forecast", sort=False):
         print(f"forecast {forecast}:\n{_text(PageTable(titled(own_latency(part)), columns))}")
-    errors = ((f"{row.method} {row.regime}", row.error) for row in rows if row.error)
-    _tell_failures(errors, paths)
+    _tell_failures((row for row in rows if row.error), paths)
 
 
-def _tell_failures(errors: Iterable[tuple[str, str]], paths: ResultsFolder) -> None:
+def _tell_failures(rows: Iterable[Row | OnlineRow], paths: ResultsFolder) -> None:
     """One line for each method, regime and error."""
-    counts = Counter(errors)
+    counts = Counter((f"{row.method} {row.regime}", row.error) for row in rows)
     for (name, error), count in counts.items():
         say(f"{name}, {counted(count, 'time')}: {error}")
     if counts and paths.failures.is_file():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import textwrap
 from collections.abc import Callable
@@ -128,8 +127,7 @@ def _unless_changed(folder: Path, draw: Callable[[Path], Manifest]) -> Manifest:
 
 
 def _path(a: argparse.Namespace) -> int:
-    Case.load(a.case)
-    print(case_file(a.case).resolve().parent)
+    print(Case.load(a.case).folder.resolve())
     return 0
 
 
@@ -142,7 +140,7 @@ def _import(a: argparse.Namespace) -> int:
     try:
         case = imported(a.file, a.dynamics, a.out.resolve().name, Case.load(a.like) if a.like else None)
     except SimulationError as error:
-        print(f"ded-bench: {a.file}: the lossless grid has no equilibrium: {error}", file=sys.stderr)
+        say(f"{a.file}: the lossless grid has no equilibrium: {error}")
         return 1
     write_record(case, path)
     assert isinstance(case.source, dict)
@@ -198,13 +196,13 @@ def _cases(a: argparse.Namespace) -> int:
     try:
         found = check_case(case, a.count)
     except SimulationError as error:
-        print(f"ded-bench: case {case.id}: {error}", file=sys.stderr)
+        say(f"case {case.id}: {error}")
         return 1
     _print_check(case, found)
     for warning in implausible(case, found):
         print(f"warning      {warning}")
     if not found.served:
-        print(f"ded-bench: case {case.id}: no instance can be served", file=sys.stderr)
+        say(f"case {case.id}: no instance can be served")
         return 1
     return 0
 

@@ -45,25 +45,6 @@ if TYPE_CHECKING:
 
 def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
-    _add_solve(commands)
-    _add_score(commands)
-    p = command(commands, "reproduce", "solve a sample of rows again and compare")
-    p.add_argument("--sample", type=positive, default=5, metavar="N", help="rows per method and settings")
-    p.set_defaults(run=_reproduce)
-    q = command(commands, "referee", "ANDES, the field's simulator, judges kept schedules: referee.csv")
-    of_many = "of instances, those with most schedules first"
-    q.add_argument("--limit", type=positive, metavar="N", help=of_many)
-    q.add_argument("--python", default=sys.executable, metavar="PATH", help="one that has ANDES")
-    q.set_defaults(run=_referee)
-    for one in (p, q):
-        one.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose rows are meant")
-        one.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in it")
-        one.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
-        declare(one, "--workers")
-        one.set_defaults(instance=None)
-
-
-def _add_solve(commands: Any) -> None:
     p = command(commands, "solve", "solve instances with methods, score, one row each")
     add_methods(p)
     add_instances(p)
@@ -75,8 +56,6 @@ def _add_solve(commands: Any) -> None:
     p.add_argument("--time-limit", type=positive_number, metavar="S", help=limit)
     p.set_defaults(run=_solve)
 
-
-def _add_score(commands: Any) -> None:
     p = command(commands, "score", "simulate schedules on a plant and judge them")
     given = p.add_mutually_exclusive_group(required=True)
     given.add_argument("--schedule", type=Path, metavar="CSV", help="one, for one --instance")
@@ -91,6 +70,21 @@ def _add_score(commands: Any) -> None:
     p.add_argument("--out", type=Path, help="results folder for the rows of --schedules")
     p.add_argument("--json", action="store_true", help="one JSON object per schedule")
     p.set_defaults(run=_score)
+
+    p = command(commands, "reproduce", "solve a sample of rows again and compare")
+    p.add_argument("--sample", type=positive, default=5, metavar="N", help="rows per method and settings")
+    p.set_defaults(run=_reproduce)
+    q = command(commands, "referee", "ANDES, the field's simulator, judges kept schedules: referee.csv")
+    of_many = "of instances, those with most schedules first"
+    q.add_argument("--limit", type=positive, metavar="N", help=of_many)
+    q.add_argument("--python", default=sys.executable, metavar="PATH", help="one that has ANDES")
+    q.set_defaults(run=_referee)
+    for one in (p, q):
+        one.add_argument("--results", type=Path, required=True, metavar="DIR", help="whose rows are meant")
+        one.add_argument("--method", type=names, default=(), metavar="M[,M]", help="default: all in it")
+        one.add_argument("--case", help=f"{CASE_HELP}; default: that of the rows")
+        declare(one, "--workers")
+        one.set_defaults(instance=None)
 
 
 def _solve(a: argparse.Namespace) -> int:
@@ -157,7 +151,7 @@ def _score_one(a: argparse.Namespace) -> int:
     try:
         verdict = score(case, instance, schedule, regime, plant_of(case, a.plant))
     except SimulationError as error:
-        print(f"ded-bench: {a.schedule}: {error}", file=sys.stderr)
+        say(f"{a.schedule}: {error}")
         return 1
     facts = dataclasses.asdict(verdict)
     facts |= {name: getattr(verdict, name) for name in ("feasible", "feasible_strict")}

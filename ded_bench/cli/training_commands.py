@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -107,8 +106,7 @@ def _train_dpc(a: argparse.Namespace) -> int:
                 continue
             is_input = isinstance(said, InputError)
             code = max(code, 2 if is_input else 1)
-            told = f"{' '.join(job)}: {said if is_input else reason_of(said)}"
-            print(f"ded-bench: {told}", file=sys.stderr, flush=True)
+            say(f"{' '.join(job)}: {said if is_input else reason_of(said)}")
     return code
 
 

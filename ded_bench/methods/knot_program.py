@@ -117,6 +117,7 @@ class KnotProgram:
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
         self._columns = KnotColumns(case, instance, model, self.condensed)
+        self._output_rows = OutputRows(model)
         generation = self._columns.generation[1:]
         self._all_costs = (generation if self.condensed else self._columns.cost).sum()
         #: Outputs and knots whose limits have rows, by knots.
@@ -150,7 +151,7 @@ class KnotProgram:
                 low, high = np.append(least[held], low), np.append(most[held], high)
             form, none = form.with_rows(rows, low, high), np.zeros(self._n)
             if not self.condensed:
-                return self._answer(form, left_s), none
+                return solve_form(form, left_s, staged=not self._is_sparse), none
             return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
 
         return self._at_all_knots(once, time_limit_s)[0]
@@ -181,7 +182,7 @@ class KnotProgram:
                 places, (up, down) = self._output_rows.places(self._held, limits), self._sides(limits)
                 answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
             else:
-                answer = self._answer(form, left_s)
+                answer = solve_form(form, left_s, staged=not self._is_sparse)
                 if answer.status == Status.FAILED and self._is_sparse:
                     other = solve_form(form, max(deadline - time.perf_counter(), 0.0), staged=True)
                     answer = replace(other, iterations=answer.iterations + other.iterations)
@@ -220,19 +221,15 @@ class KnotProgram:
             answer, widened = once(deadline - time.perf_counter())
             iterations += answer.iterations
             if answer.status == Status.OPTIMAL and not self._held.all():
-                beyond = self._beyond_at_knots(answer.x) - widened[:, None]
+                u = np.zeros_like(self.model.p_gen)
+                u[1:] = answer.x[self._columns.u]
+                now = self.model.omega[self.model.points[1:]] + self.model.states(u)[1:] @ self.model.output.T
+                beyond = np.abs(now) - self.bounds.limit - widened[:, None]
                 missing = self._bounded & ~self._held & (beyond > (KNOT_NEAR - 1.0) * self.bounds.limit)
                 if (beyond[missing] > 0.0).any():
                     self._held = self._held | missing
                     continue
             return replace(answer, iterations=iterations), widened
-
-    def _beyond_at_knots(self, columns: Array) -> Array:
-        """How far outputs are beyond their bounds at all knots but the first, (n_intervals, n_out), rad/s."""
-        u = np.zeros_like(self.model.p_gen)
-        u[1:] = columns[self._columns.u]
-        change = self.model.states(u)[1:] @ self.model.output.T
-        return np.abs(self.model.omega[self.model.points[1:]] + change) - self.bounds.limit
 
     def near(self, outputs: Array, left_open: float = 0.0, widened: Array | None = None) -> set[Limit]:
         """Points between knots at which an output comes near its bound.
@@ -288,10 +285,6 @@ class KnotProgram:
             p_gen, outputs, p_slack, generation + self._columns.slack_price * float(np.abs(p_slack).sum())
         )
 
-    def _answer(self, form: FreeForm, time_limit_s: float) -> FormAnswer:
-        """PIQP's answer."""
-        return solve_form(form, time_limit_s, staged=not self._is_sparse)
-
     @property
     def _is_sparse(self) -> bool:
         """Whether PIQP is given a sparse matrix: knots at all grid points, and few columns at each."""
@@ -346,10 +339,6 @@ class KnotProgram:
         if self.condensed:  # the only columns are those of set-points
             return self._output_rows.matrix(self._output_rows.places(self._held, limits))
         return sp.csc_matrix(sp.vstack([self._all_knots, self._frequency_rows(limits)]))
-
-    @functools.cached_property
-    def _output_rows(self) -> OutputRows:
-        return OutputRows(self.model)
 
     @functools.cached_property
     def _all_knots(self) -> sp.csc_matrix:

@@ -30,7 +30,7 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -97,7 +97,7 @@ class Foreign:
             TypeError: a `prepare` returns something that can neither be called nor solve.
         """
         if not self._prepares:
-            extra = {"case": case} if "case" in _parameters(self.function) else {}
+            extra = {"case": case} if "case" in inspect.signature(self.function).parameters else {}
             return ForeignSolver(case, lambda instance: self.function(instance, regime, **extra))
         inner = self.function(case, regime, settings)
         if callable(getattr(inner, "solve", None)):
@@ -114,7 +114,7 @@ class Foreign:
 
     @property
     def _prepares(self) -> bool:
-        return next(iter(_parameters(self.function)), "") == "case"
+        return next(iter(inspect.signature(self.function).parameters), "") == "case"
 
 
 def installed() -> dict[str, str]:
@@ -216,10 +216,6 @@ def _line(text: object) -> str:
 
 def _kind(value: object) -> str:
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
-
-
-def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    return inspect.signature(function).parameters
 
 
 def _check_signature(foreign: Foreign) -> None:

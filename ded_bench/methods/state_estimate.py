@@ -56,8 +56,7 @@ class StateEstimate:
         Raises:
             SimulationError: see `Plant.initial`.
         """
-        estimate = self._ahead(in_force)
-        return self._plant.initial(instance) if estimate is None else self._plant.initial(instance, estimate)
+        return self._plant.initial(instance, self._ahead(in_force))
 
     def keep(self, instance: Instance, state: PlantState, schedule: Schedule | None) -> None:
         """Remember the plan that was given for an instance and a state; without one the last goes on."""

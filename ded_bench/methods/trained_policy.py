@@ -133,7 +133,11 @@ class TrainedPolicy(abc.ABC):
             shapes = cls.shapes(case, training)
         except ValueError as error:
             raise InputError(path, "training", str(error)) from None
-        return cls(Scope(case, regime, float(horizon)), checked_weights(arrays, shapes, path), training)
+        for name in shapes.keys() | arrays.keys():
+            if name not in arrays or arrays[name].shape != shapes.get(name):
+                raise InputError(path, name, "is missing, unknown or has the wrong shape")
+        weights = {name: arrays[name].astype(np.float32) for name in shapes}
+        return cls(Scope(case, regime, float(horizon)), weights, training)
 
     @classmethod
     def find(cls, case: Case, regime: str, settings: Settings) -> Self:
@@ -149,16 +153,6 @@ class TrainedPolicy(abc.ABC):
         """The policy that `find` loads; raises as it does."""
         path = find_policy_file(cls.method, case, regime, settings)
         return (Artifact("policy", cls.method, cls.load(path, case, regime).fingerprint, path),)
-
-
-def checked_weights(
-    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], path: str | Path
-) -> Weights:
-    """Arrays as the weights of a network with exactly these names and shapes; InputError otherwise."""
-    for name in shapes.keys() | arrays.keys():
-        if name not in arrays or arrays[name].shape != shapes.get(name):
-            raise InputError(path, name, "is missing, unknown or has the wrong shape")
-    return {name: arrays[name].astype(np.float32) for name in shapes}
 
 
 def weights_of(network: nn.Module) -> Weights:

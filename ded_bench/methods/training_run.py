@@ -77,20 +77,7 @@ class TrainingRun(abc.ABC):
         self.of = [title, options.seed]
         if options.resume and checkpoint_file(self.out).is_file():
             self.load()
-        self._go(options.epochs or epochs, options.seconds, title)
-        self.network.load_state_dict(self.best_weights)
-        write_history(self.out, self.history)
-        return options.facts() | {
-            "epochs": self.epoch,
-            "steps": self.step,
-            "seconds": self.spent,
-            "cpu_seconds": self.busy,
-            "held_out_loss" if "held out" in self.history[-1] else "training_loss": self.best,
-            "parameters": sum(p.numel() for p in self.network.parameters()),
-            "torch": torch.__version__,
-        }
-
-    def _go(self, epochs: int, seconds: float | None, title: str) -> None:
+        epochs, seconds = options.epochs or epochs, options.seconds
         started, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
         progress = self.epoch / epochs
         with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
@@ -107,6 +94,17 @@ class TrainingRun(abc.ABC):
                 if progress >= 1.0 or self.epoch % max(1, epochs // self.looks) == 0:
                     bar.set_postfix_str(f"loss {self._look():.6g}")
                     self.save()
+        self.network.load_state_dict(self.best_weights)
+        write_history(self.out, self.history)
+        return options.facts() | {
+            "epochs": self.epoch,
+            "steps": self.step,
+            "seconds": self.spent,
+            "cpu_seconds": self.busy,
+            "held_out_loss" if "held out" in self.history[-1] else "training_loss": self.best,
+            "parameters": sum(p.numel() for p in self.network.parameters()),
+            "torch": torch.__version__,
+        }
 
     def _take_step(self, batch: Any, progress: float) -> None:
         for group, whole in zip(self.optimiser.param_groups, self.rates, strict=True):

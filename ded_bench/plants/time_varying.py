@@ -135,13 +135,6 @@ class TimeVarying:
         change = change if self.matrix is None else change @ self.matrix.T
         return self.omega + change, self.p_slack + p_slack
 
-    def before_reset(self, rows: Array, intervals: Indices) -> Array:
-        """Rows in the state after the start of intervals, (n, ..., n_state), as rows in that before it."""
-        if self.reset is not None:
-            begun, rows = np.isin(intervals, self.reset.intervals), rows.copy()
-            rows[begun] = rows[begun] @ self.reset.f
-        return rows
-
     @property
     def _intervals(self) -> Indices:
         """In which interval each grid point lies; the point at a knot belongs to the one after it."""
@@ -206,7 +199,11 @@ class TimeVarying:
             for whole, part in zip(rows, moved, strict=True):
                 whole[here] = part
         end = rows.slope / np.append(self.lengths, 1)[interval, None]
-        return LocalRows(interval, self.before_reset(rows.x, interval), rows.u - end, end)
+        x = rows.x
+        if self.reset is not None:  # rows in the state before it
+            begun, x = np.isin(interval, self.reset.intervals), x.copy()
+            x[begun] = x[begun] @ self.reset.f
+        return LocalRows(interval, x, rows.u - end, end)
 
     def _earlier(self, rows: Sums, interval: Indices, bit: int) -> Sums:
         """Rows as those in x, u and Δu 2**bit grid steps earlier, all of an interval at once."""

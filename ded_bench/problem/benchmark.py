@@ -67,12 +67,11 @@ def load_manifest(folder: Path) -> Manifest | None:
 
 def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
-    if not (folder / MANIFEST).is_file():
+    if (manifest := load_manifest(folder)) is None:
         case = folder.parent.name if SHIPPED_CASES in folder.parents else folder.parent
         problem = f"holds no scenarios; `ded-bench scenarios --case {case}` draws some"
         raise InputError(folder, "", problem)
-    files = list(read_record(Manifest, folder / MANIFEST).files)
-    return [folder / name for name in files[:limit]]
+    return [folder / name for name in list(manifest.files)[:limit]]
 
 
 def draw_split(ids: list[str], seed: int, n_test: int | None = None) -> Split:

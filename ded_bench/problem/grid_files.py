@@ -87,18 +87,16 @@ class NetworkFile(Fingerprinted):
         for field, buses in known.items():
             if unknown := [bus for bus in buses if bus not in names]:
                 raise ValueError(f"{field}: there is no bus {unknown[0]}")
-        for line in self.lines:
-            if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - names:
-                raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
-        if apart := unconnected(names, self.lines, self.slack_machine_bus):
-            raise ValueError(f"lines: bus {min(apart)} is not connected to bus {self.slack_machine_bus}")
+        check_connected(names, self.lines, self.slack_machine_bus, f"bus {self.slack_machine_bus}")
         return self
 
 
-def unconnected(names: set[str], lines: Any, start: str) -> set[str]:
-    """Buses that no path of lines (`from_bus`, `to_bus`) joins to the start."""
+def check_connected(names: set[str], lines: Any, start: str, called: str) -> None:
+    """Raise ValueError unless lines (`from_bus`, `to_bus`) join all buses to the start, which it calls so."""
     neighbours: dict[str, set[str]] = {name: set() for name in names}
     for line in lines:
+        if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - names:
+            raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
         neighbours[line.from_bus].add(line.to_bus)
         neighbours[line.to_bus].add(line.from_bus)
     apart, found = names - {start}, [start]
@@ -106,7 +104,8 @@ def unconnected(names: set[str], lines: Any, start: str) -> set[str]:
         new = neighbours[found.pop()] & apart
         apart -= new
         found += new
-    return apart
+    if apart:
+        raise ValueError(f"lines: bus {min(apart)} is not connected to {called}")
 
 
 def _of_its_model(*kinds: type[Record]) -> WrapValidator:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record
 from ded_bench.problem.case import Case, Sampling
-from ded_bench.problem.grid_files import unconnected
+from ded_bench.problem.grid_files import check_connected
 from ded_bench.problem.limits import Regime, ScheduledMachine
 from ded_bench.problem.quantities import Array, Magnitude, Name, NonNegative, Number
 
@@ -78,21 +78,14 @@ class LosslessCase(Case):
         for bus in self.buses:
             if (bus.kind == "load") != (bus.p_nominal is not None):
                 raise ValueError(f"buses: {bus.id}: p_nominal belongs to load buses, and to all of them")
-        for line in self.lines:
-            if line.from_bus == line.to_bus or {line.from_bus, line.to_bus} - set(names):
-                raise ValueError(f"lines: {line.from_bus}-{line.to_bus} does not join two known buses")
-        if apart := unconnected(set(names), self.lines, self.slack):
-            raise ValueError(f"lines: bus {min(apart)} is not connected to the slack bus")
-        self._check_schema()
-        return self
-
-    def _check_schema(self) -> None:
+        check_connected(set(names), self.lines, self.slack, "the slack bus")
         given = {*self.model_fields_set, *(f"sampling.{name}" for name in self.sampling.model_fields_set)}
         given |= {f"machines.{bus}.{n}" for bus, m in self.machines.items() for n in m.model_fields_set}
         newer = {"source", "knots", "sampling.rate_relative_per_s"}
         newer |= {f"machines.{bus}.ramp_pu_per_s" for bus in self.machines}
         if self.schema_ == "ded-bench/case/1" and given & newer:
             raise ValueError(f"{min(given & newer)}: belongs to schema ded-bench/case/2")
+        return self
 
     @functools.cached_property
     def slack(self) -> str:

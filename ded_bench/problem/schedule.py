@@ -57,8 +57,13 @@ class Schedule:
             InputError: the file cannot be read, a column is missing or unknown, a value is not a
                 finite number, times do not increase strictly from 0 to the horizon.
         """
-        header, rows = _read_table(path)
-        wanted = columns_of(case)
+        text = read_text(path, MAX_BYTES)
+        if text.count("\n") > MAX_ROWS:
+            raise InputError(path, "", f"has more than {MAX_ROWS} rows")
+        rows = [(line, cells) for line, cells in records(text, path) if cells]
+        if not rows:
+            raise InputError(path, "t", "is empty")
+        header, wanted = [name.strip() for name in rows[0][1]], columns_of(case)
         expected = f"expected {','.join(wanted)}, found {repr(','.join(header)[:100])[1:-1] or 'nothing'}"
         for name in wanted:
             if header.count(name) != 1:
@@ -66,7 +71,7 @@ class Schedule:
                 raise InputError(path, name, f"{what} ({expected})")
         if unknown := [name for name in header if name not in wanted]:
             raise InputError(path, repr(unknown[0][:40])[1:-1], f"unknown column ({expected})")
-        values = _numbers(rows, header, path)[:, [header.index(name) for name in wanted]]
+        values = _numbers(rows[1:], header, path)[:, [header.index(name) for name in wanted]]
         schedule = Schedule(t=values[:, 0].copy(), p=values[:, 1:].copy())
         schedule.check(horizon_s, path)
         return schedule
@@ -125,17 +130,6 @@ def as_schedule(given: Schedule | pd.DataFrame, case: Case) -> Schedule:
         wanted = f"({len(times)}, {len(case.generators)}): a row per time, a column per generator"
         raise InputError("schedule", "P", f"has the shape {powers.shape}, but needs {wanted}")
     return Schedule(times, powers)
-
-
-def _read_table(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Column names, and the other rows that are not blank, each with its line number."""
-    text = read_text(path, MAX_BYTES)
-    if text.count("\n") > MAX_ROWS:
-        raise InputError(path, "", f"has more than {MAX_ROWS} rows")
-    rows = [(line, cells) for line, cells in records(text, path) if cells]
-    if not rows:
-        raise InputError(path, "t", "is empty")
-    return [name.strip() for name in rows[0][1]], rows[1:]
 
 
 def _numbers(rows: list[tuple[int, list[str]]], header: list[str], path: str | Path) -> Array:

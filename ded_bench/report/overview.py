@@ -51,10 +51,15 @@ def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = (
     grids = sorted(
         (read_grid(folder, cases) for folder in folders), key=lambda grid: len(grid.case.generators)
     )
-    found = points(grids)
+    found, said = points(grids), list[str]()
+    for grid in grids:  # of default settings, in its tightest regime
+        lines = grid.outcome[
+            (grid.outcome["regime"] == grid.tightest) & (grid.outcome["settings"] == DEFAULT)
+        ]
+        said += [f"{grid.case.id}: {text}" for text in findings(lines, grid.reference.title)]
     made: list[Block] = [
         f"# Dynamics-aware economic dispatch on {len(grids)} grids",
-        *_findings(grids),
+        bullets(said),
         *folded("How to read this page", bullets(EXPLANATION)),
     ]
     for heading, blocks in _parts(grids, found).items():
@@ -67,17 +72,6 @@ def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = (
     here = "; ".join(f"{name} {value}" for name, value in environment().items())
     items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {here}."]
     return write_page([*made, "## Where the rows come from", bullets(items)], out, "overview")
-
-
-def _findings(grids: Sequence[Sources]) -> list[Block]:
-    """What the results of every grid say of default settings, in its tightest regime."""
-    said = []
-    for grid in grids:
-        lines = grid.outcome[
-            (grid.outcome["regime"] == grid.tightest) & (grid.outcome["settings"] == DEFAULT)
-        ]
-        said += [f"{grid.case.id}: {text}" for text in findings(lines, grid.reference.title)]
-    return [bullets(said)]
 
 
 def _parts(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, list[Block]]:

@@ -56,12 +56,6 @@ class PageTable:
         values = [[c.cell(value) for value in self.frame[c.name].astype(object)] for c in self.columns]
         return [list(row) for row in zip(*values, strict=True)]
 
-    @property
-    def numeric(self) -> list[bool]:
-        """Whether each column holds numbers."""
-        numbers = self.frame.select_dtypes("number")
-        return [c.name in numbers for c in self.columns]
-
 
 @dataclass(frozen=True)
 class Picture:
@@ -159,7 +153,8 @@ def _plain(text: str) -> str:
 
 def to_markdown(table: PageTable) -> str:
     """A pipe table; numbers are right-aligned."""
-    marks = ["---:" if numeric else "---" for numeric in table.numeric]
+    numbers = table.frame.select_dtypes("number")
+    marks = ["---:" if column.name in numbers else "---" for column in table.columns]
     lines = [[column.heading for column in table.columns], marks, *table.cells]
     text = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
     return "".join(f"| {' | '.join(line)} |\n" for line in text)

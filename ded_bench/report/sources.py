@@ -126,7 +126,8 @@ def read_sources(case: Case, folder: Path) -> Sources:
         InputError: there is no such folder, nothing in it, only rows of other cases, or something wrong.
     """
     paths = ResultsFolder(folder)
-    if not any(path.exists() for path in paths.contents):
+    contents = paths.results, paths.timing, paths.online, paths.certificates, paths.koopman, paths.policies
+    if not any(path.exists() for path in contents):
         raise InputError(folder, "", "holds no results" if folder.is_dir() else "is no folder")
     results, notes = Results(folder), list[str]()
     everything = named(results.frame().assign(key=pd.Series(list(results.rows), dtype=object)))
@@ -136,7 +137,8 @@ def read_sources(case: Case, folder: Path) -> Sources:
         raise InputError(paths.results, "case", f"holds rows of {others}, not of {case.id}; give --case")
     (counting, left_out), (judged, _) = newest(ours), newest(judged_rows(ours))
     notes += left_out
-    reference = choose_reference(counting, read_paper(case.folder), reference_objectives(case))
+    paper = read_paper(case.folder)
+    reference = choose_reference(counting, paper, reference_objectives(case))
     newest_of = everything.groupby("method")["method_version"].max().to_dict()
 
     def is_of_today(one: Row | RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
@@ -150,10 +152,16 @@ def read_sources(case: Case, folder: Path) -> Sources:
 
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]
     instances, test_count, version = _benchmark(case, notes)
+    if paper and (unknown := sorted(set(paper.regimes) - set(case.regimes))):
+        problem = f"is no regime of case {case.id}"
+        raise InputError(case.folder / "paper.json", f"regimes.{unknown[0]}", problem)
+    if paper and paper.case_fingerprint != case.fingerprint:
+        notes.append("The paper's numbers are about another version of the case and left out.")
+        paper = None
     return Sources(
         case=case,
         results=results,
-        paper=_paper(case, notes),
+        paper=paper,
         reference=reference,
         rows=judged_elsewhere(gaps(counting, reference.objectives), judgements),
         judged=judged_elsewhere(gaps(judged, reference.objectives), judgements),
@@ -174,18 +182,6 @@ def _benchmark(case: Case, notes: list[str]) -> tuple[dict[str, Instance], int, 
         notes.append(f"The problem files cannot be read: {error}")
         return {}, 0, ""
     return {instance.id: instance for instance, _ in found.instances}, len(tests), found.version
-
-
-def _paper(case: Case, notes: list[str]) -> Paper | None:
-    paper = read_paper(case.folder)
-    if paper and (unknown := sorted(set(paper.regimes) - set(case.regimes))):
-        raise InputError(
-            case.folder / "paper.json", f"regimes.{unknown[0]}", f"is no regime of case {case.id}"
-        )
-    if paper and paper.case_fingerprint != case.fingerprint:
-        notes.append("The paper's numbers are about another version of the case and left out.")
-        return None
-    return paper
 
 
 def trainings(paths: Iterable[Path]) -> pd.DataFrame:

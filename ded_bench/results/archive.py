@@ -127,7 +127,6 @@ class Archive:
         if self._mark != mark:
             with _readable(self.path), zipfile.ZipFile(self.path) as archive:
                 names = frozenset(name.removesuffix(".npy") for name in archive.namelist())
-            with _readable(self.path):
                 columns = [str(n) for n in _array(self._member(_COLUMNS))] if _COLUMNS in names else []
             self._mark, self._names, self._packed_columns = mark, names, columns
         return self._names

@@ -59,12 +59,6 @@ class ResultsFolder:
         self.tables, self.figures = path / "tables", path / "figures"  # of the report
         self.objectives = self.tables / "objectives.csv"  # see `rows.OBJECTIVES`
 
-    @property
-    def contents(self) -> tuple[Path, ...]:
-        """What makes a folder one of results: at least one of these is there."""
-        tables = self.results, self.timing, self.online
-        return *tables, self.certificates, self.koopman, self.policies
-
     def archive(self, method: str, settings: str, regime: str) -> Path:
         """The schedules of some rows (see `results.archive`)."""
         return self.schedules / method / settings / f"{regime}.npz"

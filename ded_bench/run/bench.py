@@ -310,6 +310,5 @@ def not_timed(key: Key, method: Method) -> str:
 
 def choose_sample(instances: Sequence[Instance], count: int) -> list[Instance]:
     """The instances to time: spread evenly over the given ones, the same every time."""
-    if len(instances) <= count:
-        return list(instances)
-    return [instances[i] for i in np.linspace(0, len(instances) - 1, count).round().astype(int)]
+    places = np.linspace(0, len(instances) - 1, min(count, len(instances)))
+    return [instances[i] for i in places.round().astype(int)]

@@ -243,14 +243,11 @@ def serve(file_descriptor: int) -> None:
         except BaseException as error:  # even sys.exit() of a method is only its answer
             error.add_note("".join(traceback.format_exception(error)))  # which does not travel by itself
             answer = error
-        connection.send_bytes(_pickled(answer))
-
-
-def _pickled(answer: object) -> bytes:
-    try:
-        return pickle.dumps(answer)
-    except Exception as error:
-        return pickle.dumps(RuntimeError(f"the answer cannot be sent: {error}"))
+        try:
+            content = pickle.dumps(answer)
+        except Exception as error:
+            content = pickle.dumps(RuntimeError(f"the answer cannot be sent: {error}"))
+        connection.send_bytes(content)
 
 
 def _read(answer: Answer) -> object:

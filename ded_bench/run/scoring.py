@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from tqdm import tqdm
@@ -32,17 +32,16 @@ Verdict = Score | Exception
 
 
 def verdicts(
-    case: Case,
-    rows: Sequence[Row],
-    instances: Mapping[str, Instance],
-    results: Results,
-    pool: Workers,
-    plant: str = "",
+    case: Case, instances: Mapping[str, Instance], results: Results, workers: int, plant: str = ""
 ) -> Iterator[tuple[Row, Verdict]]:
-    """Score the kept schedules of rows, in any order, on the plant of each row unless another is named.
+    """Score all kept schedules, in any order, on the plant of each row unless another is named.
 
     A schedule that cannot be read has an InputError, one that its plant cannot follow a SimulationError.
+
+    Raises:
+        InputError: none is kept.
     """
+    rows = results.kept(instances)
 
     def question(row: Row) -> Question:
         instance = instances[row.instance]
@@ -54,7 +53,7 @@ def verdicts(
 
     batches = [rows[start : start + BATCH] for start in range(0, len(rows), BATCH)]
     calls = ((score_all, (case, list(map(question, batch)))) for batch in batches)  # read as they are needed
-    with tqdm(total=len(rows), unit="row", disable=None, desc="score") as bar:
+    with Workers(workers) as pool, tqdm(total=len(rows), unit="row", disable=None, desc="score") as bar:
         for batch, answer in pool.imap(calls, batches):
             found: list[Any] = answer if isinstance(answer, list) else [answer] * len(batch)
             yield from zip(batch, found, strict=True)
@@ -101,14 +100,13 @@ def rescore(
         InputError: none of the rows' schedules is kept.
     """
     rows, found, sound = [], [], []
-    with Workers(workers) as pool:
-        for old, verdict in verdicts(case, results.kept(instances), instances, results, pool):
-            rows.append(scored_row(old, verdict))
-            if isinstance(verdict, Score | SimulationError):  # no worker that died, no damaged file
-                sound.append(rows[-1])
-            for sentence in _differences(old, rows[-1]):
-                found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
-                on_difference(found[-1])
+    for old, verdict in verdicts(case, instances, results, workers):
+        rows.append(scored_row(old, verdict))
+        if isinstance(verdict, Score | SimulationError):  # no worker that died, no damaged file
+            sound.append(rows[-1])
+        for sentence in _differences(old, rows[-1]):
+            found.append(f"{old.method} {old.settings} {old.regime} {old.instance}: {sentence}")
+            on_difference(found[-1])
     if update:
         results.add(sound)
         results.compact()
@@ -125,10 +123,9 @@ def validate(
     """
     table: KeyedTable[tuple[Key, str], ValidatedRow] = KeyedTable(results.paths.validated, VALIDATED)
     rows = []
-    with Workers(workers) as pool:
-        for row, verdict in verdicts(case, results.kept(instances), instances, results, pool, plant):
-            rows.append(ValidatedRow(**vars(scored_row(dataclasses.replace(row, plant=plant), verdict))))
-            table.add(rows[-1:])
+    for row, verdict in verdicts(case, instances, results, workers, plant):
+        rows.append(ValidatedRow(**vars(scored_row(dataclasses.replace(row, plant=plant), verdict))))
+        table.add(rows[-1:])
     table.compact()
     return rows
 

@@ -16,10 +16,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from pyomo.repn import generate_standard_repn
 
+from ded_bench.plants.hold import Indices
 from ded_bench.problem.case import Array
 from ded_bench.solvers.status import Status
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

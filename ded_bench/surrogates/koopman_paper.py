@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.identify import TRAIN_MIX, Trajectories, n_training, sample_trajectories
+from ded_bench.surrogates.identify import TRAIN_MIX, n_training, sample_trajectories
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import EPSILON
 
@@ -70,8 +70,13 @@ def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: i
     """Identify a model as the paper does, from the trajectories that `identify.identify` uses."""
     count = n_training(case) if count is None else count
     data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
-    state, offset, scale = _scaled_state(case, data)
     n_gen, n_in = len(case.generators), data.inputs.shape[-1]
+    # x = (θ_gen, P_s, ω) shifted and scaled, (n_points, batch, 2 n_gen + 1); ω and P_s are not shifted.
+    x = np.concatenate([data.theta, data.p_slack[..., None], data.omega], axis=-1)
+    offset, scale = x.mean(axis=(0, 1)), x.std(axis=(0, 1))
+    offset[n_gen:] = 0.0
+    scale[:n_gen], scale[n_gen + 1 :] = scale[:n_gen].mean(), scale[n_gen + 1 :].mean()
+    state = torch.as_tensor((x - offset) / scale)
     # Scaled units: ω and P_s by a common factor each, so that the fixed rows of B keep their meaning.
     inputs = torch.as_tensor(data.inputs / scale[n_gen])
     generator = torch.Generator().manual_seed(seed)
@@ -91,16 +96,6 @@ def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: i
     training = {"seed": seed, "trajectories": data.inputs.shape[1], "steps": steps}
     training["one_step_loss"] = loss.item()
     return _in_original_units(case, model, offset, scale, training)
-
-
-def _scaled_state(case: Case, data: Trajectories) -> tuple[Tensor, Array, Array]:
-    """x = (θ_gen, P_s, ω) shifted and scaled, (n_points, batch, 2 n_gen + 1); ω and P_s are not shifted."""
-    n_gen = len(case.generators)
-    x = np.concatenate([data.theta, data.p_slack[..., None], data.omega], axis=-1)
-    offset, scale = x.mean(axis=(0, 1)), x.std(axis=(0, 1))
-    offset[n_gen:] = 0.0
-    scale[:n_gen], scale[n_gen + 1 :] = scale[:n_gen].mean(), scale[n_gen + 1 :].mean()
-    return torch.as_tensor((x - offset) / scale), offset, scale
 
 
 def _in_original_units(

@@ -34,7 +34,7 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED, sample_instance
-from ded_bench.surrogates.koopman import CondensedRollout
+from ded_bench.surrogates.koopman import CondensedRollout, hat_functions
 from ded_bench.surrogates.linear import linear_model
 
 HORIZON = 4.0
@@ -135,7 +135,13 @@ def loss_and_data(case: Case, count: int, bound: float) -> tuple[PaperLoss, Batc
     condensed = CondensedRollout.make(model, instances[0].grid, case.knot_times(HORIZON))
     data = Batch.of(case, model, instances)
     data = Batch(*(part.double() for part in data))
-    return PaperLoss(condensed, bound, case.ramp * instances[0].dt_s, dtype=torch.float64), data
+    loss = PaperLoss(condensed, bound, case.ramp * instances[0].dt_s)
+    loss.gamma = torch.as_tensor(condensed.gamma.reshape(loss.gamma.shape))
+    loss.hats, loss.ramp = (
+        torch.as_tensor(hat_functions(condensed.points, condensed.knots)),
+        loss.ramp.double(),
+    )
+    return loss, data
 
 
 def test_condensed_loss_equals_the_sequential_one_in_values_and_gradients(case: Case) -> None:
@@ -173,7 +179,7 @@ def test_the_recipe_is_the_papers_and_nothing_else(threebus: Case, tmp_path: Pat
     for _ in range(7):
         for rows in torch.randperm(10, generator=order).split(8):
             optimiser.zero_grad()
-            some = data.of_rows(rows)
+            some = Batch(*(part[rows] for part in data))
             sum(term.mean() for term in loss(network(some.channels), some).values()).backward()
             optimiser.step()
     expected = network.state_dict()

@@ -137,20 +137,16 @@ def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy
         instances: not those that it will be judged on. Those that cannot be scored count as infeasible.
     """
     found: list[tuple[float, AdmmPolicy]] = []
+    case, regime, chosen = policy.scope.case, policy.scope.regime, instances[:SIMULATED]
     for margin in MARGINS:
-        tried = dataclasses.replace(policy, training=policy.training | {"margin": margin})
-        share = _feasible_share(tried, instances[:SIMULATED])
-        facts = tried.training | {"margin_feasible": share, "margin_instances": len(instances[:SIMULATED])}
+        tried, kept = dataclasses.replace(policy, training=policy.training | {"margin": margin}), 0
+        for instance, schedule in zip(chosen, tried(chosen), strict=True):
+            with contextlib.suppress(SimulationError):
+                kept += score(case, instance, schedule, regime).feasible
+        share = kept / len(chosen)
+        facts = tried.training | {"margin_feasible": share, "margin_instances": len(chosen)}
         found.append((share, dataclasses.replace(tried, training=facts)))
         best = max(found, key=lambda pair: pair[0])
         if share >= WANTED or len(found) - found.index(best) > PATIENCE:
             break
     return best[1]
-
-
-def _feasible_share(policy: AdmmPolicy, instances: Sequence[Instance]) -> float:
-    case, regime, found = policy.scope.case, policy.scope.regime, 0
-    for instance, schedule in zip(instances, policy(instances), strict=True):
-        with contextlib.suppress(SimulationError):
-            found += score(case, instance, schedule, regime).feasible
-    return found / len(instances)

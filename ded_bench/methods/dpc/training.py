@@ -166,10 +166,6 @@ class Pool(NamedTuple):
         whole = (np.ascontiguousarray(array) for array in arrays)
         return Pool(*(torch.as_tensor(array, dtype=torch.float32) for array in whole))
 
-    def of_rows(self, rows: Tensor) -> Pool:
-        """Some of them."""
-        return Pool(*(part[rows] for part in self))
-
 
 class RolloutLoss:
     """Relative cost and frequency excess of schedules, by a surrogate on the coarse points."""
@@ -251,7 +247,7 @@ class _DispatchTraining(TrainingRun):
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """Cost and priced penalty of a batch."""
-        batch = self.data.of_rows(rows)
+        batch = Pool(*(part[rows] for part in self.data))
         cost, excess = self.judge(self.network(*batch[:4]), batch, MARGIN)
         penalty = _penalty(excess)
         self.penalty[rows] = penalty.detach()

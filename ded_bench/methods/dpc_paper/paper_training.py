@@ -90,25 +90,15 @@ class Batch(NamedTuple):
         )
         return Batch(*(torch.as_tensor(a.copy(), dtype=torch.float32) for a in arrays))
 
-    def of_rows(self, rows: Tensor) -> Batch:
-        """Some of them."""
-        return Batch(*(part[rows] for part in self))
-
 
 class PaperLoss:
     """The paper's loss on the condensed rollout of a surrogate: (ω, P_s) = free response + Γ knots."""
 
-    def __init__(
-        self,
-        condensed: CondensedRollout,
-        omega_bound: float,
-        ramp: Array,
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
+    def __init__(self, condensed: CondensedRollout, omega_bound: float, ramp: Array) -> None:
         """Bounds in rad/s and, for each generator, pu per step."""
         gamma = condensed.gamma.reshape(-1, condensed.gamma.shape[2])
         arrays = gamma, hat_functions(condensed.points, condensed.knots), ramp
-        self.gamma, self.hats, self.ramp = (torch.as_tensor(array, dtype=dtype) for array in arrays)
+        self.gamma, self.hats, self.ramp = (torch.as_tensor(array, dtype=torch.float32) for array in arrays)
         self.n_gen, self.omega_bound = len(condensed.gamma) - 1, omega_bound
 
     def __call__(self, knots: Tensor, batch: Batch) -> dict[str, Tensor]:
@@ -187,7 +177,7 @@ class PaperTraining(TrainingRun):
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """The sum of the terms."""
-        batch = self.data.of_rows(rows)
+        batch = Batch(*(part[rows] for part in self.data))
         terms = {name: term.mean() for name, term in self.judge(self.network(batch.channels), batch).items()}
         for name, value in terms.items():
             self.totals[name] = self.totals.get(name, 0.0) + value.item() * len(rows)

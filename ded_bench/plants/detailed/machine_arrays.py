@@ -103,23 +103,11 @@ def _exciter(exciter: Any) -> dict[str, float]:
     if exciter is None:
         return {"ke": 1.0}
     if exciter.model == "SEXS":
-        lead = exciter.ta / exciter.tb
-        return {
-            "gain": exciter.k,
-            "lead": lead,
-            "rate_x": 1 / exciter.tb,
-            "rate_f": 1 / exciter.te,
-            "ke": 1.0,
-        }
-    return {
-        "dc": 1.0,
-        "gain": exciter.ka,
-        "lead": exciter.kf / exciter.tf,
-        "rate_x": 1.0 / exciter.ta,
-        "rate_f": 1.0 / exciter.te,
-        "ke": exciter.ke,
-        "rate_fb": 1.0 / exciter.tf,
-    }
+        gain, lead, lag, own = exciter.k, exciter.ta / exciter.tb, exciter.tb, {"ke": 1.0}
+    else:
+        gain, lead, lag = exciter.ka, exciter.kf / exciter.tf, exciter.ta
+        own = {"dc": 1.0, "ke": exciter.ke, "rate_fb": 1.0 / exciter.tf}
+    return own | {"gain": gain, "lead": lead, "rate_x": 1.0 / lag, "rate_f": 1.0 / exciter.te}
 
 
 def _stabiliser(pss: Any) -> dict[str, float]:

@@ -11,16 +11,6 @@ from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed import machine_arrays as at
-from ded_bench.plants.detailed.machine_arrays import (
-    DELTA,
-    GATE,
-    N_STATES,
-    SPEED,
-    TURBINE,
-    MachineArrays,
-    machine_arrays,
-    moving,
-)
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
 from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled, repeated
 from ded_bench.plants.time_varying import Delivered, Reset, TimeVarying
@@ -89,11 +79,11 @@ class PowerSystem:
         return port_network(files.network, files.data, self.case.loads)
 
     @functools.cached_property
-    def data(self) -> MachineArrays:
+    def data(self) -> at.MachineArrays:
         """The machines."""
         machines = self.case.detailed.data
         infinite = None if self.island else machines.machines[self.network.balancing].name
-        return machine_arrays(machines, self.network.machine_port, infinite)
+        return at.machine_arrays(machines, self.network.machine_port, infinite)
 
     @property
     def island(self) -> bool:
@@ -139,7 +129,7 @@ class PowerSystem:
     @functools.cached_property
     def moving(self) -> Indices:
         """See `machine_arrays.moving`."""
-        return moving(self.data)
+        return at.moving(self.data)
 
     @functools.cached_property
     def symbolic(self) -> SymbolicPlant:
@@ -230,19 +220,19 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
     kinds, machines = _states(system)
     order = np.searchsorted(system.moving, kinds * len(system.data) + machines)
     n = len(order) + (system.case.agc is not None)
-    scale = np.where(kinds == SPEED, system.data.omega_0[machines], 1.0)
+    scale = np.where(kinds == at.SPEED, system.data.omega_0[machines], 1.0)
     middle = (points[:-1] + points[1:]) // 2
     drawn = system.p_drawn(trajectory.p_load[middle])
     rates, slack = np.zeros((len(middle), n, n)), np.zeros((len(middle), n))
     for j, k in enumerate(middle):
         x = run.states.x[k].copy()
-        x[DELTA] -= system.data.inertia @ x[DELTA]
+        x[at.DELTA] -= system.data.inertia @ x[at.DELTA]
         slopes = system.slopes(x, run.states.v[k].view(np.complex128), drawn[j])
         rates[j, : len(order), : len(order)] = slopes.rates[np.ix_(order, order)] * (scale[:, None] / scale)
         if not system.island:
             slack[j, : len(order)] = slopes.p_e[system.network.balancing, order] / scale
     into = np.zeros((n, n_gen))
-    gates = np.flatnonzero(kinds == GATE)
+    gates = np.flatnonzero(kinds == at.GATE)
     for place in gates[:n_gen]:
         into[place, machines[place] == system.scheduled] = system.data.rate_g[machines[place]]
     reset = None
@@ -250,7 +240,7 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
         rates[:, gates, -1] = (system.data.rate_g * system.shares)[machines[gates]]
         f = np.eye(n)
         f[-1] = 0.0
-        f[-1, :-1] = np.where(kinds == DELTA, -agc.k * system.data.inertia[machines], 0.0)
+        f[-1, :-1] = np.where(kinds == at.DELTA, -agc.k * system.data.inertia[machines], 0.0)
         reset = Reset(np.flatnonzero(np.isin(points[:-1], run.agc_points)), f)
     dt_s = float(trajectory.t[1] - trajectory.t[0])
     step = _one_step(rates, into, dt_s, run.steps)
@@ -258,16 +248,21 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
     across = across_intervals(powers, np.diff(points))
     if reset is not None:
         across.f[reset.intervals] = across.f[reset.intervals] @ reset.f
+    c, reheat = np.zeros((n_gen, n)), system.data.reheat  # turbines' powers by gates and turbines
+    for kind, weight in ((at.GATE, reheat), (at.TURBINE, 1.0 - reheat)):
+        places = np.flatnonzero(kinds == kind)[:n_gen]
+        c[np.arange(n_gen), places] = weight[machines[places]]
+    delivered = np.broadcast_to(c, (len(middle), *c.shape)), np.zeros((len(middle), n_gen, n_gen))
     return TimeVarying(
         points=points,
         step=step,
         across=across,
-        speed=slice(*(np.flatnonzero(kinds == SPEED)[[0, -1]] + [0, 1]).tolist()),
+        speed=slice(*(np.flatnonzero(kinds == at.SPEED)[[0, -1]] + [0, 1]).tolist()),
         slack=slack,
         omega=trajectory.omega,
         p_slack=trajectory.p_slack,
         p_gen=trajectory.p_set[points],
-        delivered=_delivered(system, kinds, machines, n, trajectory.p_gen, len(middle)),
+        delivered=Delivered(*delivered, trajectory.p_gen),
         reset=reset,
         powers=powers,
     )
@@ -277,8 +272,8 @@ def _states(system: PowerSystem) -> tuple[Indices, Indices]:
     """Kind and machine of every state that moves; those of the generators first, in their order."""
     n_machine = len(system.data)
     others = np.setdiff1d(np.arange(n_machine), system.scheduled)
-    machines = np.tile([*system.scheduled, *others], N_STATES)
-    kinds = np.repeat(np.arange(N_STATES), n_machine)
+    machines = np.tile([*system.scheduled, *others], at.N_STATES)
+    kinds = np.repeat(np.arange(at.N_STATES), n_machine)
     moves = np.isin(kinds * n_machine + machines, system.moving)
     return kinds[moves], machines[moves]
 
@@ -303,16 +298,3 @@ def _one_step(rates: Array, into: Array, dt_s: float, steps: int) -> Hold:
     h = once / 2.0 + twice / 6.0 + thrice / 24.0
     whole = repeated(Hold(f, g, h), steps)
     return Hold(whole.f, whole.g, whole.h / steps)
-
-
-def _delivered(
-    system: PowerSystem, kinds: Indices, machines: Indices, n_state: int, p_gen: Array, n: int
-) -> Delivered:
-    """Turbines' powers by gates and turbines, the same in all n intervals."""
-    n_gen = len(system.scheduled)
-    c = np.zeros((n_gen, n_state))
-    reheat = system.data.reheat
-    for kind, weight in ((GATE, reheat), (TURBINE, 1.0 - reheat)):
-        places = np.flatnonzero(kinds == kind)[:n_gen]
-        c[np.arange(n_gen), places] = weight[machines[places]]
-    return Delivered(np.broadcast_to(c, (n, *c.shape)), np.zeros((n, n_gen, n_gen)), p_gen)

@@ -15,7 +15,6 @@ import numpy as np
 
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.equations import set_rates
-from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.plants.detailed.power_flow import PortNetwork
 
 
@@ -48,7 +47,7 @@ class SymbolicPlant(NamedTuple):
     jacobian: casadi.Function  # of all these, stacked, by (x, v)
 
 
-def symbolic_plant(data: MachineArrays, network: PortNetwork) -> SymbolicPlant:
+def symbolic_plant(data: at.MachineArrays, network: PortNetwork) -> SymbolicPlant:
     """Write the equations of all machines and the network for CasADi."""
     n, n_port = len(data.port), len(network.ports)
     x, v = casadi.SX.sym("x", at.N_STATES * n), casadi.SX.sym("v", 2 * n_port)
@@ -67,7 +66,7 @@ def symbolic_plant(data: MachineArrays, network: PortNetwork) -> SymbolicPlant:
 
 
 def plant_equations(
-    data: MachineArrays,
+    data: at.MachineArrays,
     network: PortNetwork,
     s: Sequence[Any],
     voltage: tuple[Any, Any],

@@ -8,7 +8,6 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,24 +50,22 @@ class Operation:
 def make_operations(
     case: Case,
     scenarios: Sequence[Scenario],
-    methods: Sequence[tuple[str, Settings]],
+    asked: tuple[str, Settings],
     regimes: Sequence[str],
     options: LoopOptions,
     latency: str,
-    timing: Sequence[Path],
     limit_s: float = LIMIT_S,
     plant: str | None = None,
 ) -> list[Operation]:
-    """List every row of a run, a method's together.
+    """List every row of a run of one method.
 
     Args:
         case: the grid.
         scenarios: to be operated.
-        methods: names with their settings.
+        asked: the method's name and its settings; their folders may tell the latency, too.
         regimes: of the case.
         options: of the loop; its latency is replaced.
         latency: `timing`, `zero`, or seconds.
-        timing: results folders whose `timing.csv` may tell the latency.
         limit_s: how long a method may take for a plan, s of the clock.
         plant: name of what is operated; None: the case's own.
 
@@ -78,33 +75,33 @@ def make_operations(
     case.check_regimes(regimes)
     operated = plant_of(case, plant)
     operations = []
-    for method, given in ((get_method(name), settings) for name, settings in methods):
-        settings = method.canonical(given)
-        for regime in regimes:
-            artifacts = method.artifacts(case, regime, settings)
-            model, policy = named(artifacts, "model"), named(artifacts, "policy")
-            timed = functools.partial(timed_latency, case, method, regime, settings, timing)
-            seconds, source = _latency(latency, timed)
-            longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
-            own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
-            for scenario in scenarios:
-                made_from = *(a.fingerprint for a in artifacts), f"{limit_s:g}"
-                row = OnlineRow(
-                    *(scenario.id, regime, method.name, settings.options),
-                    period_s=own.period_s,
-                    latency_s=seconds,
-                    forecast=own.forecast,
-                    predicted=own.predict,
-                    warm=own.warm,
-                    plant=operated.name,
-                    **_made(case, operated.name, scenario, *made_from),
-                    model=model,
-                    policy=policy,
-                    limit_s=limit_s,
-                    latency_source=source,
-                    method_version=method.version,
-                )
-                operations.append(Operation(scenario, settings, own, row))
+    method = get_method(asked[0])
+    settings = method.canonical(asked[1])
+    for regime in regimes:
+        artifacts = method.artifacts(case, regime, settings)
+        model, policy = named(artifacts, "model"), named(artifacts, "policy")
+        timed = functools.partial(timed_latency, case, method, regime, settings)
+        seconds, source = _latency(latency, timed)
+        longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
+        own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
+        for scenario in scenarios:
+            made_from = *(a.fingerprint for a in artifacts), f"{limit_s:g}"
+            row = OnlineRow(
+                *(scenario.id, regime, method.name, settings.options),
+                period_s=own.period_s,
+                latency_s=seconds,
+                forecast=own.forecast,
+                predicted=own.predict,
+                warm=own.warm,
+                plant=operated.name,
+                **_made(case, operated.name, scenario, *made_from),
+                model=model,
+                policy=policy,
+                limit_s=limit_s,
+                latency_source=source,
+                method_version=method.version,
+            )
+            operations.append(Operation(scenario, settings, own, row))
     return operations
 
 
@@ -258,9 +255,7 @@ def _latency(latency: str, timed: Callable[[], float]) -> tuple[float, str]:
     return seconds, "given"
 
 
-def timed_latency(
-    case: Case, method: Method, regime: str, settings: Settings, folders: Sequence[Path]
-) -> float:
+def timed_latency(case: Case, method: Method, regime: str, settings: Settings) -> float:
     """Median build and solve time in the tables of the first folder that timed a method's present version, s.
 
     Raises:
@@ -268,7 +263,7 @@ def timed_latency(
     """
     model = model_name(named(method.artifacts(case, regime, settings), "model"))
     job = regime, method.name, method.canonical(settings).options, model
-    for folder in folders:
+    for folder in settings.search:
         paths = ResultsFolder(folder)
         rows = [*TIMING.existing(paths.timing), *TIMING.existing(paths.latency)]
         times = [

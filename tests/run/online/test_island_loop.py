@@ -116,7 +116,7 @@ def test_practice_gets_a_forecast_as_long_as_its_interval(island, scenario, tmp_
     """Every answer is asked for once an interval, and told the loads up to its end."""
     settings = get_method("ed").canonical(Settings("every=25"))
     (made,) = make_operations(
-        island, [scenario], [("ed", settings)], ["TO"], LoopOptions(25.0), "zero", [], plant="detailed"
+        island, [scenario], ("ed", settings), ["TO"], LoopOptions(25.0), "zero", plant="detailed"
     )
     assert made.options.horizon_s == 25.0
     ask = Follow(ed.dispatch(island, whole_instance(island, scenario), 25.0))
@@ -164,7 +164,7 @@ def test_rows_are_the_same_to_the_last_bit(island, scenario, tmp_path):
     """With all numbers of islands; and without hindsight, which may come later."""
     settings = get_method("ed").canonical(Settings("every=1"))
     asked = make_operations(
-        island, [scenario], [("ed", settings)], ["TO"], LoopOptions(5.0), "0.2", [], plant="detailed"
+        island, [scenario], ("ed", settings), ["TO"], LoopOptions(5.0), "0.2", plant="detailed"
     )
     files = [OnlineResults(tmp_path / name) for name in "ab"]
     first, again = (operate(island, asked, results, look_back=False)[0] for results in files)

@@ -41,8 +41,8 @@ def scenarios(threebus, tmp_path_factory):
 def operations(case, files, latency="0.3", method="ed", limit_s=60.0):
     """Rows of one method in one regime."""
     loaded = load_scenarios(files, case)
-    chosen = [(method, Settings("every=1" if method == "ed" else "default"))]
-    return make_operations(case, loaded, chosen, ["TO"], LoopOptions(), latency, [], limit_s)
+    chosen = method, Settings("every=1" if method == "ed" else "default")
+    return make_operations(case, loaded, chosen, ["TO"], LoopOptions(), latency, limit_s)
 
 
 @pytest.fixture(scope="module")
@@ -166,9 +166,9 @@ def test_the_latency_is_the_median_of_build_and_solve(threebus, scenarios, tmp_p
 def timed(case, scenarios, folder, rows, method, settings) -> float:
     """The latency of a method, and that the row says where it is from."""
     TIMING.write(folder / "timing.csv", rows)
-    chosen, loaded = [(method, settings)], load_scenarios(scenarios[:1], case)
-    folders = [folder / "nothing", folder]
-    (found,) = make_operations(case, loaded, chosen, ["TO"], LoopOptions(), "timing", folders)
+    own = dataclasses.replace(settings, search=(folder / "nothing", folder))
+    loaded = load_scenarios(scenarios[:1], case)
+    (found,) = make_operations(case, loaded, (method, own), ["TO"], LoopOptions(), "timing")
     assert found.row.latency_source == "timing"
     assert found.row.settings == settings.options
     return found.options.latency_s
@@ -201,11 +201,11 @@ def test_rows_and_files_of_models_and_plants_stand_side_by_side(tmp_path):
 
 @pytest.mark.usefixtures("inline")
 def test_another_plant_has_rows_and_hindsight_of_its_own(threebus, scenarios, tmp_path, lagged):
-    loaded, chosen = load_scenarios(scenarios[:1], threebus), [("ed", Settings("every=1"))]
+    loaded, chosen = load_scenarios(scenarios[:1], threebus), ("ed", Settings("every=1"))
     rows = [
         operate(
             threebus,
-            make_operations(threebus, loaded, chosen, ["TO"], LoopOptions(), "0", [], plant=plant),
+            make_operations(threebus, loaded, chosen, ["TO"], LoopOptions(), "0", plant=plant),
             OnlineResults(tmp_path),
         )[0]
         for plant in (None, "lagged")

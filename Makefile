@@ -57,7 +57,7 @@ suite: $(STAMP)  ## the reports of all cases, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done
 	$(BIN)/ded-bench overview --results $(CASES:%=results/%)
 
-quick: $(STAMP)  ## the same road with 4 instances (1 for full DED) and little training, about three minutes
+quick: $(STAMP)  ## the same road with 4 instances (1 for full DED) and little training, two to three minutes
 	$(RUN) report --runs quick --results results/quick --limit 4 --workers "$(WORKERS)"
 
 docs: $(STAMP)  ## the API reference, from docstrings and types, in build/reference

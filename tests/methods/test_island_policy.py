@@ -144,7 +144,7 @@ def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instan
 def test_a_start_that_the_plant_cannot_carry(
     carried: int, island: Case, instance: Instance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Then it goes on from the static dispatch, towards what is carried; or that is the answer."""
+    """Then it goes on from the static dispatch; where nothing else is carried, that is the answer."""
     made = policy(island)
     follow, start, seen = made.grid.follow, made.grid.ask(instance).start, []
 

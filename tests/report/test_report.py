@@ -81,7 +81,7 @@ def finished(ninebus: Case, problems: Path, tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.fixture(scope="module")
-def report(ninebus: Case, problems: Path, finished: Path) -> list[Path]:
+def report(problems: Path, finished: Path) -> list[Path]:
     (finished / "policies").mkdir()
     write_arrays(
         finished / "policies" / "ded-dpc-TO.safetensors",
@@ -184,7 +184,7 @@ def test_the_report_says_what_made_the_numbers(report, finished: Path) -> None:
     assert "- Surrogates and policies: koopman@1.\n" in text
 
 
-def test_the_instance_shown_is_usual(ninebus: Case, problems: Path, finished: Path) -> None:
+def test_the_instance_shown_is_usual(problems: Path, finished: Path) -> None:
     """Of five instances one of the two with gaps nearest to the median; the reference comes first."""
     sources = read_sources(Case.load(problems), finished)
     rows = sources.judged[(sources.judged["regime"] == "TO") & (sources.judged["method"] == "ded-dpc-paper")]
@@ -196,7 +196,7 @@ def test_the_instance_shown_is_usual(ninebus: Case, problems: Path, finished: Pa
 
 
 @pytest.mark.usefixtures("sketched")
-def test_broken_pieces_are_named_and_left_out(ninebus, problems: Path, finished: Path, tmp_path) -> None:
+def test_broken_pieces_are_named_and_left_out(problems: Path, finished: Path, tmp_path) -> None:
     folder = copy(finished, tmp_path)
     results = Results(folder)
     archive = results.paths.archive("ded-dpc-paper", "default", "TO")

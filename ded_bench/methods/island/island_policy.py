@@ -7,7 +7,6 @@ set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -38,8 +37,6 @@ MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 NEAR = 0.05
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
 MENDED, WIDENED = 5, 2.0
-#: Parts of the way to an answer that are tried, each half of the one before.
-HALVINGS = 4
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 #: Iterations without costs, made once for all settings.
@@ -101,11 +98,11 @@ class IslandPolicy(TrainedPolicy):
         return min(seen, key=lambda found: found.excess)
 
     def _followed(self, asked: IslandProblem, last: Found, answer: Array) -> Found:
-        """An answer, or as much of the way to it as the plant can carry, in halves."""
-        for part in 0.5 ** np.arange(HALVINGS):
-            with contextlib.suppress(SimulationError):
-                return self.grid.follow(asked, last.schedule + part * (answer - last.schedule))
-        return last
+        """An answer, or the one before where the plant cannot carry it."""
+        try:
+            return self.grid.follow(asked, answer)
+        except SimulationError:
+            return last
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

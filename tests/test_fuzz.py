@@ -1,6 +1,6 @@
 """Damaged files: a reader takes a file or refuses it in one line that names it, and nothing else happens.
 
-Every kind of file that a user may hand over is damaged a few hundred times, always in the same ways,
+Every kind of file that a user may hand over is damaged some hundred times, always in the same ways,
 and given to the command line. Allowed ends are exit code 0, 1 (the simulation says why) and 2 (one line
 with the file's name, and the field's where a field was damaged).
 """
@@ -43,17 +43,17 @@ from tests.methods.policies import HORIZON, random_policy
 
 #: Every kind of file: where it lies, and how many damaged ones are tried.
 FILES = {
-    "instance": ("instance.json", 250),
-    "case": ("case.json", 200),
-    "schedule": ("schedule.csv", 150),
-    "compressed schedule": ("schedule.csv.gz", 150),
-    "split": ("split.json", 100),
-    "manifest": ("MANIFEST.json", 100),
-    "results": ("results.csv", 100),
-    "model": ("model.safetensors", 120),
-    "ded-dpc-paper": ("ded-dpc-paper.safetensors", 120),
-    "ded-dpc": ("ded-dpc.safetensors", 120),
-    "ded-admm": ("ded-admm.safetensors", 120),
+    "instance": ("instance.json", 150),
+    "case": ("case.json", 120),
+    "schedule": ("schedule.csv", 90),
+    "compressed schedule": ("schedule.csv.gz", 90),
+    "split": ("split.json", 60),
+    "manifest": ("MANIFEST.json", 60),
+    "results": ("results.csv", 60),
+    "model": ("model.safetensors", 70),
+    "ded-dpc-paper": ("ded-dpc-paper.safetensors", 70),
+    "ded-dpc": ("ded-dpc.safetensors", 70),
+    "ded-admm": ("ded-admm.safetensors", 70),
 }
 POLICIES = ("ded-dpc-paper", "ded-dpc", "ded-admm")
 #: Longer valid instances are read, but not simulated.

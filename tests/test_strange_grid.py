@@ -13,7 +13,7 @@ import pytest
 from ded_bench.cli import main
 
 METHODS = ("ed", "ded", "ded-radau", "ded-slp", "ded-ko", "ded-ko-knots")
-HORIZON = 4.0
+HORIZON = 3.0
 
 
 def grid(machines: int, seed: int) -> dict[str, Any]:

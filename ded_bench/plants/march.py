@@ -28,6 +28,7 @@ def march(
         now, push = state[j], force[j].copy()
         for k in range(points[j] + 1, points[j + 1]):
             np.dot(f[which[j]], now, found[k])
-            found[k] += push
-            push += growth[j]
+            for i in range(len(push)):
+                found[k, i] += push[i]
+                push[i] += growth[j, i]
             now = found[k]

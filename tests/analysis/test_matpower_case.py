@@ -187,6 +187,7 @@ def test_what_is_read_of_a_file(tmp_path: Path) -> None:
         read_matpower(tmp_path / "none.m")
 
 
+@pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize(("name", "like"), [("ieee14", ["--like", "39bus"]), ("ieee39", [])])
 def test_public_grids_to_the_end_of_the_road(
     name: str, like: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -34,7 +34,7 @@ def ways(method) -> list[str]:
 def test_solvers_agree_and_their_solution_replays_on_the_model(
     case: Case, koopman: Koopman, regime: str
 ) -> None:
-    instance = short(case, 3)
+    instance = short(case, 3, horizon_s=2.0)
     solve = [prepared(ded_ko, case, koopman, regime, Settings(f"solver={slug}")) for slug in SOLVERS]
     solutions = [each(instance) for each in solve]
     for solution in solutions:

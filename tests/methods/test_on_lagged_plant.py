@@ -79,14 +79,13 @@ def test_the_linearisation_has_the_derivatives_of_simulations(slow: Case) -> Non
     assert told == pytest.approx(paid, rel=1e-8)
 
 
-@pytest.mark.parametrize("bounded", ["every speed", "mean, swings and end"])
-def test_the_program_is_the_model_with_every_point(slow: Case, bounded: str) -> None:
-    """HiGHS on the Pyomo model, in which what is delivered is paid, finds the same optimum."""
-    instance, bounds = short(slow, 0), slow.bounds("TO")
-    if bounded != "every speed":
-        hz = slow.regimes["TO"].omega_hz
-        regime = IslandRegime(mean_hz=hz, relative_hz=hz, end_hz=hz / 5)
-        bounds = regime.bounds(slow.inertia)
+def test_the_program_is_the_model_with_every_point(slow: Case) -> None:
+    """HiGHS on the Pyomo model, in which what is delivered is paid, finds the same optimum.
+
+    Mean, swings and end are bounded; `test_ded_slp` bounds every speed.
+    """
+    instance, hz = short(slow, 0), slow.regimes["TO"].omega_hz
+    bounds = IslandRegime(mean_hz=hz, relative_hz=hz, end_hz=hz / 5).bounds(slow.inertia)
     p_gen = slow_dispatch(slow, instance, POINTS)
     along = simulate(slow, instance, Schedule(instance.grid[POINTS], p_gen))
     model = plant_of(slow).linearise_along(along, POINTS)

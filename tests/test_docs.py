@@ -6,10 +6,14 @@ repository's root. A block after `<!-- not tested: why -->` does not.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import doctest
+import io
+import itertools
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +22,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import pytest
 
+from ded_bench.cli import main
 from ded_bench.cli.commands import parser
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import REPOSITORY
@@ -29,6 +34,7 @@ LINKED = [*PAGES, *sorted((REPOSITORY / "studies").rglob("*.md"))]
 BLOCK = re.compile(
     r"(?:<!-- not tested: (?P<why>.*?) -->\n+)?^```(?P<kind>\S*)\n(?P<text>.*?)^```$", re.M | re.S
 )
+PLAIN = re.compile(r"ded-bench [^|<>$&;]*")
 LINK = re.compile(r"!?\[[^]]*\]\((?!https?:)([^)#]+)")
 
 
@@ -72,11 +78,22 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run_shell(text: str) -> str:
-    """Run a script, which must succeed; returns what it prints."""
-    command = ["bash", "-euo", "pipefail", "-c", text]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    """Run a script, which must succeed; returns what it prints.
+
+    Lines of it that are a command of `ded-bench` and no more run here, where all is imported already.
+    """
+    printed = io.StringIO()
+    for is_ours, lines in itertools.groupby(text.replace("\\\n", "").splitlines(), PLAIN.fullmatch):
+        if not is_ours:
+            command = ["bash", "-euo", "pipefail", "-c", "\n".join(lines)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+            assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+            printed.write(done.stdout)
+            continue
+        for line in lines:
+            with contextlib.redirect_stdout(printed):
+                assert not main(shlex.split(line, comments=True)[1:]), text
+    return printed.getvalue()
 
 
 def run_console(text: str) -> None:

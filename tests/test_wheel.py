@@ -33,10 +33,11 @@ sys.exit(main())
 SETUP = "import setuptools; setuptools.setup()"
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def wheel(tmp_path: Path) -> Path:
     """Built from this checkout, outside of it, with what is installed here."""
-    folder = tmp_path_factory.mktemp("wheel")
+    folder = tmp_path / "wheel"
+    folder.mkdir()
     steps = ["egg_info", "--egg-base", folder, "build", "--build-base", folder / "build", "bdist_wheel"]
     command = [sys.executable, "-c", SETUP, "-q", *steps, "--bdist-dir", folder / "b", "-d", folder / "dist"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=100, check=False)
@@ -61,7 +62,19 @@ def command(wheel: Path, tmp_path: Path) -> list[str]:
     return [sys.executable, "-m", "without_torch"]
 
 
-def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path) -> None:
+def check_weight(wheel: Path) -> None:
+    """It has models, policies and objectives of the reference runs; no rows, no schedules, no figures."""
+    with zipfile.ZipFile(wheel) as archive:
+        kept = [item for item in archive.infolist() if "_reference_runs/" in item.filename]
+        assert "ded_bench/py.typed" in archive.namelist()
+        whole = sum(item.compress_size for item in archive.infolist())
+    assert {Path(item.filename).suffix for item in kept} == {".safetensors", ".csv"}
+    assert {Path(item.filename).name for item in kept if item.filename.endswith("csv")} == {"objectives.csv"}
+    assert whole < 20e6
+
+
+def test_answers_and_gaps_in_an_empty_folder(wheel: Path, command: list[str], tmp_path: Path) -> None:
+    check_weight(wheel)
     place = tmp_path / "empty"
     place.mkdir()
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "OMP_NUM_THREADS": "1"}
@@ -94,14 +107,3 @@ def test_answers_and_gaps_in_an_empty_folder(command: list[str], tmp_path: Path)
         assert summary.loc[method, "n"] == 2
         assert -0.1 < summary.loc[method, "gap_percent_mean"] < 1.0
     assert [path.name for path in place.iterdir()] == ["results"]
-
-
-def test_it_weighs_little(wheel: Path) -> None:
-    """Models, policies and objectives of the reference runs; no rows, no schedules, no figures."""
-    with zipfile.ZipFile(wheel) as archive:
-        kept = [item for item in archive.infolist() if "_reference_runs/" in item.filename]
-        assert "ded_bench/py.typed" in archive.namelist()
-        whole = sum(item.compress_size for item in archive.infolist())
-    assert {Path(item.filename).suffix for item in kept} == {".safetensors", ".csv"}
-    assert {Path(item.filename).name for item in kept if item.filename.endswith("csv")} == {"objectives.csv"}
-    assert whole < 20e6

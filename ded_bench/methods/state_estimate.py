@@ -71,10 +71,9 @@ class StateEstimate:
         passed = passed_s(instance, in_force, schedule)
         if passed is None:
             return None
-        k = round(passed / instance.dt_s)
-        p_load = instance.p_load(self._plant.case)[: k + 1]
+        grid = instance.grid[: round(passed / instance.dt_s) + 1]
+        p_load = instance.p_load(self._plant.case, grid)
         try:
-            p_set = schedule.at(instance.grid[: k + 1])
-            return self._plant.advance(state, p_set, p_load, instance.dt_s, exact=False).end
+            return self._plant.advance(state, schedule.at(grid), p_load, instance.dt_s, exact=False).end
         except SimulationError:
             return None

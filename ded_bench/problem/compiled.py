@@ -46,6 +46,8 @@ def compiled(function: Function) -> Function:
         made: Any = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError:  # there is no such folder
         return cast(Function, numba.njit(nogil=True)(function))
+    if made is function:  # NUMBA_DISABLE_JIT: somebody debugs
+        return function
     made._cache._cache_file._version = sources_stamp()  # looked at before anything of the file is unpickled
     resolve = made.get_call_template  # callers that are compiled: one version for all literal integers
     made.get_call_template = lambda args, named: resolve(tuple(map(unliteral, args)), named)

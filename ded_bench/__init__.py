@@ -222,8 +222,10 @@ def _prepared(case: Case, method: str, regime: str, settings: Settings | None) -
     from threadpoolctl import ThreadpoolController, threadpool_limits
 
     from ded_bench.methods.registry import get_method
-    from ded_bench.methods.solution import Settings
+    from ded_bench.methods.solution import Settings, Solution
+    from ded_bench.plants.plant import SimulationError
     from ded_bench.results.folder import search_folders
+    from ded_bench.solvers.status import Status
 
     chosen = settings or Settings()
     if not chosen.search:
@@ -234,7 +236,10 @@ def _prepared(case: Case, method: str, regime: str, settings: Settings | None) -
 
     def solve(instance: Instance) -> Solution:
         with libraries.limit(limits=1):
-            return solver(instance)
+            try:
+                return solver(instance)
+            except SimulationError as error:  # the plant cannot begin so
+                return Solution(Status.FAILED, error=str(error))
 
     return solve
 

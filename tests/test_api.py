@@ -157,6 +157,15 @@ def test_solve_answers_like_the_method(threebus: Case, quiet_instance) -> None:
         ded_bench.solve(instance, "ded", "NO", case=threebus, settings=Settings("magic"))
 
 
+@pytest.mark.parametrize("method", ["ded", "ded-slp", "ded-radau"])
+def test_what_no_plant_can_begin_with_is_a_failed_solution(threebus: Case, quiet_instance, method) -> None:
+    load = {"initial": -40.0, "start": 0.0, "duration": 0.0, "rate": 0.0}
+    instance = quiet_instance(threebus, horizon_s=0.5, load=dict.fromkeys(threebus.loads, load))
+    solution = ded_bench.solve(instance, method, "NO", case=threebus)
+    assert (solution.status, solution.schedule) == (Status.FAILED, None)
+    assert solution.error
+
+
 def test_a_case_that_is_not_shipped_must_be_given(
     threebus: Case, ninebus: Case, quiet_instance, constant
 ) -> None:

@@ -204,10 +204,10 @@ def _shared_load(case: Case, instance: Instance) -> Array:
     Returns:
         Powers at all grid points, shape (n_points, n_gen), pu.
     """
-    load = instance.p_load(case)[:: round(1.0 / instance.dt_s)].sum(axis=1)
+    load = instance.p_load(case).sum(axis=1)
+    asked, nominal = load[_intervals(instance, 1.0)[1]], case.load_nominal.sum()
     if case.slack is None:  # P_0 balances the first loads
-        change = (load - load[0]) / case.load_nominal.sum()
-        target = instance.p_initial(case) + np.outer(change, case.p_nominal)
+        target = instance.p_initial(case) + np.outer((asked - load[0]) / nominal, case.p_nominal)
     else:
-        target = np.outer(load / case.load_nominal.sum(), case.p_nominal)
-    return follow_set_points(case, instance, target[1:], 1.0).p
+        target = np.outer(asked / nominal, case.p_nominal)
+    return follow_set_points(case, instance, target, 1.0).p

@@ -63,8 +63,9 @@ class ForeignSolver:
 
     def __call__(self, instance: Instance, **more: Any) -> Solution:
         """Solve one instance."""
+        own = instance.model_copy(deep=True)  # what it changes is not judged
         started = time.perf_counter()
-        answer = self.function(instance, **more)
+        answer = self.function(own, **more)
         return accept(answer, self.case, instance, time.perf_counter() - started)
 
 
@@ -96,10 +97,11 @@ class Foreign:
         Raises:
             TypeError: a `prepare` returns something that can neither be called nor solve.
         """
+        own = case.model_copy(deep=True)  # what it changes is not the judge's
         if not self._prepares:
-            extra = {"case": case} if "case" in inspect.signature(self.function).parameters else {}
+            extra = {"case": own} if "case" in inspect.signature(self.function).parameters else {}
             return ForeignSolver(case, lambda instance: self.function(instance, regime, **extra))
-        inner = self.function(case, regime, settings)
+        inner = self.function(own, regime, settings)
         if callable(getattr(inner, "solve", None)):
             return ForeignWarmSolver(case, inner.solve)
         if not callable(inner):

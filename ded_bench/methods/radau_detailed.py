@@ -83,11 +83,11 @@ class DetailedProgram:
         m.p_set, m.held = pyo.Var(m.gen, m.knot), pyo.Var(pyo.RangeSet(0, len(mesh.acts)))
         self._p_set, self._held = by_time(m.p_set, m.knot), np.array(list(m.held.values()))
         self._speed = np.searchsorted(self._moving, SPEED * len(data) + self.system.scheduled)
-        self._follow_plant()
+        self._follow_plant(plant)
         self._limit_powers()
         self._limit_frequencies(regime)
 
-    def _follow_plant(self) -> None:
+    def _follow_plant(self, plant: DetailedPlant) -> None:
         """States, voltages and secondary control follow the plant; what turbines deliver is paid."""
         m, mesh, state, case, instance = self.model, self._mesh, self._state, self.case, self.instance
         data, weight, places = self.system.data, point_weights(mesh.ends), self._places
@@ -99,7 +99,8 @@ class DetailedProgram:
         m.follows, m.balanced, m.secondary = (pyo.ConstraintList() for _ in range(3))
         cost_gen, cost_slack = instance.cost_gen(case), instance.cost_slack(case)
         m.p_slack = pyo.Var(m.t, [0, 1], bounds=(0, None), initialize=0.0)  # up and down
-        total = weight[0] * float(self.system.turbines(state.x)[self.system.scheduled] @ cost_gen)
+        begun = plant.advance(state, instance.p_initial(case)[None], instance.p_load(case)[:1], instance.dt_s)
+        total = weight[0] * float(begun.p_gen[0] @ cost_gen + cost_slack * abs(begun.p_slack[0]))
         times, slow = list(m.t), self._slowness()
         for k in range(1, len(places)):
             found = self._equations(k, drawn[k], self._held[period[k]])

@@ -18,6 +18,7 @@ from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.ipopt import run_ipopt
 from ded_bench.solvers.status import Status
+from tests.detailed_cases import detailed_case
 
 HORIZON = 2.0
 
@@ -158,3 +159,12 @@ def test_a_reused_program_gives_the_answer_of_a_fresh_one(case: Case, quiet_inst
         assert again.status == outcome.status == Status.OPTIMAL
         assert again.solver_objective == pytest.approx(outcome.objective, rel=1e-12)
         np.testing.assert_allclose(again.schedule.p, fresh.schedule(x, instance, ends).p, atol=1e-12)
+
+
+def test_behind_an_infinite_machine_the_slack_is_paid_from_the_start(tmp_path, quiet_instance) -> None:
+    """The claim on the detailed plant is what the scorer finds, t = 0 included."""
+    case = detailed_case("two-area", tmp_path, "infinite").model_copy(update={"knots": 3})
+    instance = quiet_instance(case, horizon_s=0.5)
+    solution = prepare(case, "NO", Settings())(instance)
+    found = score(case, instance, solution.schedule, "NO")
+    assert solution.solver_objective == pytest.approx(found.objective, rel=1e-6)

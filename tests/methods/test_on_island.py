@@ -174,6 +174,14 @@ def test_what_static_dispatch_serves_has_a_first_schedule() -> None:
     assert carried == [False, False, False, False, False, True]
 
 
+@pytest.mark.parametrize(("horizon_s", "dt_s"), [(5.3, 0.01), (0.5, 0.01), (8.0, 2.0)])
+def test_first_schedules_of_any_horizon_and_step(case: Case, horizon_s: float, dt_s: float) -> None:
+    instance = sample_instance(case, 7, 0).model_copy(update={"horizon_s": horizon_s, "dt_s": dt_s})
+    points = np.array([0, instance.steps])
+    wanted = np.tile(instance.p_initial(case), (2, 1))
+    assert all(np.isfinite(p).all() for p in first_schedules(case, instance, wanted, points))
+
+
 def test_transfers_are_limits_of_programs(island: Case, instance: Instance) -> None:
     """What two machines deliver beyond a load is held below what it would be, at every grid point."""
     free = get_method("ded-slp").prepare(island, "NO", Settings())(instance).schedule.at(instance.grid)

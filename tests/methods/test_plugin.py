@@ -52,6 +52,13 @@ class Warm:
 def warm(case, regime, settings):
     return Warm(case)
 
+def greedy(instance, regime, case):
+    power = list(instance.initial.power.values())
+    instance.cost.update(dict.fromkeys(instance.cost, 0.0))
+    instance.initial.power.clear()
+    case.p_max[:] = 0.0
+    return flat(instance, power)
+
 def hollow(case, regime, settings):
     return None
 
@@ -91,6 +98,14 @@ def test_a_function_of_instance_and_regime_or_case_is_a_method(theirs, threebus,
     assert solution.schedule.p.tolist() == [[0.6], [0.6]]
     assert 0 < solution.solve_s < 1
     assert answer(f"{theirs}:with_case", threebus, instance).schedule.p.tolist() == [[0.6], [0.6]]
+
+
+def test_what_a_method_does_to_its_data_nobody_else_sees(theirs, threebus, instance) -> None:
+    """The row is judged by what was asked."""
+    asked, limits = instance.model_dump(), threebus.p_max.copy()
+    assert answer(f"{theirs}:greedy", threebus, instance).schedule.p.tolist() == [[0.6], [0.6]]
+    assert instance.model_dump() == asked
+    np.testing.assert_array_equal(threebus.p_max, limits)
 
 
 def test_a_prepare_is_one_with_its_options(theirs, threebus, instance) -> None:

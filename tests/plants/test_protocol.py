@@ -11,6 +11,7 @@ import pytest
 
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import PLANTS, Plant, plant_of, simulate
+from ded_bench.plants.score import score
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_instance
@@ -99,3 +100,28 @@ def test_what_is_observed_leads_to_the_same_state(plant, case, alter):
     part = simulate(case, rest, Schedule(rest.grid, whole.p_set[k:]), plant)
     np.testing.assert_allclose(part.omega, whole.omega[k:], rtol=0, atol=2e-9)
     np.testing.assert_allclose(part.p_slack, whole.p_slack[k:], rtol=0, atol=2e-9)
+
+
+class Least:
+    """What the protocol asks of a plant that is simulated, judged and operated, and no more."""
+
+    name, fingerprint = "least", "0"
+
+    def __init__(self, case: Case) -> None:
+        self._plant = plant_of(case)
+
+    def initial(self, instance):
+        return self._plant.initial(instance)
+
+    def advance(self, state, p_set, p_load, dt_s):
+        return self._plant.advance(state, p_set, p_load, dt_s)
+
+    def observed(self, state):
+        return self._plant.observed(state)
+
+
+def test_the_least_plant_is_simulated_and_judged(ninebus):
+    instance, schedule = moving(ninebus)
+    assert score(ninebus, instance, schedule, "TO", Least(ninebus)) == score(
+        ninebus, instance, schedule, "TO"
+    )

@@ -64,6 +64,31 @@ def test_a_course_balances_within_ramps_and_limits(island: Case, drawn: list[Ins
         assert np.abs(short).max() < 1e-6
 
 
+@pytest.mark.parametrize("beyond", ["limit", "transfer"])
+def test_what_begins_beyond_a_limit_comes_back_within_ramps(
+    island: Case, drawn: list[Instance], beyond: str
+) -> None:
+    """A machine above its largest power, or a group above its transfer: balanced, second after second."""
+    (group,), instance, times = island.transfer_rows[0] > 0, drawn[0], np.arange(0.0, 5.0)
+    start, loads = instance.p_initial(island), instance.p_load(island, times)
+    moved = np.where(group, 1.0, -1.0) * (1.0 - island.transfer_excess(start, loads[0]).max()) / group.sum()
+    if beyond == "limit":
+        above = island.p_max[0] + 0.3 - start[0]
+        moved = np.array([above, 0.0, *np.full(len(start) - 2, -above / (len(start) - 2))])
+    power = dict(zip(island.generators, (start + moved).tolist(), strict=True))
+    instance = instance.model_copy(update={"initial": instance.initial.model_copy(update={"power": power})})
+    dispatcher = plant_of(island).dispatcher
+    powers = dispatcher.course(instance, times)
+    assert (np.abs(np.diff(powers, axis=0)) <= island.ramp + 1e-9).all()
+    excess = [(p - island.p_max).max() for p in powers]
+    if beyond == "transfer":
+        excess = [island.transfer_excess(p, load).max() for p, load in zip(powers, loads, strict=True)]
+    assert excess[0] == pytest.approx(0.3 if beyond == "limit" else 1.0)
+    assert excess == sorted(excess, reverse=True)
+    assert excess[-1] < excess[0] - 0.1
+    assert abs(dispatcher.weigh(powers[-1], loads[-1]).short) < 1e-6
+
+
 def test_slow_loads_make_balanced_powers_a_share_of_what_each_can_move(
     island: Case, drawn: list[Instance]
 ) -> None:

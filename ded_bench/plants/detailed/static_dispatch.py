@@ -24,6 +24,8 @@ from ded_bench.problem.schedule import Schedule
 BALANCED, STAYS = 1e-9, 1e-6
 #: Programs, and Newton steps, after which there is no balance.
 PROGRAMS, NEWTON_STEPS = 12, 12
+#: Price of powers beyond transfers, in sums of all costs.
+BEYOND = 100.0
 #: Programs with marginal losses of their own.
 RENEWED = 4
 #: Time in which what rounding and the curvature of losses leave is made up, s.
@@ -83,7 +85,8 @@ class StaticDispatch:
             p_load: load injections, (n_load,), pu.
             start: powers and voltages near these.
             reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere. Where none
-                within reach balance the loads, they go as far as they can.
+                within reach balance the loads, they go as far as they can; where that takes more than
+                transfers allow, by as little as can be.
             rough: one program is enough, whose powers may be short of the curvature of losses, and powers
                 that are out of reach are an error.
 
@@ -93,14 +96,15 @@ class StaticDispatch:
         case = self.case
         lower, upper = case.p_min, case.p_max
         if reach is not None:
-            lower, upper = np.maximum(lower, start.power - reach), np.minimum(upper, start.power + reach)
+            within = start.power - reach, start.power + reach
+            lower, upper = np.clip(lower, *within), np.clip(upper, *within)
         found = self.weigh(np.clip(start.power, lower, upper), p_load, start.point.voltage)
         for number in range(PROGRAMS):
             if number == RENEWED:  # else two machines of equal marginal cost may change places for ever
                 slopes = found.slopes
             if number >= RENEWED:
                 found = dataclasses.replace(found, slopes=slopes)
-            power = self._program(cost, p_load, found, lower, upper)
+            power = self._program(cost, p_load, found, lower, upper, strict=reach is None or rough)
             if power is None:
                 if reach is None or rough:
                     break
@@ -111,11 +115,14 @@ class StaticDispatch:
                 return found
         raise SimulationError("no powers within limits and transfers balance loads and losses")
 
-    def _program(self, cost: Array, p_load: Array, near: Balance, lower: Array, upper: Array) -> Array | None:
+    def _program(
+        self, cost: Array, p_load: Array, near: Balance, lower: Array, upper: Array, strict: bool
+    ) -> Array | None:
         """Cheapest powers with the balance linearised, (n_gen,), pu; None: there are none.
 
-        Without transfers they are a merit order of cost per power that arrives: machines are raised one after
-        another from their lower ends until loads and losses are met.
+        Unless `strict`, what is beyond transfers has a price where they cannot be kept. Without transfers
+        they are a merit order of cost per power that arrives: machines are raised one after another from
+        their lower ends until loads and losses are met.
         """
         arrives = -near.slopes
         need = near.short + arrives @ (near.power - lower)
@@ -129,15 +136,15 @@ class StaticDispatch:
         if not (self.case.transfer_excess(power, p_load) > 0.0).any():
             return np.minimum(power, upper)
         by_machine, by_load, limit = self.case.transfer_rows
-        found = linprog(
-            cost,
-            A_ub=by_machine,
-            b_ub=limit - by_load @ p_load,
-            A_eq=arrives[None],
-            b_eq=[float(need + arrives @ lower)],
-            bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)),
-        )
-        return None if found.x is None else np.clip(found.x, lower, upper)
+        room, balance = limit - by_load @ p_load, [float(need + arrives @ lower)]
+        bounds = list(zip(lower.tolist(), upper.tolist(), strict=True))
+        found = linprog(cost, by_machine, room, arrives[None], balance, bounds)
+        if found.x is None and not strict:
+            none, prices = np.zeros(len(room)), np.full(len(room), BEYOND * max(cost.sum(), 1.0))
+            rows, right = np.hstack([by_machine, -np.eye(len(room))]), np.append(arrives, none)[None]
+            limits = [*bounds, *((0.0, None) for _ in room)]
+            found = linprog(np.append(cost, prices), rows, room, right, balance, limits)
+        return None if found.x is None else np.clip(found.x[: len(cost)], lower, upper)
 
     def balanced(self, power: Array, p_load: Array) -> Balance:
         """Powers near some given ones that balance loads and losses within limits and transfers.

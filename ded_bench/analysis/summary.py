@@ -336,4 +336,5 @@ def findings(found: pd.DataFrame, reference: str) -> Iterator[str]:
 def _cost(row: dict[str, Any], reference: str) -> str:
     """A method, its gap and its time."""
     gap = "no gap" if np.isnan(row["gap_percent"]) else f"{row['gap_percent']:+.3g} % over {reference}"
-    return f"{row['title']} ({gap}, {row['seconds']:.2g} s)"
+    taken = "not timed" if np.isnan(row["seconds"]) else f"{row['seconds']:.2g} s"
+    return f"{row['title']} ({gap}, {taken})"

@@ -48,14 +48,19 @@ class Options:
     )
 
 
+def check(case: Case, settings: Settings) -> None:
+    """Raise InputError if the case is an island."""
+    if case.slack is None:
+        raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
+
+
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances on the surrogate that the settings name.
 
     Raises:
-        InputError: the case is an island; or the solver wants a lifted model, and this surrogate is none.
+        InputError: see `check`; or the solver wants a lifted model, and this surrogate is none.
     """
-    if case.slack is None:
-        raise InputError("--method", "ded-ko", f"has no slack on the island {case.id}; use ded-ko-knots")
+    check(case, settings)
     surrogate = find_surrogate(case, settings.model, settings.search)
     solver = read_options(Options, settings.options).solver
     if solver != "piqp" and not isinstance(surrogate, Koopman):

@@ -7,6 +7,7 @@ import functools
 import importlib
 import json
 import pkgutil
+import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -138,8 +139,8 @@ class Case(Fingerprinted, Extended):
 
     @property
     def place(self) -> str:
-        """What `--case` finds it by."""
-        return self.id if self.folder.parent == SHIPPED_CASES else str(self.folder)
+        """What `--case` finds it by, in a shell."""
+        return self.id if self.folder.parent == SHIPPED_CASES else shlex.quote(str(self.folder))
 
     def __eq__(self, other: object) -> bool:
         """Equal content, also of the files beside the case."""

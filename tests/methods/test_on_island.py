@@ -222,11 +222,12 @@ def test_others_refuse_with_one_line(island: Case, instance: Instance, method: s
 
 
 @pytest.mark.parametrize(
-    ("case", "method", "options"), [("island", "ded", "default"), ("threebus", "ed", "lead=on")]
+    ("case", "method", "options"),
+    [("island", "ded", "default"), ("island", "ded-ko", "default"), ("threebus", "ed", "lead=on")],
 )
 def test_a_case_that_a_method_does_not_plan_on(case: str, method: str, options: str, request) -> None:
     """Before any row is made."""
-    with pytest.raises(InputError, match=r"has no lossless network|needs an island"):
+    with pytest.raises(InputError, match=r"has no lossless network|has no slack|needs an island"):
         get_method(method).artifacts(request.getfixturevalue(case), "TO", Settings(options))
 
 

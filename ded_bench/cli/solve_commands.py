@@ -88,6 +88,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _solve(a: argparse.Namespace) -> int:
+    from ded_bench.cli.outcome import tell_solved
     from ded_bench.results.rows import Results
     from ded_bench.run.runner import fallbacks, run, unfinished
     from ded_bench.run.tasks import make_tasks
@@ -116,9 +117,9 @@ def _solve(a: argparse.Namespace) -> int:
         check_writable(results.path)
     there = f", {len(finished)} there already" if finished else ""
     say(f"{counted(len(todo), 'row')} to solve{there}")
-    rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
-    from ded_bench.cli.outcome import tell_solved
-
+    rows = [results.rows[key] for key in finished]
+    if todo:  # else nothing is written: the folder may refuse that
+        rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
     tell_solved(case, results, rows, sys.stderr if a.instance else sys.stdout)
     print(f"{counted(len(rows), 'row')} in {results.path} ({len(finished)} there already)", file=sys.stderr)
     unanswered = Status.INFEASIBLE, Status.TIME_LIMIT  # results, too

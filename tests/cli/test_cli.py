@@ -69,6 +69,18 @@ def test_solve_ends_with_a_table(problem: Path, tmp_path: Path, capsys) -> None:
     assert "Traceback (most recent call last)" in log
 
 
+@pytest.mark.usefixtures("inline")
+def test_what_is_finished_is_told_where_nothing_may_be_written(
+    problem: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve = ["solve", "--method", "ed", "--regime", "NO", "--case", str(problem), "--out", str(tmp_path)]
+    assert main(solve) == 0
+    told = capsys.readouterr().out
+    monkeypatch.setattr("ded_bench.run.runner.run", None)
+    assert main(solve) == 0
+    assert capsys.readouterr().out == told
+
+
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:
     """First one of the workers is killed, then the main process, whose workers go with it."""
     out = tmp_path / "out"

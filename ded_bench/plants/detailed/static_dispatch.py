@@ -142,8 +142,8 @@ class StaticDispatch:
         if found.x is None and not strict:
             none, prices = np.zeros(len(room)), np.full(len(room), BEYOND * max(cost.sum(), 1.0))
             rows, right = np.hstack([by_machine, -np.eye(len(room))]), np.append(arrives, none)[None]
-            limits = [*bounds, *((0.0, None) for _ in room)]
-            found = linprog(np.append(cost, prices), rows, room, right, balance, limits)
+            bounds += [(0.0, None)] * len(room)
+            found = linprog(np.append(cost, prices), rows, room, right, balance, bounds)
         return None if found.x is None else np.clip(found.x[: len(cost)], lower, upper)
 
     def balanced(self, power: Array, p_load: Array) -> Balance:

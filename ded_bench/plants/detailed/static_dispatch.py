@@ -85,8 +85,7 @@ class StaticDispatch:
             p_load: load injections, (n_load,), pu.
             start: powers and voltages near these.
             reach: how far powers may be from those of the start, (n_gen,), pu; None: anywhere. Where none
-                within reach balance the loads, they go as far as they can; where that takes more than
-                transfers allow, by as little as can be.
+                within reach balance the loads, or keep transfers, they come as near as they can.
             rough: one program is enough, whose powers may be short of the curvature of losses, and powers
                 that are out of reach are an error.
 

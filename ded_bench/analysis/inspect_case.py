@@ -75,6 +75,9 @@ def implausible(case: Case, found: CaseCheck) -> Iterator[str]:
         f"{bus} {power:g}" for bus, power in zip(case.loads, case.load_nominal, strict=True) if power > 0
     ]:
         yield f"loads that feed in, pu (a load that draws is negative): {', '.join(feeding)}"
+    powers = zip(case.generators, case.p_nominal, case.p_min, case.p_max, strict=True)
+    if beyond := [f"{name} {power:g}" for name, power, low, high in powers if not low <= power <= high]:
+        yield f"nominal powers beyond the machines' limits, pu: {', '.join(beyond)}"
     if isinstance(case, LosslessCase):
         # Behind x'd a generator's |V| is no bus's; its largest power is its base.
         voltages = {bus.id: bus.v for bus in case.buses if bus.kind != "generator"}
@@ -90,12 +93,8 @@ def implausible(case: Case, found: CaseCheck) -> Iterator[str]:
         yield f"knots: {case.n_knots}, fewer than the {found.knots} that the fastest mode suggests"
     for regime, share in found.violating.items():
         if found.served and share in (0, 1):
-            said = (
-                "keeps its bounds on every draw: they cost nothing"
-                if share == 0
-                else "breaks it on every draw"
-            )
-            yield f"regime {regime}: static dispatch {said}"
+            said = "breaks it" if share else "keeps its bounds"
+            yield f"regime {regime}: static dispatch {said} on every draw{': they cost nothing' * (not share)}"
 
 
 def suggested_knots(case: Case, fastest_hz: float) -> int:

@@ -105,11 +105,14 @@ def test_implausible_data_are_named(threebus: Case, alter) -> None:
     buses = json.loads(threebus.model_dump_json(by_alias=True))["buses"]
     for bus in buses:
         bus |= {"v": 1.3, "p_nominal": 0.4} if bus["id"] == "town" else {}
+    machine |= {"p_nominal": machine["p_max"] + 0.1}
     strange = dataclasses.replace(
         found, frequency_hz=np.array([1.0, 7.0]), knots=1000, violating={"NO": 0.0, "TO": 1.0}
     )
-    assert [line.split(":")[0] for line in implausible(alter(threebus, buses=buses), strange)] == [
+    odd = alter(threebus, buses=buses, machines={"plant": machine})
+    assert [line.split(":")[0] for line in implausible(odd, strange)] == [
         "loads that feed in, pu (a load that draws is negative)",
+        "nominal powers beyond the machines' limits, pu",
         "|V| of buses, pu, outside 0.8 to 1.2",
         "inertia constants, s, outside 1 to 15",
         "modes, Hz, outside 0.1 to 3",

@@ -124,7 +124,7 @@ def test_tradeoff_prefers_times_taken_alone(table: pd.DataFrame) -> None:
 
 def test_findings_name_the_limit_that_is_broken() -> None:
     """Own methods and those that failed, too; what was run on fewer instances is not the fastest."""
-    mine = row("a", "mine", 101.0, ramp_violation=0.02, feasible=False)
+    mine = row("a", "mine", 101.0, ramp_violation=0.02, feasible=False, solve_s=None)
     full = [row(name, "ded", 100.0, build_s=0.5, solve_s=1.5) for name in "ab"]
     few, broken = row("a", "ded-slp", 100.0, solve_s=0.1), row("a", "ed", 1.0, **BROKEN)
     frame = with_gaps(frame_of(*full, few, mine, broken, row("b", "ed")))
@@ -132,7 +132,7 @@ def test_findings_name_the_limit_that_is_broken() -> None:
     assert said == [
         "**TO:** 1 of 4 methods and settings keep every limit on every instance; the fastest of these is "
         "DED (+0 % over DED, 2 s).",
-        "**mine TO:** mine (+1 % over DED, 1 s); it keeps every limit on 0 of 1 instances; "
+        "**mine TO:** mine (+1 % over DED, not timed); it keeps every limit on 0 of 1 instances; "
         "largest violation: 0.02 pu (ramp).",
         "**ED TO** failed on 1 of 2 instances.",
         "Limits are broken, on some instance, by up to: ED TO by 0.003 Hz (frequency).",

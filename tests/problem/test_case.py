@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import parse_record
+from ded_bench.files.strict import parse_record, write_record
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.sampling import sample_instance
@@ -196,3 +197,10 @@ def test_equality_is_about_content_not_about_what_was_computed(case_file: Path) 
     assert instance.grid[0] == 0.0
     assert instance == sample_instance(fresh, 1, 2)
     assert instance != sample_instance(fresh, 1, 3)
+
+
+def test_the_place_of_a_case_is_one_word_of_a_shell(threebus: Case, tmp_path: Path) -> None:
+    folder = tmp_path / "my grid"
+    write_record(threebus, folder / "case.json")
+    assert shlex.split(Case.load(folder).place) == [str(folder)]
+    assert Case.load("9bus").place == "9bus"

@@ -12,11 +12,11 @@ Schlöder, 2005): the surrogate's model is taken along the plan in force, and on
   there is news (`surprises`). Knots keep their places.
 * On islands, what is not measured comes from a simulation of the plan in force (`state_estimate`). There a
   margin of half the bound costs half a per cent and makes peaks of the mean no lower
-  (studies/hidden_states.md), so that there is none.
+  (studies/hidden_states.md), so that there is none unless option `margin` asks for it.
 
-A single instance, outside of operation, is answered without a margin by two such steps: what the first
-makes of the static dispatch is the plan in force of the second. The first counts as set-up, so that build
-and solution times are those of one step, as operation asks for it.
+A single instance, outside of operation, is answered by two such steps, with no margin but that of the option:
+what the first makes of the static dispatch is the plan in force of the second. The first counts as set-up, so
+that build and solution times are those of one step, as operation asks for it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 
 from ded_bench.methods.knot_program import Plan
 from ded_bench.methods.knots import case_knots, knots_in_operation, knots_on_clock
-from ded_bench.methods.options import NoOptions
+from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surprises import Surprises
@@ -43,7 +43,6 @@ from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import TRAJECTORY, Surrogate, find_surrogate
 from ded_bench.surrogates.koopman import Koopman
 
-Options = NoOptions
 #: Raised when answers change.
 VERSION = 4
 #: Beside a slack, plans are made for so many seconds, and their ends stay: on drawn scenarios of two-area
@@ -51,10 +50,24 @@ VERSION = 4
 NEAR_S = 30.0
 
 
+@dataclass(frozen=True)
+class Options:
+    """Parameters of `ded-rti`."""
+
+    margin: float | None = option(
+        None,
+        "part of the bound to leave free; none: in operation beside a slack, as ramps ask for",
+        lowest=0,
+        below=1,
+    )
+    reserve: bool = option(True, "room where a ramp may begin, in operation beside a slack")
+
+
 def prepare(case: Case, regime: str, settings: Settings) -> RealTimeSolver:
     """Return a solver that corrects the plan in force."""
     surrogate = find_surrogate(case, settings.model, settings.search, TRAJECTORY)
-    return RealTimeSolver(case, surrogate, regime, settings.time_limit_s)
+    options = read_options(Options, settings.options)
+    return RealTimeSolver(case, surrogate, regime, options, settings.time_limit_s)
 
 
 @dataclass(frozen=True)
@@ -64,11 +77,12 @@ class RealTimeSolver:
     case: Case
     surrogate: Surrogate
     regime: str
+    options: Options = Options()
     time_limit_s: float | None = None  # of a step
 
     def __call__(self, instance: Instance) -> Solution:
         """Solve by two steps; the first, from the static dispatch, is `setup_s`."""
-        bounds = self.case.bounds(self.regime)
+        bounds = self._bounds
         if self.case.slack is None:  # condensed programs leave open what they may
             bounds = bounds.tightened(part=SOFT_TOLERANCE)
         knots = case_knots(self.case, instance)
@@ -88,8 +102,7 @@ class RealTimeSolver:
         in_force = None if last is None else last.schedule
         if self.case.slack is not None:
             return self._when_there_is_news(instance, in_force)
-        bounds = self.case.bounds(self.regime)
-        knots = knots_in_operation(self.case, instance)
+        bounds, knots = self._bounds, knots_in_operation(self.case, instance)
         if self._estimate is None:
             return self._step(bounds, instance, knots, Plan(in_force))
         state = self._estimate.initial(instance, in_force)
@@ -108,13 +121,19 @@ class RealTimeSolver:
             return Solution(Status.FEASIBLE, going_on)
         near = expected.until(NEAR_S)
         knots = knots_on_clock(case, near, surprises.now_s)
-        margin, room = surprises.margin(near.grid), surprises.room(near.grid[knots[1:]])
-        solution = self._step(case.bounds(self.regime), near, knots, Plan(in_force, room, margin=margin))
+        room = surprises.room(near.grid[knots[1:]]) if self.options.reserve else None
+        margin = surprises.margin(near.grid) if self.options.margin is None else None
+        solution = self._step(self._bounds, near, knots, Plan(in_force, room, margin=margin))
         if (plan := solution.schedule) is not None and plan.t[-1] < instance.horizon_s:
             longer = Schedule(np.append(plan.t, instance.horizon_s), np.vstack([plan.p, plan.p[-1:]]))
             solution = dataclasses.replace(solution, schedule=longer)
         surprises.keep(solution.schedule, near)
         return solution
+
+    @functools.cached_property
+    def _bounds(self) -> Bounds:
+        """The regime's, tighter by the margin that was asked for."""
+        return self.case.bounds(self.regime).tightened(part=self.options.margin or 0.0)
 
     @functools.cached_property
     def _surprises(self) -> Surprises:

@@ -30,16 +30,23 @@ class NoOptions:
     """The options of a method that has none."""
 
 
-def option(default: Any, text: str, *, choices: Sequence[str] = (), lowest: float = -math.inf) -> Any:
+def option(
+    default: Any,
+    text: str,
+    *,
+    choices: Sequence[str] = (),
+    lowest: float = -math.inf,
+    below: float = math.inf,
+) -> Any:
     """Declare a field of an `Options` dataclass, of type bool, int, float, str, or one of these or None.
 
     Args:
         default: its value unless `--set` says otherwise.
         text: one line of help, with the unit.
         choices: the texts that a str may be.
-        lowest: of a number.
+        lowest, below: a number is at least the one and less than the other.
     """
-    limits = {"choices": tuple(choices), "lowest": lowest}
+    limits = {"choices": tuple(choices), "lowest": lowest, "below": below}
     return dataclasses.field(default=default, metadata={"text": text, **limits})
 
 
@@ -86,16 +93,19 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
         return None
     kind = next(k for k in kinds if k is not types.NoneType)
     choices = field.metadata.get("choices", ())
-    lowest = field.metadata.get("lowest", -math.inf)
+    lowest, below = (
+        field.metadata.get(name, end) for name, end in (("lowest", -math.inf), ("below", math.inf))
+    )
     try:
         value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
         is_number = kind in (int, float)
-        fits = lowest <= value and math.isfinite(value) if is_number else not set(text) & set("/\\")
+        fits = lowest <= value < below and math.isfinite(value) if is_number else not set(text) & set("/\\")
         if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):
         wanted = f"one of {', '.join(choices)}" if choices else _KINDS.get(kind, kind.__name__)
         wanted += f" of at least {lowest:g}" if math.isfinite(lowest) else ""
+        wanted += f" and less than {below:g}" if math.isfinite(below) else ""
         raise InputError("--set", field.name, f"{text[:40]!r} is not {wanted}") from None
     return value
 

@@ -16,7 +16,7 @@ from ded_bench.methods.solution import Settings
 @dataclass(frozen=True)
 class Options:
     steps: int = option(3, "of something", lowest=1)
-    margin: float = option(0.5, "part of the bound", lowest=0.0)
+    margin: float = option(0.5, "part of the bound", lowest=0.0, below=1.0)
     length_s: float | None = option(None, "s")
     solver: str = option("a", "which", choices=("a", "b"))
     fast: bool = option(False, "or slow")
@@ -50,7 +50,7 @@ def test_what_differs_from_the_defaults_is_the_canonical_text() -> None:
         ("steps=2,steps=3", "is set twice"),
         ("steps=2.5", "'2.5' is not a whole number of at least 1"),
         ("steps=0", "is not a whole number of at least 1"),
-        ("margin=-1", "is not a number of at least 0"),
+        ("margin=1", "is not a number of at least 0 and less than 1"),
         ("plain=nan", "is not a number"),
         ("solver=c", "is not one of a, b"),
         ("fast=yes", "is not on or off"),

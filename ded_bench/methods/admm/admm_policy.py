@@ -41,7 +41,9 @@ class Options:
     """Parameters of `ded-admm`."""
 
     iterations: int = option(0, "iterations beyond the policy's own", lowest=0)
-    margin: float | None = option(None, "part of the bound to leave free instead of the learned", lowest=0)
+    margin: float | None = option(
+        None, "part of the bound to leave free instead of the learned, beside a slack", lowest=0, below=1
+    )
 
 
 class AdmmPolicy(TrainedPolicy):
@@ -118,8 +120,8 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """
     options, own = read_options(Options, settings.options), replace(settings, model="")
     iterations, margin = options.iterations, options.margin
-    if margin is not None and (margin >= 1.0 or case.slack is None):
-        raise InputError("--set", "margin", "is a part of the bound beside a slack, less than 1")
+    if margin is not None and case.slack is None:
+        raise InputError("--set", "margin", "policies of islands have none but the learned")
     if case.slack is None:
         return IslandSolver(IslandPolicy.find(case, regime, own), iterations)
     policy = AdmmPolicy.find(case, regime, own)

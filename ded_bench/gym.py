@@ -150,6 +150,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             run.go_on(p_set)
         except SimulationError as error:
             left = -((first - self.instance.steps) // self._points)
+            self._points = 0  # the episode has ended
             info |= {"cost": LARGEST_DEVIATION_HZ, "error": str(error)}
             return self._observation(), -left * self.price * LARGEST_DEVIATION_HZ, True, False, info
         self._knots.append(last)

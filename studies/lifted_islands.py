@@ -28,11 +28,11 @@ from ded_bench import Case, Instance, Schedule, SimulationError, load_instances
 from ded_bench.methods import ded_ko_knots
 from ded_bench.methods.knots import case_knots
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled
+from ded_bench.plants.hold import Hold, across_intervals, doubled
 from ded_bench.plants.plant import plant_of, servable, simulate
 from ded_bench.plants.score import score
 from ded_bench.plants.time_varying import Delivered, Reset, TimeVarying
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 from ded_bench.problem.sampling import KOOPMAN_SEED, sample_instance
 from ded_bench.surrogates.find import AlongTrajectory, find_surrogate
 

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled
+from ded_bench.plants.hold import Hold, across_intervals, doubled
 from ded_bench.plants.lossless.lossless_plant import LosslessPlant, LosslessState
 from ded_bench.plants.plant import PLANTS, Piece
 from ded_bench.plants.time_varying import Delivered, TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import LosslessCase
 from ded_bench.problem.schedule import Trajectory

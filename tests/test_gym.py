@@ -159,6 +159,8 @@ def test_what_cannot_go_on_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(env.plant), "advance", collapse)
     _, reward, ended, _, info = env.step(np.zeros(env.action_space.shape))
     assert (reward, ended, info["cost"], info["error"]) == (-2.0 * (steps - 1), True, 1.0, "no voltages")
+    with pytest.raises(InputError, match="the episode has ended"):
+        env.step(np.zeros(env.action_space.shape))
 
 
 def test_every_shipped_case_and_regime_has_an_id() -> None:

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 import pandas as pd
 from pydantic import Field, model_validator
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
@@ -35,7 +36,7 @@ from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.legacy import upgraded
 from ded_bench.results.timing import model_name
 from ded_bench.run.environment import commit, host, now, version
-from ded_bench.run.pool import Workers
+from ded_bench.run.pool import Workers, WorkersLostError
 from ded_bench.run.tasks import Task, solve_and_score
 
 #: Instances answered, re-simulated and saved together.
@@ -267,10 +268,11 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
 
 def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:
     if workers == 1:
-        yield from (judge(*call) for call in calls)
+        with threadpool_limits(1):
+            yield from (judge(*call) for call in calls)
         return
     with Workers(workers) as pool:
         for _, answer in pool.imap([(judge, call) for call in calls], calls):
             if not isinstance(answer, list):
-                raise RuntimeError(f"a chunk of the certificate failed: {answer}")
+                raise WorkersLostError(f"a chunk of the certificate failed: {answer}")
             yield answer

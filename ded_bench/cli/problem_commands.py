@@ -240,7 +240,7 @@ def _scenarios(a: argparse.Namespace) -> int:
     except ValueError as error:
         raise InputError(a.case, "sampling", str(error)) from None
     folder = a.out or case.folder / "scenarios"
-    hours = len(list(folder.glob("*-h[0-9]*.json"))) if a.hours is None else a.hours
+    hours = len(list(folder.glob(f"{case.id}-h[0-9]*.json"))) if a.hours is None else a.hours
 
     def draw(folder: Path) -> Manifest:
         return write_scenarios(case, a.count, a.seed, folder, servable, hours=hours)

@@ -254,9 +254,10 @@ def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]
     if not a.case and len(named) != 1:
         raise InputError(results.path, "case", f"rows of {len(named)} cases: choose one by --case")
     place = a.case or named.pop()
-    splits = {row.split for row in results.rows.values()}
-    needed = ["all", *(["validation"] if "validation" in splits else [])]
-    selections = [select_split(place, split) for split in needed]
+    drawn = [row.instance.rpartition("-v")[2] for row in results.rows.values() if row.split == "validation"]
+    count = max((int(number) + 1 for number in drawn if number.isdecimal()), default=0)
+    selections = [select_split(place, "validation", count, servable)] if count else []
+    selections += [select_split(place, "all")] if len(drawn) < len(results.rows) or not count else []
     found = {instance.id: instance for chosen in selections for instance, _ in chosen.instances}
     return results, selections[0].case, found
 

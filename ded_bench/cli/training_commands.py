@@ -73,6 +73,8 @@ def _train_ko(a: argparse.Namespace) -> int:
 
     model = (identify_paper if is_paper else identify)(case, a.seed, a.count)
     model.save(out)
+    if a.count and not model.training["trajectories"]:
+        say("--count has no effect: the energy form of so large a grid is not fitted to trajectories")
     omega, p_slack = rollout_errors(model, held_out(case, a.seed))
     held = f"{omega / (2 * math.pi):.3g} Hz at most, P_s by {p_slack:.3g} pu rms, on held-out trajectories"
     print(f"wrote {out}: ω errs by {held}")

@@ -15,9 +15,9 @@ import stat
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, WrapValidator
 
@@ -34,9 +34,16 @@ class Record(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, populate_by_name=True
     )
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Copy without what is cached, which may follow from what is updated."""
+        copied = super().model_copy(update=update, deep=deep)
+        for name in vars(copied).keys() - type(self).model_fields.keys():
+            del vars(copied)[name]
+        return copied
+
 
 class Fingerprinted(Record):
-    """A record that is equal to others of its content: cached arrays do not count."""
+    """A record that is equal to others of its content."""
 
     @functools.cached_property
     def fingerprint(self) -> str:

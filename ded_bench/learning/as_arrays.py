@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ded_bench.methods.knots import control_times
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import Plant, plant_of, servable, simulate
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.benchmark import SplitName, select_split
-from ded_bench.problem.case import Array, Case
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.case import Array, Case, Indices
+from ded_bench.problem.instance import BETWEEN, Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.surrogates.koopman import hat_functions
 
@@ -67,8 +66,6 @@ def split_arrays(
 
 #: Slopes are those of intervals of this length, s: gradients are then right to a ten-thousandth.
 INTERVAL_S = 0.1
-#: How far a time may be from a grid point that it is at, in steps.
-BETWEEN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

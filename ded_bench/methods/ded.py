@@ -74,7 +74,7 @@ def _solve(case: Case, regime: str, time_limit_s: float | None, instance: Instan
     model = _built(case, instance.steps, instance.dt_s)
     set_instance(model, case, instance, regime)
     build_s = time.perf_counter() - started
-    outcome = _compiled(case, instance.steps, instance.dt_s).solve(time_limit_s)
+    outcome = _compiled(model).solve(time_limit_s)
     return answer(outcome, build_s, lambda: schedule_of(model, instance))
 
 
@@ -98,11 +98,6 @@ def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: 
         solve_s=(verdict.solve_s or 0.0) + spent_s,
         solver_version=f"{found.solver_version}, {verdict.solver_version}".removeprefix(", "),
     )
-
-
-@functools.lru_cache(maxsize=1)
-def _compiled(case: Case, steps: int, dt: float) -> CasadiIpopt:
-    return CasadiIpopt(_built(case, steps, dt), _IPOPT_OPTIONS)
 
 
 def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
@@ -152,6 +147,7 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
 
 
 _built = functools.lru_cache(maxsize=1)(build_ded)
+_compiled = functools.lru_cache(maxsize=1)(functools.partial(CasadiIpopt, options=_IPOPT_OPTIONS))
 _programs = functools.lru_cache(maxsize=2)(EulerPrograms)
 
 

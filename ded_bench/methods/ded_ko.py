@@ -111,13 +111,8 @@ def _solve_model(
     model = _built(case, koopman, instance.steps)
     set_instance(model, case, koopman, instance, regime)
     build_s = time.perf_counter() - started
-    outcome = _compiled(case, koopman, instance.steps, solver).solve(time_limit_s)
+    outcome = _compiled(model, solver).solve(time_limit_s)
     return answer(outcome, build_s, lambda: schedule_of(model, instance))
-
-
-@functools.lru_cache(maxsize=1)
-def _compiled(case: Case, koopman: Koopman, steps: int, solver: str) -> OnArrays:
-    return OnArrays(_built(case, koopman, steps), solver)
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
@@ -158,6 +153,7 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
 
 
 _built = functools.lru_cache(maxsize=1)(build_ded_ko)
+_compiled = functools.lru_cache(maxsize=1)(OnArrays)
 
 
 def set_instance(m: pyo.ConcreteModel, case: Case, koopman: Koopman, instance: Instance, regime: str) -> None:

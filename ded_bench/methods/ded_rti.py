@@ -34,8 +34,7 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.surprises import Surprises
 from ded_bench.methods.surrogate_program import SOFT_TOLERANCE, solve_on_surrogate
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule

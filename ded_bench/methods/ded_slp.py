@@ -20,9 +20,8 @@ from ded_bench.methods.knots import case_knots, is_reachable
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import plant_of, simulate
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule, Trajectory

@@ -24,9 +24,8 @@ from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import knot_points, track
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution, Solver
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError, plant_of
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule

@@ -14,9 +14,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ded_bench.methods.knots import divided, knot_weights, power_limits, transfer_room
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.time_varying import LocalRows, TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.solvers.linear_program import Basis, FreeForm
 

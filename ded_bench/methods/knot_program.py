@@ -32,10 +32,9 @@ import scipy.sparse as sp
 from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows
 from ded_bench.methods.knots import divided, knot_weights
 from ded_bench.methods.reserve import Room
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import PlantState
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule

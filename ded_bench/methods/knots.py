@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.instance import Instance
 

@@ -21,9 +21,8 @@ from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedState
 from ded_bench.plants.detailed.symbolic import Equations, Functions, plant_equations
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError, simulate
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.linear_program import assign

@@ -25,8 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.signal import lsim
 
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.solvers.linear_program import FreeForm
 from ded_bench.surrogates.linear import at_nominal_point
 
@@ -55,12 +54,9 @@ def sudden_speeds(case: Case, t: Array) -> Array:
         (n_t, n_load, n_gen), rad/s.
     """
     linear, n = at_nominal_point(case), len(case.generators)
-    a = np.zeros((2 * n, 2 * n))
-    a[:n, n:], a[n:, :n] = np.eye(n), -linear.stiffness / linear.m[:, None]
-    a[n:, n:] = -np.diag(linear.d / linear.m)
     by_load = np.vstack([np.zeros_like(linear.share), -linear.share / linear.m[:, None]])
     to_speed, direct = np.eye(n, 2 * n, n), np.zeros((n, 1))
-    found = [lsim((a, one[:, None], to_speed, direct), t, t)[1] for one in by_load.T]
+    found = [lsim((linear.matrix, one[:, None], to_speed, direct), t, t)[1] for one in by_load.T]
     speeds = np.stack([one.reshape(len(t), n) for one in found], axis=1)
     return np.asarray(np.maximum.accumulate(np.abs(speeds)))
 

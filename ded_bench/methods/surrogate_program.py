@@ -14,9 +14,8 @@ from ded_bench.methods.knot_program import KnotProgram, Plan, Prediction
 from ded_bench.methods.knots import is_reachable
 from ded_bench.methods.slp import Attempt, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Solution
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
 from ded_bench.problem.schedule import Schedule

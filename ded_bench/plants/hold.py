@@ -9,11 +9,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ded_bench.problem.case import Array
-
-Indices = NDArray[np.intp]
+from ded_bench.problem.quantities import Array, Indices
 
 #: Terms of the exponential series below this are left out; doubles resolve no more.
 SERIES_END = 1e-18

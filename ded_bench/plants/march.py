@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Indices
 from ded_bench.problem.compiled import compiled
 
 

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.schedule import Schedule, Trajectory
 

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.plants.hold import Hold, Indices, Sums, doubled
-from ded_bench.problem.case import Array
+from ded_bench.plants.hold import Hold, Sums, doubled
+from ded_bench.problem.case import Array, Indices
 
 
 class LocalRows(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,7 +125,7 @@ def write_benchmark(
         write_record(instance, folder / "instances" / f"{instance.id}.json")
     write_record(draw_split(list(written), seed, n_test), folder / "split.json")
     names = [f"instances/{name}.json" for name in written]
-    _remove_others(folder / "instances", names)
+    _remove_others(case, folder / "instances", names)
     own = ["case.json", *(GRID_FILES if case.needs_grid else ())]
     return _write_manifest(folder, [*own, "split.json", *names], sum(written.values()))
 
@@ -160,14 +161,15 @@ def write_scenarios(
         names.append(f"{scenario.id}.json")
         text = scenario.model_dump_json(by_alias=True)  # in one line: mostly lists of numbers
         write_atomically(folder / names[-1], text + "\n")
-    _remove_others(folder, [*names, MANIFEST])
+    _remove_others(case, folder, names)
     return _write_manifest(folder, names)
 
 
-def _remove_others(folder: Path, names: Iterable[str]) -> None:
-    kept = {Path(name).name for name in names}
-    for path in folder.glob("*.json"):
-        if path.name not in kept:
+def _remove_others(case: Case, folder: Path, names: Iterable[str]) -> None:
+    """Remove what was drawn of a case before, and no other file."""
+    kept, drawn = {Path(name).name for name in names}, re.compile(rf"{re.escape(case.id)}-[sh]?\d+\.json")
+    for path in folder.iterdir():
+        if drawn.fullmatch(path.name) and path.name not in kept:
             path.unlink()
 
 
@@ -239,7 +241,7 @@ def instance_file(name: Path, case: str | None = None) -> Path:
     Raises:
         InputError: it is a name without a folder, and neither a file nor the id of an instance.
     """
-    if name.exists() or name.name != str(name) or name.suffix:
+    if name.exists() or name.name != str(name) or name.suffix == ".json":
         return name
     folders = [Case.load(case).folder] if case else sorted(SHIPPED_CASES.glob("*"))
     for folder in folders:

@@ -28,6 +28,7 @@ from ded_bench.problem.quantities import (
     Range,
     check_whole_steps,
 )
+from ded_bench.problem.quantities import Indices as Indices
 
 #: Records of a case's file by its schema: `module:class`.
 SCHEMAS = {

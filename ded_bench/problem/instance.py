@@ -32,11 +32,6 @@ LARGEST_DEVIATION_HZ = 1.0
 BETWEEN = 1e-6
 
 
-def ramped_for(t: Array, start: float, duration: float) -> Array:
-    """How long a ramp has gone on at times `t`, s."""
-    return np.minimum(np.maximum(t - start, 0.0), duration)  # np.clip takes twice as long
-
-
 class LoadRamp(Record):
     """A load that ramps once: `initial + rate * clip(t - start, 0, duration)`, an injection in pu."""
 
@@ -47,7 +42,7 @@ class LoadRamp(Record):
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
-        return np.asarray(self.initial + self.rate * ramped_for(t, self.start, self.duration))
+        return np.asarray(self.initial + self.rate * np.clip(t - self.start, 0.0, self.duration))
 
     @property
     def kinks(self) -> tuple[float, ...]:
@@ -247,10 +242,7 @@ class Instance(Fingerprinted):
 
     def until(self, horizon_s: float) -> Instance:
         """The same with a horizon of no more than so many seconds; loads are known beyond it."""
-        shorter = self.model_copy(update={"horizon_s": min(horizon_s, self.horizon_s)})
-        for name in ("steps", "grid", "kinks"):  # cached
-            shorter.__dict__.pop(name, None)
-        return shorter
+        return self.model_copy(update={"horizon_s": min(horizon_s, self.horizon_s)})
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""

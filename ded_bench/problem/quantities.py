@@ -12,6 +12,7 @@ from ded_bench.files.strict import Record
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
+Indices = NDArray[np.intp]
 #: Numbers beyond these are typing errors or in other units; within them no product overflows.
 SMALLEST, LARGEST = 1e-9, 1e9
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Fingerprinted, Record, read_record
 from ded_bench.problem.case import Case
-from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp, ramped_for
+from ded_bench.problem.instance import Initial, Instance, LoadPoints, LoadRamp
 from ded_bench.problem.quantities import (
     MAX_POINTS,
     Array,
@@ -81,7 +81,7 @@ class ScenarioLoad(Record):
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape)."""
-        ramped = sum(ramp.rate * ramped_for(t, ramp.start, ramp.duration) for ramp in self.ramps)
+        ramped = sum(ramp.rate * np.clip(t - ramp.start, 0.0, ramp.duration) for ramp in self.ramps)
         return np.asarray(self.initial + ramped + self.fluctuation_at(t))
 
     def courses(self, count: int) -> Array:

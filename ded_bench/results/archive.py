@@ -10,10 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-import lzma
-import struct
 import zipfile
-import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -27,11 +24,6 @@ from ded_bench.problem.schedule import MAX_BYTES, Schedule, columns_of
 
 #: Smaller than deflate by a fourth.
 COMPRESSION = zipfile.ZIP_LZMA
-#: What Python's readers of zip files and of arrays raise on damaged ones.
-_DAMAGE = (
-    *(zipfile.BadZipFile, lzma.LZMAError, zlib.error, struct.error, EOFError, OSError, MemoryError),
-    *(ValueError, LookupError, RuntimeError, SyntaxError, TypeError),
-)
 _COLUMNS = "columns"
 _MADE = (1980, 1, 1, 0, 0, 0)
 
@@ -40,7 +32,7 @@ class Archive:
     """The schedules of one method, settings and regime by name; nothing need be there."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self._loose = path, path.with_suffix("") if path.suffix == ".npz" else path
+        self.path, self._loose = path, path.with_suffix("")
         self._mark, self._names, self._packed_columns = (0, 0), frozenset[str](), list[str]()
 
     def __contains__(self, name: str) -> bool:
@@ -169,6 +161,6 @@ def _readable(source: str | Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except _DAMAGE as error:
+    except Exception as error:  # of zipfile, its codecs and NumPy alike, on damaged files
         reason = " ".join(str(error).split())[:100] or type(error).__name__
         raise InputError(source, "", f"is no archive of schedules ({reason})") from None

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ded_bench.problem.case import REPOSITORY
 
-PACKAGES = ("pyomo", "casadi", "highspy", "torch", "numba", "numpy", "scipy", "pandas")
+PACKAGES = ("pyomo", "casadi", "highspy", "piqp", "torch", "numba", "numpy", "scipy", "pandas")
 
 
 @functools.cache

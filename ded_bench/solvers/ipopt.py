@@ -15,8 +15,8 @@ import pyomo.environ as pyo
 from pyomo.repn.plugins.nl_writer import NLWriter
 
 from ded_bench.problem.case import Array
-from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, bounds
-from ded_bench.solvers.status import Options, Outcome, Status
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm, assign, bounds, told
+from ded_bench.solvers.status import Outcome, Status
 
 #: IPOPT's return values as CasADi spells them; everything else is a failure.
 _IPOPT_STATUS = {
@@ -46,7 +46,7 @@ class CasadiIpopt:
         options: IPOPT options beyond the defaults.
     """
 
-    def __init__(self, model: pyo.ConcreteModel, options: Options | None = None) -> None:
+    def __init__(self, model: pyo.ConcreteModel, options: dict[str, Any] | None = None) -> None:
         started = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "model.nl")
@@ -59,7 +59,7 @@ class CasadiIpopt:
         self._rows = {"lbg": np.array(builder.g_lb), "ubg": np.array(builder.g_ub)}
         # Scalar expressions must be expanded, or every evaluation takes several times as long.
         self._made = functools.lru_cache(maxsize=1)(
-            lambda limit: make_ipopt(nlp, dict(options or {}), limit, {"expand": True})
+            lambda limit: make_ipopt(nlp, options or {}, limit, {"expand": True})
         )
         self._setup_s = time.perf_counter() - started
 
@@ -90,13 +90,12 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf) -> FormAnswer:
     solver = make_ipopt({"x": x, "f": casadi.dot(form.cost, x), "g": g}, LINEAR_OPTIONS, limit, {})
     arguments = {"x0": np.zeros(n), "lbx": form.lower, "ubx": form.upper, "lbg": low, "ubg": high}
     said, found = run_ipopt(solver, arguments, 0.0)
-    return FormAnswer(
-        said.status, np.zeros(n) if found is None else found, said.iterations or 0, said.version, said.message
-    )
+    x_or_zero = np.zeros(n) if found is None else found
+    return told(form, FormAnswer(said.status, x_or_zero, said.iterations or 0, said.version, said.message))
 
 
 def make_ipopt(
-    nlp: dict[str, Any], ipopt: Options, time_limit_s: float | None, options: dict[str, Any]
+    nlp: dict[str, Any], ipopt: dict[str, Any], time_limit_s: float | None, options: dict[str, Any]
 ) -> casadi.Function:
     """IPOPT on a program; its own options, a time limit in s, and CasADi's options."""
     limit = {} if time_limit_s is None else {"max_wall_time": time_limit_s}

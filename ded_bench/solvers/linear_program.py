@@ -16,8 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from pyomo.repn import generate_standard_repn
 
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Indices
 from ded_bench.solvers.status import Status
 
 

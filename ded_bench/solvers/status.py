@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-#: A solver's own options by name.
-Options = Mapping[str, Any]
 
 
 class Status(enum.StrEnum):

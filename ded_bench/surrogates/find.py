@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import Plant, PlantState, plant_of, simulate
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance, LoadPoints, State
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.folder import ResultsFolder

@@ -28,10 +28,10 @@ import numpy as np
 from ded_bench.files.arrays import read_arrays, write_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.files.table import plain_name
-from ded_bench.plants.hold import Hold, Indices, repeated
+from ded_bench.plants.hold import Hold, repeated
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 
 SCHEMA = "ded-bench/koopman/1"

@@ -19,6 +19,7 @@ from ded_bench.cli import main
 from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
+from tests.detailed_cases import MIXED
 from tests.run.test_pool import runs, wait_until
 
 #: So much processor time may pass before the first line of a command, s: more than twice what it takes alone,
@@ -79,6 +80,15 @@ def test_what_is_finished_is_told_where_nothing_may_be_written(
     monkeypatch.setattr("ded_bench.run.runner.run", None)
     assert main(solve) == 0
     assert capsys.readouterr().out == told
+
+
+def test_rows_of_validation_draws_are_judged_on_these(tmp_path: Path, capsys) -> None:
+    """On an island, too, where a draw is balanced, and drawn again if it cannot be served."""
+    here = ["--case", str(MIXED), "--regime", "TO", "--out", str(tmp_path)]
+    road = ["solve", "--method", "ed", "--set", "every=30", "--split", "validation", "--limit", "1", *here]
+    assert main(road) == 0
+    assert main(["score", "--results", str(tmp_path), "--case", str(MIXED)]) == 0
+    assert "1 row checked" in capsys.readouterr().out
 
 
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:

@@ -203,6 +203,10 @@ def test_instances_and_scenarios_that_are_not_there(problem: Path, tmp_path: Pat
     chosen = instance_file_of(Path("threebus-0000"), str(problem))
     assert chosen == problem / "instances" / "threebus-0000.json"
     assert instance_file_of(Path("9bus-0001")).is_file()
+    dotted = problem / "instances" / "my.grid-0000.json"
+    dotted.write_text("{}")
+    assert instance_file_of(Path("my.grid-0000"), str(problem)) == dotted
+    dotted.unlink()
     line = refused(capsys, "online", "--method", "ed", "--case", problem, "--out", tmp_path)
     assert f"`ded-bench scenarios --case {problem}` draws some" in line
 

@@ -245,6 +245,14 @@ def test_records_round_trip_and_are_byte_identical(case, tmp_path):
         assert first.read_bytes() == second.read_bytes()
 
 
+def test_a_changed_copy_forgets_what_followed_from_the_original(case, quiet_instance):
+    instance = quiet_instance(case)
+    assert (len(instance.grid), case.ramp.max(), case.fingerprint) != (0, 0.0, "")  # cached
+    shorter, tighter = instance.until(1.0), case.model_copy(update={"id": "other"})
+    assert (shorter != instance, len(shorter.grid)) == (True, round(1.0 / instance.dt_s) + 1)
+    assert (tighter != case, tighter.model_copy(update={"id": case.id}) == case) == (True, True)
+
+
 @pytest.mark.parametrize("content", ["text é\n", b"\x00bytes"])
 def test_write_atomically_replaces_the_content(tmp_path, content):
     """Folders are made, old content goes, nothing else is left behind; the umask is respected."""

@@ -24,6 +24,7 @@ from ded_bench.solvers import linear_program
     [
         ("ded-slp", None),
         ("ded-ko", Settings("solver=highs", model="linear")),
+        ("ded-ko", Settings("solver=ipopt", model="linear")),
         ("ded-ko-knots", Settings(model="trajectory")),
     ],
 )

@@ -8,11 +8,11 @@ import pytest
 
 from ded_bench.methods.ded import build_ded, prepare, schedule_of, set_instance
 from ded_bench.methods.solution import Settings
-from ded_bench.plants.plant import simulate
+from ded_bench.plants.plant import SimulationError, simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.instance import Instance, LoadRamp
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
@@ -36,6 +36,17 @@ def test_reused_model_gives_the_objective_of_a_fresh_one(case: Case) -> None:
         fresh = CasadiIpopt(model).solve()
         assert again.status == fresh.status == Status.OPTIMAL
         assert again.solver_objective == pytest.approx(fresh.objective, rel=1e-9)
+
+
+def test_an_instance_that_cannot_begin_leaves_no_other_model_behind(threebus: Case) -> None:
+    """Its steps are others, so that a model is built for it; the next answer is read from the one solved."""
+    solve, (one, other) = prepare(threebus, "TO", Settings()), (short(threebus, i) for i in range(2))
+    alone = solve(other).solver_objective
+    solve(one)
+    loads = {bus: LoadRamp(initial=-100.0, start=0.0, duration=0.0, rate=0.0) for bus in threebus.loads}
+    with pytest.raises(SimulationError):
+        solve(short(threebus, 1, horizon_s=2 * HORIZON, load=loads))
+    assert solve(other).solver_objective == pytest.approx(alone, rel=1e-9)
 
 
 def test_solved_schedule_is_feasible_on_the_true_system(case: Case) -> None:

@@ -65,6 +65,7 @@ def test_mistakes_are_told(text: str, told: str) -> None:
 
 def test_a_description_has_every_option() -> None:
     assert described(Options)[0] == ("steps", "3", "of something")
+    assert described(Options)[3] == ("solver", "a", "which; one of a, b")
     assert described(Options)[-1] == ("plain", "2", "")
 
 

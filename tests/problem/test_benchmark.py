@@ -18,6 +18,7 @@ from ded_bench.problem.benchmark import (
     select_split,
     validation_instances,
     write_benchmark,
+    write_scenarios,
 )
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import VALIDATION_SEED, sample_instance
@@ -84,6 +85,19 @@ def test_an_edited_copy_needs_a_name_of_its_own(
     with pytest.raises(InputError, match=rf"copy.json: id: {instance.id} is the name of .*: choose another"):
         check_own_name(edited, "copy.json", case)
     check_own_name(alter(edited, id="mine"), "copy.json", case)
+
+
+def test_draws_make_room_for_draws_of_their_case_alone(tmp_path: Path, threebus: Case) -> None:
+    others = [tmp_path / "package.json", tmp_path / "instances" / "mine.json"]
+    write_benchmark(threebus, 3, 1, tmp_path)
+    for other in others:
+        other.write_text("{}")
+    write_benchmark(threebus, 2, 1, tmp_path)
+    for count in (2, 1):
+        write_scenarios(threebus, count, 0, tmp_path, duration_s=1.0)
+    assert all(other.exists() for other in others)
+    found = sorted(path.name for path in tmp_path.rglob(f"{threebus.id}-*.json"))
+    assert found == ["threebus-0000.json", "threebus-0001.json", "threebus-s0000.json"]
 
 
 def test_a_copy_of_a_benchmark_has_its_version(tmp_path: Path, threebus: Case) -> None:

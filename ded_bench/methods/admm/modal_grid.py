@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.problems import POINTS, ramp_limited_schedules
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.lossless import algebraic
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, copy_row
-from ded_bench.problem.quantities import largest_divisor
+from ded_bench.problem.quantities import Indices, largest_divisor
 
 #: Mismatch of a power flow that is good enough here, pu.
 MISMATCH = 1e-5

@@ -9,19 +9,16 @@ import numpy as np
 
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import sample_instances
+from ded_bench.problem.sampling import DECAY_S, FLUCTUATION, sample_instances
 
 #: Points of the time grid per interval between knots.
 POINTS = 4
 #: One of so many drawn problems is of the closed loop's kind.
 OPERATING = 4
-#: Their fluctuation: standard deviation as a part of the nominal load, and decay, s.
-FLUCTUATION, DECAY_S = 5e-4, 20.0
 
 
 def problems_of(case: Case, instances: Sequence[Instance], points: Array) -> StackedInstances:

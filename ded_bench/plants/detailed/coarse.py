@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ded_bench.files.errors import InputError
+from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.equations import (
     CompiledNetwork,
     LoadSlopes,
@@ -29,22 +30,12 @@ from ded_bench.plants.detailed.equations import (
     solve_voltages,
     sources,
 )
-from ded_bench.plants.detailed.machine_arrays import (
-    DELTA,
-    E1D,
-    E1Q,
-    E2D,
-    E2Q,
-    GATE,
-    SPEED,
-    MachineArrays,
-)
+from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
 from ded_bench.plants.detailed.start import start
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.compiled import compiled, copy_row
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 
 if TYPE_CHECKING:
     from ded_bench.problem.instance import Instance
@@ -56,7 +47,7 @@ DIFFERENCE = 1e-6
 #: Loads are linear between so many points of a step.
 PARTS = 2
 #: States that rates do not depend on linearly.
-CURVED = (DELTA, E1Q, E1D, E2D, E2Q)
+CURVED = (at.DELTA, at.E1Q, at.E1D, at.E2D, at.E2Q)
 
 
 class CoarseMaps(NamedTuple):
@@ -109,7 +100,7 @@ class CoarsePlant:
         a = system.slopes(x, v.view(np.complex128), system.network.nominal().p_drawn).rates
         by_reference, by_load = np.zeros((len(a), n)), np.empty((len(a), len(drawn)))
         for i in range(n):
-            by_reference[np.flatnonzero(system.moving == GATE * n + i), i] = system.data.rate_g[i]
+            by_reference[np.flatnonzero(system.moving == at.GATE * n + i), i] = system.data.rate_g[i]
         load, source = LoadSlopes(np.empty((len(drawn), 4)), np.empty((len(v), len(v)))), np.empty(len(v))
         sources(system.data, x, source)
         for j, one in enumerate(np.eye(len(drawn))):
@@ -128,8 +119,8 @@ class CoarsePlant:
         system = self.system
         point = system.network.nominal()
         x, v_ref = system.equilibrium(point)
-        mean = float(system.data.inertia @ x[DELTA])
-        x[DELTA] -= mean
+        mean = float(system.data.inertia @ x[at.DELTA])
+        x[at.DELTA] -= mean
         v = interleaved(point.voltage * np.exp(-1j * mean))
         return x, v, point.p_drawn[: system.network.n_load_port].copy(), point.power.real.copy(), v_ref
 
@@ -228,7 +219,7 @@ class CoarsePlant:
         network = system.compiled_network if linear else system.compiled_network._replace(change=CHANGE)
         if advance(system.data, network, self.maps, begun, push, linear, states) < len(states):
             raise SimulationError("the network has no voltages any more")
-        omega = states[:, SPEED, machines] * system.data.omega_0[machines]
+        omega = states[:, at.SPEED, machines] * system.data.omega_0[machines]
         return omega, self.system.turbines(states)[:, machines]
 
     def response(self, p_set: Array, agc: bool = True) -> tuple[Array, Array]:
@@ -249,10 +240,10 @@ class CoarsePlant:
         omega, delivered = np.empty(p_set.shape), np.empty(p_set.shape)
         for k in range(len(p_set)):
             states.reshape(n_changes, -1)[:, maps.moving] = x.T
-            omega[k] = (states[:, SPEED, machines] * data.omega_0[machines]).T
+            omega[k] = (states[:, at.SPEED, machines] * data.omega_0[machines]).T
             delivered[k] = self.system.turbines(states)[:, machines].T
             if agc and k and k % maps.period == 0:
-                held = -maps.gain * (states[:, DELTA] @ data.inertia)
+                held = -maps.gain * (states[:, at.DELTA] @ data.inertia)
             after = p_set[min(k + 1, len(p_set) - 1)]
             x = maps.onward[:, :n] @ x + np.outer(maps.held, held)
             x += first @ p_set[k] + second @ (after - p_set[k])

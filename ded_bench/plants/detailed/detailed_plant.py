@@ -22,12 +22,11 @@ from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem, linearised
 from ded_bench.plants.detailed.start import corrected, initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import AgcState, Instance, State
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 from ded_bench.problem.sampling import rounded
 from ded_bench.problem.schedule import Trajectory
 

@@ -24,9 +24,8 @@ from ded_bench.plants.detailed.equations import (
     sources,
 )
 from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
-from ded_bench.plants.hold import Indices
 from ded_bench.problem.compiled import compiled, copy_row, inlined
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 
 #: Slopes of loads are renewed where voltages take more fixed-point steps than this, but not within so many
 #: integrator steps: an inversion costs as much as some hundred of those.

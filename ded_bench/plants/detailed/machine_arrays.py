@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ded_bench.plants.hold import Indices
+from ded_bench.problem.quantities import Indices
 
 #: Rotor angle (rad), speed deviation (pu), flux linkages, exciter, field voltage, exciter's feedback,
 #: stabiliser, governor and turbine; a row of a state array each.

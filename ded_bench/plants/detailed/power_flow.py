@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgetrf, dgetrs
 
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 
 Complex = NDArray[np.complex128]
 

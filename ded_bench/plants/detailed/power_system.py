@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.power_flow import Complex, OperatingPoint, PortNetwork, port_network
-from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled, repeated
+from ded_bench.plants.hold import Hold, across_intervals, doubled, repeated
 from ded_bench.plants.time_varying import Delivered, Reset, TimeVarying
 from ded_bench.problem.case import Case
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 from ded_bench.problem.schedule import Trajectory
 
 if TYPE_CHECKING:

@@ -8,10 +8,9 @@ from ded_bench.files.errors import InputError
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.power_flow import MISMATCH, NEWTON_STEPS, OperatingPoint
 from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, interleaved
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 
 #: What powers and loads of an instance may leave to the machine that balances the power flow, pu.
 REMAINDER = 1e-4

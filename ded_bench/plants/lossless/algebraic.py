@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.plants.hold import Indices
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Indices
 from ded_bench.problem.compiled import compiled, inlined
 
 #: Newton gives up after so many steps.

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.hold import Hold, Indices, across_intervals, doubled, series_step
+from ded_bench.plants.hold import Hold, across_intervals, doubled, series_step
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
 from ded_bench.plants.time_varying import TimeVarying
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance, State
 from ded_bench.problem.lossless_case import lossless

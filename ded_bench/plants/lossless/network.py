@@ -40,12 +40,15 @@ class Linearisation:
     m: Array
     d: Array
 
+    @property
+    def matrix(self) -> Array:
+        """That of the linearised dynamics in (θ, ω), (2 n_gen, 2 n_gen)."""
+        nothing, one = np.zeros_like(self.stiffness), np.eye(len(self.m))
+        return np.block([[nothing, one], [-self.stiffness / self.m[:, None], -np.diag(self.d / self.m)]])
+
     def modes(self) -> NDArray[np.complex128]:
-        """Eigenvalues in rad/s of the linearised dynamics in (θ, ω), shape (2 n_gen,), complex."""
-        n = len(self.m)
-        top = np.hstack([np.zeros((n, n)), np.eye(n)])
-        bottom = np.hstack([-self.stiffness / self.m[:, None], -np.diag(self.d / self.m)])
-        return np.linalg.eigvals(np.vstack([top, bottom])).astype(np.complex128)
+        """Eigenvalues in rad/s of the linearised dynamics, shape (2 n_gen,), complex."""
+        return np.linalg.eigvals(self.matrix).astype(np.complex128)
 
 
 class Network:

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.plants.hold import Indices
 from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorise, solve_algebraic
-from ded_bench.problem.case import Array
+from ded_bench.problem.case import Array, Indices
 from ded_bench.problem.compiled import compiled, copy_row, inlined
 
 #: Dormand and Prince's method of order 5 (Hairer, Norsett, Wanner: Solving ODEs I, II.5); SciPy loads slowly.

@@ -82,11 +82,7 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
 
 
 def solve(
-    instance: Instance,
-    method: str,
-    regime: str,
-    case: Case | None = None,
-    settings: Settings | None = None,
+    instance: Instance, method: str, regime: str, case: Case | None = None, settings: Settings | None = None
 ) -> Solution:
     """Solve one instance in this process; a method's model is built once and used again.
 

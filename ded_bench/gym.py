@@ -68,7 +68,7 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             loads at the sampler's mean cost.
 
     Raises:
-        InputError: there is no such case, regime or plant.
+        InputError: there is no such case, regime or plant, or the price is not finite.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012, as gymnasium declares it
@@ -88,6 +88,8 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         step_cost = max(round(STEP_S / ranges.dt_s), 1) * float(np.mean(ranges.cost)) * drawn
         largest_hz = self.case.regimes[regime].largest_hz
         self.price = step_cost / largest_hz if price is None else price
+        if not np.isfinite(self.price):
+            raise InputError("price", "", "must be finite")
         self.action_space = Box(-1.0, 1.0, (len(self.case.generators),), np.float32)
         seen = self.plant.observed(self._drawn(POLICY_SEED)[1].state)
         ends = _ends(self.case, seen)
@@ -114,6 +116,8 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         super().reset(seed=seed)
         given = (options or {}).get("instance")
         if given is not None:
+            if not isinstance(given, Instance):
+                raise InputError("options", "instance", "must be an Instance, as `load_instances` gives")
             given.check_case(self.case)
         master = POLICY_SEED + int(self.np_random.integers(VALIDATION_SEED - POLICY_SEED))
         self.instance: Instance
@@ -133,13 +137,15 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
             What is observed, the reward, whether the episode is over, False, and more, as the class says.
 
         Raises:
-            InputError: the action is no number for each generator, or the episode has ended.
+            InputError: the action is no number for each generator, or no episode goes on.
         """
+        if not hasattr(self, "_run"):
+            raise InputError("step", "", "no episode has begun: reset the environment")
         run = self._run
         first, last = run.now, min(run.now + self._points, self.instance.steps)
         if first == last:
             raise InputError("step", "", "the episode has ended: reset the environment")
-        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
+        if np.shape(action) != self.action_space.shape or not np.isfinite(np.asarray(action, float)).all():
             raise InputError("action", "", f"must be finite, of the shape {self.action_space.shape}")
         grid = self.instance.grid
         power = np.stack([run.p_set[first], self._moved(np.asarray(action, dtype=np.float64), first, last)])

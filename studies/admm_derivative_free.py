@@ -15,13 +15,7 @@ import cma
 import numpy as np
 
 from ded_bench import Case
-from ded_bench.methods.admm.admm_inference import (
-    DOUBLING,
-    PRICE,
-    STRAIGHT,
-    CompiledIterations,
-    weight_shapes,
-)
+from ded_bench.methods.admm.admm_inference import DOUBLING, PRICE, STRAIGHT, CompiledIterations, weight_shapes
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.admm_training import HELD_OUT, HOPELESS, MARGIN
 from ded_bench.methods.admm.modal_grid import ModalGrid

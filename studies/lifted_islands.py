@@ -168,12 +168,7 @@ class Identified(AlongTrajectory):
         return hashlib.sha256(np.asarray(self.weights).tobytes()).hexdigest()[:12]
 
     def along(
-        self,
-        instance: Instance,
-        p_gen: Array,
-        points: Indices,
-        exact: bool = True,
-        state: Any = None,
+        self, instance: Instance, p_gen: Array, points: Indices, exact: bool = True, state: Any = None
     ) -> TimeVarying:
         """See `AlongTrajectory.along`; for instances at rest, on a grid of STEP_S."""
         f, g, h, by_load, reset = self._maps

@@ -106,6 +106,16 @@ def test_seeds_say_which_training_draws_come(env: DispatchEnv) -> None:
         np.testing.assert_array_equal(values, drawn[2][1][name])
 
 
+def test_what_is_no_step_of_an_episode_is_said() -> None:
+    folder = FOLDERS["fivemachine"]
+    with pytest.raises(InputError, match="no episode has begun"):
+        DispatchEnv(folder, "TO").step(np.zeros(1))
+    with pytest.raises(InputError, match="must be an Instance"):
+        DispatchEnv(folder, "TO").reset(options={"instance": "fivemachine-0000"})
+    with pytest.raises(InputError, match="price: must be finite"):
+        DispatchEnv(folder, "TO", price=float("nan"))
+
+
 def test_full_ramps_lead_to_the_limits(env: DispatchEnv) -> None:
     """And no further; nothing else is accepted as an action."""
     env.reset(seed=1, options={"instance": env.reset(seed=1)[1]["instance"]})

@@ -5,6 +5,7 @@ A MATPOWER file is parsed, never executed.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -116,6 +117,7 @@ class MatpowerGrid(NamedTuple):
     gen: Array
     branch: Array
     places: dict[int, int]  # rows of the buses by their numbers
+    machines: Array  # bus of every machine, and whether it is in service, (n, 2)
 
     @property
     def reference(self) -> int:
@@ -144,7 +146,8 @@ def imported(path: str | Path, dynamics: str | Path, name: str, like: Case | Non
         path: MATPOWER file; it is parsed, not executed.
         dynamics: CSV with columns bus, h (s), xd1 (pu), both on the machine's base, and perhaps mva, p_min
             and p_max (pu of 100 MVA), ramp_pu_per_s; machines at one bus in the order of the MATPOWER file.
-            Or a PSS/E dyr file with GENROU, GENROE, GENSAL or GENSAE records.
+            Or a PSS/E dyr file with GENROU, GENROE, GENSAL or GENSAE records. Of a bus they have
+            all machines, or those in service.
         name: id of the case.
         like: gives nominal frequency, ramp limit, regimes and the sampler's ranges; None: see `alike`.
 
@@ -174,19 +177,26 @@ def _grid(path: str | Path) -> MatpowerGrid:
     for name, columns in COLUMNS.items():
         if name not in found or found[name].shape[1] <= max(columns) or not len(found[name]):
             raise InputError(path, f"mpc.{name}", f"is needed, with {max(columns) + 1} columns or more")
-        if not np.isfinite(found[name][:, columns]).all():
+        finite = [column for column in columns if (name, column) not in (("gen", 8), ("gen", 9))]
+        if not np.isfinite(found[name][:, finite]).all():
             raise InputError(path, f"mpc.{name}", "has a value that is not finite")
     bus = found["bus"][found["bus"][:, 1] != 4]
     if len(bus) > MOST_BUSES:
         raise InputError(path, "mpc.bus", f"has more than {MOST_BUSES} buses")
     branch, gen = found["branch"][found["branch"][:, 10] > 0], found["gen"][found["gen"][:, 7] > 0]
     places = {int(row[0]): i for i, row in enumerate(bus)}
-    if len(places) < len(bus) or not np.isin([*gen[:, 0], *branch[:, :2].flat], bus[:, 0]).all():
-        problem = "two have the same number, or one of a branch or machine is missing"
+    if len(places) < len(bus):
+        raise InputError(path, "mpc.bus", "two have the same number")
+    if lost := sorted({*gen[:, 0], *branch[:, :2].flat} - {*bus[:, 0]}):
+        problem = f"{lost[0]:g} is missing or out of service, and has a machine or branch in service"
         raise InputError(path, "mpc.bus", problem)
     if list(bus[:, 1]).count(3) != 1 or not (gen[:, 0] == bus[bus[:, 1] == 3, 0]).any():
         raise InputError(path, "mpc.bus", "exactly one reference bus (type 3) with a machine is needed")
-    return MatpowerGrid(path, float(found["baseMVA"][0, 0]), bus, gen, branch, places)
+    base, every = float(found["baseMVA"][0, 0]), found["gen"]
+    if base <= 0 or (bus[:, 7] <= 0).any():
+        raise InputError(path, "mpc", "baseMVA and the size of all voltages must be above 0")
+    machines = np.stack([every[:, 0], every[:, 7] > 0], axis=1)
+    return MatpowerGrid(path, base, bus, gen, branch, places, machines)
 
 
 def _dynamics(path: str | Path) -> dict[int, list[Dynamics]]:
@@ -206,16 +216,17 @@ def _dynamics(path: str | Path) -> dict[int, list[Dynamics]]:
 
 def _of_dyr(text: str) -> Iterator[tuple[int, list[str]]]:
     """Line, bus, H and x'd of every record of a machine."""
+    text = "\n" + text
     for record in re.finditer(r"([^/]+)/[^\n]*", text):  # what follows a record is a comment
         words = re.sub(r"['\",]", " ", record[1]).split()
         if len(words) > 2 and (columns := DYR.get(words[1].upper())):
-            line = text.count("\n", 0, record.end()) + 1
+            line = text.count("\n", 0, record.end())
             yield line, [words[0], *(words[3 + c] for c in columns if 3 + c < len(words))]
 
 
 def _power_flow(grid: MatpowerGrid) -> tuple[Complex, Complex]:
     """Voltages, and powers generated at the buses, of the solved AC power flow, pu of 100 MVA."""
-    path, base, bus, gen, branch, places = grid
+    path, base, bus, gen, branch, places, _ = grid
     held = np.isin(bus[:, 0], gen[:, 0]) & (bus[:, 1] != 1)
     generated, size = np.zeros(len(bus), dtype=np.complex128), bus[:, 7].copy()
     for row in gen:
@@ -257,13 +268,19 @@ def _units(
     units = []
     for number, rows in by_bus.items():
         own, total = known[number], generated[grid.places[number]]
-        rating = [one.mva or float(row[6]) for one, row in zip(own, rows, strict=False)]
+        in_service = grid.machines[grid.machines[:, 0] == number, 1]
+        if len(own) == len(in_service):
+            own = list(itertools.compress(own, in_service))
+        if len(own) != len(rows):
+            problem = f"{len(own)} rows for bus {number}, which has {len(rows)} machines in service"
+            raise InputError(dynamics, "bus", f"{problem}, {len(in_service)} in all")
+        rating = [one.mva or float(row[6]) for one, row in zip(own, rows, strict=True)]
         if min(rating) <= 0:
             raise InputError(dynamics, "mva", f"is needed of the machine at bus {number}")
         p = [float(row[1]) / BASE_MVA for row in rows]
         if number == grid.reference:  # elsewhere the power flow keeps them, but for round-off
             p[0] += float(total.real) - sum(p)
-        for k, (one, row) in enumerate(zip(own, rows, strict=False)):
+        for k, (one, row) in enumerate(zip(own, rows, strict=True)):
             letter = chr(ord("a") + k) if len(rows) > 1 else ""
             power = complex(p[k], float(total.imag) * rating[k] / sum(rating))
             ends = (one.p_min, row[9]), (one.p_max, row[8])
@@ -298,7 +315,7 @@ def _record(
         if unit is slack:
             continue
         p = unit.power.real
-        if not unit.p_min <= p <= unit.p_max or unit.p_min >= unit.p_max:
+        if not unit.p_min <= p <= unit.p_max or not 0 < unit.p_max - unit.p_min < math.inf:
             within = f"{unit.p_min:g} to {unit.p_max:g}"
             problem = f"{p:g} pu is not within its limits, {within}; the dynamics may give p_min, p_max"
             raise InputError(grid.path, f"machine at bus {unit.bus}", problem)

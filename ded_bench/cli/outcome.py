@@ -50,7 +50,7 @@ def tell_operated(rows: Sequence[OnlineRow], paths: ResultsFolder) -> None:
 
 def _tell_failures(rows: Iterable[Row | OnlineRow], paths: ResultsFolder) -> None:
     """One line for each method, regime and error."""
-    counts = Counter((f"{row.method} {row.regime}", row.error) for row in rows)
+    counts = Counter((f"{row.method} {row.regime}", row.error or "without a word") for row in rows)
     for (name, error), count in counts.items():
         say(f"{name}, {counted(count, 'time')}: {error}")
     if counts and paths.failures.is_file():

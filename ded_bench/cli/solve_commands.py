@@ -26,13 +26,7 @@ from ded_bench.cli.arguments import (
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
 from ded_bench.plants.plant import PLANTS, SimulationError, plant_of, servable
-from ded_bench.problem.benchmark import (
-    Selection,
-    check_own_name,
-    instance_file,
-    select_files,
-    select_split,
-)
+from ded_bench.problem.benchmark import Selection, check_own_name, instance_file, select_files, select_split
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.instance import Instance, check_plausible
 from ded_bench.problem.schedule import Schedule

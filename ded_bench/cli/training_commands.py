@@ -21,7 +21,8 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
-from ded_bench.methods.registry import get_method, trainable
+from ded_bench.methods.registry import fitting, get_method, trainable
+from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
@@ -87,13 +88,14 @@ def _train_dpc(a: argparse.Namespace) -> int:
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
-    methods = [get_method(name) for name in a.method or trainable()]
+    methods = [get_method(name) for name in a.method or fitting(case)]
     jobs = [(method.name, regime) for method in methods for regime in regimes]
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method and regime with --out")
     with _missing_named():
         for method in methods:
             _ = method.train  # says if it is not trained
+            method.check(case, Settings())
     if a.device != "cpu" and (others := [method.name for method in methods if not method.takes_device]):
         raise InputError("--device", a.device, f"{others[0]} is trained on the CPU alone")
     say(f"{counted(len(jobs), 'training')} of {', '.join(method.name for method in methods)} on {case.id}")

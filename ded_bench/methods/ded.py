@@ -153,7 +153,6 @@ _programs = functools.lru_cache(maxsize=2)(EulerPrograms)
 
 def add_powers(m: pyo.ConcreteModel, case: Case, points: Any) -> None:
     """Declare what any program over all points has: powers, pu, and data that `set_powers` fixes."""
-    m.known = {}  # variables by time, see `_over_time`
     m.gen = pyo.Set(initialize=case.generators, ordered=True)
     m.load_bus = pyo.Set(initialize=case.loads, ordered=True)
     m.cost, m.cost_slack = pyo.Var(m.gen, initialize=0.5), pyo.Var(initialize=0.5)
@@ -257,11 +256,10 @@ def set_powers(m: pyo.ConcreteModel, case: Case, instance: Instance, p_slack: fl
             fix(variable, value)
 
 
+@functools.lru_cache(maxsize=8)  # of one model
 def _over_time(m: pyo.ConcreteModel, name: str) -> Expressions:
     """A variable of every point, (n_points, n_index); to look it up takes longer than to set it."""
-    if name not in m.known:
-        m.known[name] = by_time(m.component(name), m.p_slack_up)
-    return np.asarray(m.known[name])
+    return by_time(m.component(name), m.p_slack_up)
 
 
 def by_time(variable: pyo.Var, times: Any) -> Expressions:

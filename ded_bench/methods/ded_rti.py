@@ -53,12 +53,7 @@ NEAR_S = 30.0
 class Options:
     """Parameters of `ded-rti`."""
 
-    margin: float | None = option(
-        None,
-        "part of the bound to leave free; none: in operation beside a slack, as ramps ask for",
-        lowest=0,
-        below=1,
-    )
+    margin: float | None = option(None, "part of the bound left free; none: as ramps ask", lowest=0, below=1)
     reserve: bool = option(True, "room where a ramp may begin, in operation beside a slack")
 
 

@@ -21,8 +21,8 @@ from ded_bench.solvers.linear_program import Basis, FreeForm
 
 #: Entries of rows below this are left out: they are what a double leaves of zero.
 ROUND_OFF = 1e-13
-#: Grid points of a piece of Σ |P_s|, about. Within one its sign is taken to be the same: of the cost that
-#: leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
+#: Grid points of a piece of Σ |P_s|, about, at first. Within one its sign is taken to be the same: of the
+#: cost that leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
 PIECE = 20
 
 
@@ -91,16 +91,24 @@ class KnotColumns:
         instance: costs and P_0.
         model: a linear model along a trajectory that starts at P_0.
         condensed: states are substituted.
+        pieces: first grid points of the pieces; None: such as PIECE says.
     """
 
-    def __init__(self, case: Case, instance: Instance, model: TimeVarying, condensed: bool) -> None:
+    def __init__(
+        self,
+        case: Case,
+        instance: Instance,
+        model: TimeVarying,
+        condensed: bool,
+        pieces: Indices | None = None,
+    ) -> None:
         self._case, self._instance, self._model = case, instance, model
         self._condensed = condensed
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         #: First grid points of the pieces of Σ |P_s|; every interval between knots has its own.
         self.pieces = np.empty(0, dtype=int)
         if case.slack is not None:
-            self.pieces = divided(model.points, -(-model.lengths // PIECE))
+            self.pieces = divided(model.points, -(-model.lengths // PIECE)) if pieces is None else pieces
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval

@@ -4,7 +4,8 @@
 surrogate.
 
 Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over
-every piece p of a few grid points, so that every row is local to one interval between knots:
+every piece p of a few grid points, so that every row is local to one interval between knots (pieces within
+which much of P_s cancels are divided, see `divide`):
 
     min  Σ_j weight_j c · (P_j + u_j) + c_s Σ_p s_p
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
@@ -57,6 +58,9 @@ NEAR, PARTS = 0.9, 8
 #: exceeded, at peaks and at so many points of an interval. Chosen on validation draws of two-area-agc and
 #: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
 HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
+
+#: What |P_s| may cost beyond what is paid for its pieces, as a part of all; shipped grids have a sixth of it.
+CANCELLED = 1e-4
 
 #: Output, grid point, and the sign of the bound that it comes near, of a limit between knots.
 Limit = tuple[int, int, int]
@@ -115,7 +119,8 @@ class KnotProgram:
         self._margin = np.zeros(len(model.omega)) if plan is None or plan.margin is None else plan.margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
-        self._columns = KnotColumns(case, instance, model, self.condensed)
+        pieces = None if before is None else before._columns.pieces
+        self._columns: KnotColumns = KnotColumns(case, instance, model, self.condensed, pieces)
         self._output_rows = OutputRows(model)
         generation = self._columns.generation[1:]
         self._all_costs = (generation if self.condensed else self._columns.cost).sum()
@@ -283,6 +288,28 @@ class KnotProgram:
         return Prediction(
             p_gen, outputs, p_slack, generation + self._columns.slack_price * float(np.abs(p_slack).sum())
         )
+
+    def divide(self, columns: Array, predicted: Prediction) -> bool:
+        """Divide the pieces of |P_s| in which its sign changes, if what cancels there matters to the cost.
+
+        Args:
+            columns: a solution, shape (n_columns,).
+            predicted: of it.
+
+        Returns:
+            Whether the program is another now.
+        """
+        old, size = self._columns, np.abs(predicted.p_slack)
+        unpaid = old.slack_price * float(size.sum() - columns[old.s].sum())
+        if unpaid <= CANCELLED * abs(predicted.objective):
+            return False
+        owner = np.searchsorted(old.pieces, np.arange(len(size) - 1), side="right") - 1
+        sums, sizes = (np.add.reduceat(values, old.pieces) for values in (predicted.p_slack, size))
+        cancels = sizes - np.abs(sums) > 1e-9 * sizes
+        pieces = np.union1d(old.pieces, np.flatnonzero(cancels[owner]))
+        self._columns = KnotColumns(self._case, self._instance, self.model, self.condensed, pieces)
+        self.__dict__.pop("_all_knots", None)  # cached, by columns
+        return len(pieces) > len(old.pieces)
 
     @property
     def _is_sparse(self) -> bool:

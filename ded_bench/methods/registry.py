@@ -13,6 +13,7 @@ least.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 from dataclasses import dataclass
@@ -65,6 +66,11 @@ class Method:
         """How often it means to be asked in operation: its option `every`, where it has one and it is set."""
         return getattr(read_options(self.options, settings.options), "every", None)
 
+    def check(self, case: Case, settings: Settings) -> None:
+        """Raise InputError if it does not plan on a case, or not with these options."""
+        if check := getattr(self._answering, "check", None):
+            check(case, settings)
+
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance after another.
 
@@ -82,10 +88,8 @@ class Method:
             InputError: unknown options, a case that it does not plan on, or a model or policy that is
                 missing or does not fit.
         """
-        find, check = (getattr(self._answering, name, None) for name in ("artifacts", "check"))
-        own = self.canonical(settings)
-        if check:
-            check(case, own)
+        find, own = getattr(self._answering, "artifacts", None), self.canonical(settings)
+        self.check(case, own)
         if find:
             return tuple(find(case, regime, own))
         return (model_artifact(case, own, self.model),) if self.model else ()
@@ -150,6 +154,16 @@ def registered() -> dict[str, Method]:
 def trainable() -> list[str]:
     """Names of the methods that are trained; imports none of them."""
     return [method.name for method in METHODS.values() if method.trainer]
+
+
+def fitting(case: Case) -> list[str]:
+    """Names of the trained methods that plan on a case."""
+    found = []
+    for name in trainable():
+        with contextlib.suppress(InputError):
+            METHODS[name].check(case, Settings())
+            found.append(name)
+    return found
 
 
 def get_method(name: str) -> Method:

@@ -171,7 +171,7 @@ def solve_with_rows_added(
         least = (rows.enough if np.isfinite(rows.enough) else rows.open) / 2
         added = program.near(prediction.outputs, least, widened) - limits
         limits |= added if excess > rows.open else set()
-        if not added or left_open <= rows.enough:
+        if not program.divide(answer.x, prediction) and (not added or left_open <= rows.enough):
             break
     if answer.status != Status.OPTIMAL and not (rows.soft and prediction is not None):
         return Attempt(answer.status, None, None, iterations, answer.version, answer.message)

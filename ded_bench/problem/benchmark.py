@@ -14,19 +14,11 @@ from pydantic import Field
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import Record, read_record, write_atomically, write_record
+from ded_bench.problem import sampling
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.grid_files import GRID_FILES
 from ded_bench.problem.instance import Instance, load_instances
 from ded_bench.problem.quantities import Name
-from ded_bench.problem.sampling import (
-    DURATION_S,
-    HOUR_S,
-    VALIDATION_SEED,
-    Servable,
-    drawn_with_redraws,
-    sample_instances,
-    sample_scenario,
-)
 
 SplitName = Literal["test", "train", "validation", "all"]
 #: What `--split` may say; `all` are the instances that are files.
@@ -94,7 +86,7 @@ def write_benchmark(
     seed: int,
     folder: Path,
     n_test: int | None = None,
-    servable: Servable | None = None,
+    servable: sampling.Servable | None = None,
     source: Path | None = None,
 ) -> Manifest:
     """Write case, instances, split and manifest of a benchmark into `folder`.
@@ -120,7 +112,7 @@ def write_benchmark(
     else:
         copy_case(source, folder)
     written: dict[str, int] = {}
-    for instance, redraws in drawn_with_redraws(case, seed, count, servable=servable):
+    for instance, redraws in sampling.drawn_with_redraws(case, seed, count, servable=servable):
         written[instance.id] = redraws
         write_record(instance, folder / "instances" / f"{instance.id}.json")
     write_record(draw_split(list(written), seed, n_test), folder / "split.json")
@@ -142,8 +134,8 @@ def write_scenarios(
     count: int,
     seed: int,
     folder: Path,
-    servable: Servable | None = None,
-    duration_s: float = DURATION_S,
+    servable: sampling.Servable | None = None,
+    duration_s: float = sampling.DURATION_S,
     hours: int = 0,
 ) -> Manifest:
     """Write scenarios and their manifest into `folder`; scenarios of other seeds there are removed.
@@ -155,9 +147,9 @@ def write_scenarios(
         InputError: the case's ranges leave hardly anything to draw.
     """
     names = []
-    wanted = [*((i, duration_s) for i in range(count)), *((i, HOUR_S) for i in range(hours))]
+    wanted = [*((i, duration_s) for i in range(count)), *((i, sampling.HOUR_S) for i in range(hours))]
     for index, lasting_s in wanted:
-        scenario = sample_scenario(case, seed, index, servable, lasting_s)
+        scenario = sampling.sample_scenario(case, seed, index, servable, lasting_s)
         names.append(f"{scenario.id}.json")
         text = scenario.model_dump_json(by_alias=True)  # in one line: mostly lists of numbers
         write_atomically(folder / names[-1], text + "\n")
@@ -195,7 +187,7 @@ class Selection:
 
 
 def select_split(
-    name: str | Path, split: str = "test", limit: int | None = None, servable: Servable | None = None
+    name: str | Path, split: str = "test", limit: int | None = None, servable: sampling.Servable | None = None
 ) -> Selection:
     """Choose the first `limit` instances of a split, in the order of their ids.
 
@@ -222,13 +214,13 @@ def select_split(
 
 
 def validation_instances(
-    case: Case, count: int, first: int = 0, servable: Servable | None = None
+    case: Case, count: int, first: int = 0, servable: sampling.Servable | None = None
 ) -> list[Instance]:
     """Draw validation instances `first` to `first + count - 1` of a case, `<case>-v0000` and so on.
 
     Weights, prices, steps and variants are chosen on them; they are no part of the benchmark.
     """
-    drawn = sample_instances(case, VALIDATION_SEED, count, first, servable)
+    drawn = sampling.sample_instances(case, sampling.VALIDATION_SEED, count, first, servable)
     return [
         instance.model_copy(update={"id": f"{case.id}-v{index:04d}"})
         for index, instance in enumerate(drawn, start=first)

@@ -49,7 +49,7 @@ class DetailedCase(Case):
     loads_: Annotated[
         dict[Name, Annotated[float, Field(ge=-LARGEST, lt=0)]], Field(alias="loads", min_length=1)
     ]
-    transfers_: Annotated[tuple[Transfer, ...] | None, Field(alias="transfers", strict=False)] = None
+    transfers_: Annotated[tuple[Transfer, ...] | None, Field(alias="transfers")] = None
     ramp_pu_per_s: Magnitude
     regimes: dict[Name, AnyRegime]
     sampling: Sampling

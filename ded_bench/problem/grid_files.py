@@ -73,9 +73,9 @@ class NetworkFile(Fingerprinted):
     source: str | dict[Name, str] | None = None
     base_mva: float
     slack_machine_bus: Name
-    buses: Annotated[tuple[AcBus, ...], Field(strict=False, min_length=1)]
-    lines: Annotated[tuple[AcLine, ...], Field(strict=False)]
-    machines: Annotated[tuple[ClassicalMachine, ...], Field(strict=False)] = ()
+    buses: Annotated[tuple[AcBus, ...], Field(min_length=1)]
+    lines: tuple[AcLine, ...]
+    machines: tuple[ClassicalMachine, ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> NetworkFile:
@@ -229,10 +229,9 @@ class MachinesFile(Fingerprinted):
     slack_machine_bus: Name
     source: str | None = None
     licence: str | None = None
-    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    notes: tuple[str, ...] = ()
     machines: Annotated[
-        tuple[Annotated[Genrou | Gencls, _of_its_model(Genrou, Gencls)], ...],
-        Field(strict=False, min_length=1),
+        tuple[Annotated[Genrou | Gencls, _of_its_model(Genrou, Gencls)], ...], Field(min_length=1)
     ]
 
     @model_validator(mode="after")

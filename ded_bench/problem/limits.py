@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from ded_bench.files.strict import Record
 from ded_bench.problem.quantities import Array, Extended, Magnitude, Name, NonNegative, Number, Positive
@@ -119,8 +118,8 @@ class Transfer(Record):
     """Σ set-points of `machines` - Σ powers drawn by `loads` ≤ `max`, pu."""
 
     name: Name
-    machines: Annotated[tuple[Name, ...], Field(strict=False)]
-    loads: Annotated[tuple[Name, ...], Field(strict=False)] = ()
+    machines: tuple[Name, ...]
+    loads: tuple[Name, ...] = ()
     max: Number
 
 

@@ -58,7 +58,7 @@ class Fluctuation(Record):
     """
 
     step_s: Positive
-    values: Annotated[tuple[Number, ...], Field(strict=False, min_length=2, max_length=MAX_POINTS)]
+    values: Annotated[tuple[Number, ...], Field(min_length=2, max_length=MAX_POINTS)]
     decay_s: Positive
 
     @functools.cached_property
@@ -76,7 +76,7 @@ class ScenarioLoad(Record):
     """A load that ramps several times and fluctuates; an injection in pu."""
 
     initial: Number
-    ramps: Annotated[tuple[ScenarioRamp, ...], Field(strict=False, max_length=MAX_POINTS)]
+    ramps: Annotated[tuple[ScenarioRamp, ...], Field(max_length=MAX_POINTS)]
     fluctuation: Fluctuation
 
     def at(self, t: Array) -> Array:
@@ -101,7 +101,7 @@ class Scenario(Fingerprinted):
     schema_: Literal["ded-bench/scenario/1"] = Field(alias="schema")
     id: Name
     case: Name
-    seed: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
+    seed: tuple[Annotated[int, Field(ge=0)], ...]
     duration_s: Positive
     dt_s: Positive
     cost: dict[Name, NonNegative]

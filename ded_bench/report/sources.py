@@ -9,19 +9,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from ded_bench.analysis import summary
 from ded_bench.analysis.certificate import Certificate, read_certificates
 from ded_bench.analysis.online_summary import online_rows, practice_rows
 from ded_bench.analysis.referee import REFEREE, RefereeRow
 from ded_bench.analysis.reference import Paper, Reference, choose_reference, read_paper
-from ded_bench.analysis.summary import (
-    gaps,
-    judged_elsewhere,
-    judged_rows,
-    named,
-    newest,
-    on_usual_model,
-    outcome,
-)
 from ded_bench.files.arrays import read_arrays
 from ded_bench.files.errors import InputError
 from ded_bench.plants.plant import SimulationError, simulate
@@ -75,12 +67,12 @@ class Sources:
     @property
     def shown(self) -> pd.DataFrame:
         """Judged rows that stand beside each other: with a paper's numbers, on usual surrogates alone."""
-        return on_usual_model(self.judged) if self.paper else self.judged
+        return summary.on_usual_model(self.judged) if self.paper else self.judged
 
     @cached_property
     def outcome(self) -> pd.DataFrame:
         """Of the rows shown: see `summary.outcome`."""
-        return outcome(self.shown, self.timing)
+        return summary.outcome(self.shown, self.timing)
 
     @cached_property
     def online(self) -> pd.DataFrame:
@@ -130,12 +122,12 @@ def read_sources(case: Case, folder: Path) -> Sources:
     if not any(path.exists() for path in contents):
         raise InputError(folder, "", "holds no results" if folder.is_dir() else "is no folder")
     results, notes = Results(folder), list[str]()
-    everything = named(results.frame().assign(key=pd.Series(list(results.rows), dtype=object)))
+    everything = summary.named(results.frame().assign(key=pd.Series(list(results.rows), dtype=object)))
     ours = everything[everything["case"].isin([case.id, ""])]
     if len(everything) and not len(ours):
         others = ", ".join(sorted(set(everything["case"])))
         raise InputError(paths.results, "case", f"holds rows of {others}, not of {case.id}; give --case")
-    (counting, left_out), (judged, _) = newest(ours), newest(judged_rows(ours))
+    (counting, left_out), (judged, _) = summary.newest(ours), summary.newest(summary.judged_rows(ours))
     notes += left_out
     paper = read_paper(case.folder)
     reference = choose_reference(counting, paper, reference_objectives(case))
@@ -163,9 +155,9 @@ def read_sources(case: Case, folder: Path) -> Sources:
         results=results,
         paper=paper,
         reference=reference,
-        rows=judged_elsewhere(gaps(counting, reference.objectives), judgements),
-        judged=judged_elsewhere(gaps(judged, reference.objectives), judgements),
-        timing=named(timing_summary(calls)),
+        rows=summary.judged_elsewhere(summary.gaps(counting, reference.objectives), judgements),
+        judged=summary.judged_elsewhere(summary.gaps(judged, reference.objectives), judgements),
+        timing=summary.named(timing_summary(calls)),
         instances=instances,
         test_count=test_count,
         problems_version=version,

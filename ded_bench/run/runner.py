@@ -137,12 +137,7 @@ SUFFIXES = (".csv", ".csv.gz")
 
 
 def submit(
-    chosen: Selection,
-    folder: Path,
-    name: str,
-    regimes: Sequence[str],
-    results: Results,
-    workers: int = 1,
+    chosen: Selection, folder: Path, name: str, regimes: Sequence[str], results: Results, workers: int = 1
 ) -> tuple[list[Row], list[Path]]:
     """Score the schedules of a folder as rows of a method called `name`.
 

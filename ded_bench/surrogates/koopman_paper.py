@@ -106,10 +106,7 @@ def _in_original_units(
         k, b = (matrix.numpy() for matrix in model.matrices())
         first, last = model.first, model.last
         weight = first.weight.numpy() / scale
-        mlp = (
-            (weight, first.bias.numpy() - weight @ offset),
-            (last.weight.numpy(), last.bias.numpy()),
-        )
+        mlp = ((weight, first.bias.numpy() - weight @ offset), (last.weight.numpy(), last.bias.numpy()))
     unit = np.concatenate([scale[n_gen + 1 :], scale[[n_gen]], np.ones(len(model.steady))])
     k = unit[:, None] * k / unit
     b = unit[:, None] * b / scale[n_gen]

@@ -5,14 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from ded_bench.analysis.summary import (
-    groups,
-    judged_rows,
-    main_lines,
-    newest,
-    on_usual_model,
-    title,
-)
+from ded_bench.analysis.summary import groups, judged_rows, main_lines, newest, on_usual_model, title
 from ded_bench.methods.registry import METHODS
 from tests.analysis.test_summary import frame_of, row
 

@@ -134,6 +134,27 @@ def test_rules_by_hand(tmp_path: Path) -> None:
     assert 0.9 < v["2"] < 1.02
 
 
+def test_data_of_machines_out_of_service_are_no_others(tmp_path: Path) -> None:
+    """Whether these are told of, too, or not."""
+    idle_last = "  3  10  0 99 -99 1.01 50 0 60 10;\n"
+    idle_first = SMALL.replace(idle_last, "").replace("  3  50  0", idle_last + "  3  50  0")
+    told = [DYNAMICS, DYNAMICS.replace("3,3,0.3,,", "3,9,0.9,,\n3,3,0.3,,")]
+    cases = [
+        imported(*files(tmp_path, grid, text), "s")
+        for grid, text in zip((SMALL, idle_first), told, strict=True)
+    ]
+    assert cases[0] == cases[1]
+
+
+def test_a_dyr_file_may_begin_with_a_comment(tmp_path: Path) -> None:
+    record = "{} 'GENROU' 1 6.5 .03 .4 .05 {} 0 1.8 1.7 {} .5 .2 .1 0 0 /\n"
+    text = "".join(record.format(*one) for one in ((1, 4, 0.25), (3, 3, 0.3), (3, 5, 0.2)))
+    plain, commented = (
+        imported(*files(tmp_path, dynamics=start + text, kind="dyr"), "s") for start in ("", "// of mine\n")
+    )
+    assert plain == commented
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -151,6 +172,14 @@ def test_rules_by_hand(tmp_path: Path) -> None:
         ("2 1 150 40", "2 1 15000 40", "the AC power flow has no solution"),
         ("3  50  0", "3  95  0", "machine at bus 3: 0.95 pu is not within its limits, 0.2 to 0.9"),
         ("mpc.bus = [1 3", "mpc.bus = [1 2", "exactly one reference bus"),
+        ("3 2 0 0 0 0 1 1 0", "3 4 0 0 0 0 1 1 0", "mpc.bus: 3 is missing or out of service"),
+        ("mpc.baseMVA = 200", "mpc.baseMVA = 0", "baseMVA and the size of all voltages must be above 0"),
+        ("1 90 20", "1 Inf 20", "machine at bus 3: 0.5 pu is not within its limits, 0.2 to inf"),
+        (
+            "1,4,0.25,,\n",
+            "1,4,0.25,,\n1,4,0.25,,\n",
+            "2 rows for bus 1, which has 1 machines in service, 1 in",
+        ),
     ],
 )
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, capsys, old: str, new: str, said: str) -> None:
@@ -181,7 +210,7 @@ def test_more_machines_at_a_bus_than_letters_are_refused(tmp_path: Path, capsys)
 def test_what_is_read_of_a_file(tmp_path: Path) -> None:
     found = read_matpower(files(tmp_path)[0])
     assert {name: values.shape for name, values in found.items()} == {
-        **{"baseMVA": (1, 1), "bus": (4, 13), "gen": (4, 10), "branch": (4, 13), "gencost": (1, 7)},
+        **{"baseMVA": (1, 1), "bus": (4, 13), "gen": (4, 10), "branch": (4, 13), "gencost": (1, 7)}
     }
     with pytest.raises(InputError, match="cannot be read"):
         read_matpower(tmp_path / "none.m")

@@ -12,15 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ded_bench.analysis.referee import (
-    ABSOLUTE_HZ,
-    REFEREE,
-    grid_data,
-    judged,
-    referee,
-    run_data,
-    verdict,
-)
+from ded_bench.analysis.referee import ABSOLUTE_HZ, REFEREE, grid_data, judged, referee, run_data, verdict
 from ded_bench.cli import main
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance

@@ -15,6 +15,7 @@ from ded_bench.problem.benchmark import instance_file as instance_file_of
 from ded_bench.results.rows import Results, Row
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
+from tests.detailed_cases import MIXED
 
 pytestmark = pytest.mark.usefixtures("inline")
 
@@ -230,6 +231,7 @@ def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys
         (("--method", "ded-dpc", "--out", "p.safetensors"), "name one method and regime"),
         (("--method", "ded", "--regime", "TO"), "is not trained"),
         (("--method", "ded-dpc", "--device", "cuda"), "ded-dpc is trained on the CPU alone"),
+        (("--method", "ded-dpc", "--case", str(MIXED)), "has no lossless network"),
     ],
 )
 def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:

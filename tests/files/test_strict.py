@@ -91,11 +91,7 @@ BAD = {
     "too many steps": (_with("dt_s", 1e-6), "", "more than 1000000 time steps"),
     "infinitely many steps": (_with("dt_s", 1e-320), "", "more than 1000000 time steps"),
     "duplicate key": (_with("id", "x").replace('"dt_s"', '"id"'), "id", "appears twice"),
-    "duplicate nested key": (
-        json.dumps(VALID).replace('"rate"', '"start"'),
-        "start",
-        "appears twice",
-    ),
+    "duplicate nested key": (json.dumps(VALID).replace('"rate"', '"start"'), "start", "appears twice"),
     "not JSON": ("{", "", "is not JSON"),
     "trailing text": (json.dumps(VALID) + "]", "", "is not JSON"),
     "empty": ("", "", "is not JSON"),

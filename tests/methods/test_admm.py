@@ -26,12 +26,7 @@ from ded_bench.methods.admm.admm_policy import prepare
 from ded_bench.methods.admm.admm_training import with_margin
 from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, oscillators
 from ded_bench.methods.admm.problems import POINTS, problems_of
-from ded_bench.methods.admm.torch_iterations import (
-    ModalChange,
-    TorchIterations,
-    Transposed,
-    judged,
-)
+from ded_bench.methods.admm.torch_iterations import ModalChange, TorchIterations, Transposed, judged
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.plant import simulate
@@ -39,13 +34,7 @@ from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
-from tests.methods.policies import (
-    modal_grid,
-    random_policy,
-    short_instances,
-    started,
-    torch_iterations,
-)
+from tests.methods.policies import modal_grid, random_policy, short_instances, started, torch_iterations
 
 
 @pytest.mark.parametrize("square", [-2.0, 0.0, 0.01, 4.0, 400.0, 1e6])
@@ -254,10 +243,7 @@ def test_margin_is_left_free_of_the_bound(ninebus: Case, tmp_path: Path) -> None
     assert dear > cheap
 
 
-@pytest.mark.parametrize(
-    ("case", "options"),
-    [("9bus", "margin=1"), ("two-area-agc", "margin=0.1")],
-)
+@pytest.mark.parametrize(("case", "options"), [("9bus", "margin=1"), ("two-area-agc", "margin=0.1")])
 def test_margin_is_refused_where_there_is_none(case: str, options: str) -> None:
     with pytest.raises(InputError, match="margin"):
         prepare(Case.load(case), "TO", Settings(options))

@@ -24,7 +24,7 @@ from ded_bench.methods.island.island_iterations import (
 from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
 from ded_bench.methods.island.island_training import FIRST, train
 from ded_bench.methods.knots import knot_points
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.registry import fitting, get_method
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions
@@ -111,6 +111,10 @@ def test_a_trained_policy_keeps_the_bounds(
     assert found.feasible
     best = get_method("ded-slp").prepare(island, regime, Settings())(instance).solver_objective
     assert found.objective < 1.005 * best
+
+
+def test_no_other_policy_is_trained_by_default(island: Case) -> None:
+    assert fitting(island) == ["ded-admm"]
 
 
 def test_one_instance_is_too_few_to_train_on(island: Case, instance: Instance, tmp_path: Path) -> None:

@@ -101,10 +101,7 @@ def test_a_policy_refuses_what_it_was_not_trained_for(
 
 @pytest.mark.parametrize(
     ("method", "name", "value", "problem"),
-    [
-        ("ded-admm", "iterations", "many", "iterations"),
-        ("ded-admm", "margin", "some", "margin"),
-    ],
+    [("ded-admm", "iterations", "many", "iterations"), ("ded-admm", "margin", "some", "margin")],
 )
 def test_facts_that_do_not_fit_are_refused(
     threebus: Case, tmp_path: Path, method: str, name: str, value: object, problem: str

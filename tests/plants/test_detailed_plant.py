@@ -210,10 +210,7 @@ def test_a_measured_start_has_what_was_measured(mixed, plant, quiet_instance, al
         np.testing.assert_allclose(getattr(plant.observed(start), name), getattr(seen, name), atol=1e-12)
     assert start.next_s == pytest.approx(0.7)
     x, data = start.x.copy(), plant.system.data
-    drawn, reference = (
-        plant.system.p_drawn(whole.p_load[[k]])[0],
-        seen.agc.held_pu * plant.system.shares,
-    )
+    drawn, reference = (plant.system.p_drawn(whole.p_load[[k]])[0], seen.agc.held_pu * plant.system.shares)
     reference[plant.system.scheduled] += seen.p_gen
     np.testing.assert_allclose(x[GATE], reference - data.droop * x[SPEED], rtol=0, atol=1e-12)
     assert data.inertia @ x[DELTA] == pytest.approx(seen.agc.integral_rad, rel=1e-9)

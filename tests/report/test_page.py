@@ -9,12 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ded_bench.report.columns import Column
-from ded_bench.report.page import (
-    Details,
-    PageTable,
-    Picture,
-    write_page,
-)
+from ded_bench.report.page import Details, PageTable, Picture, write_page
 from tests.reading import Page
 
 FRAME = pd.DataFrame(

@@ -105,10 +105,7 @@ def test_a_folder_without_results_of_the_case_is_refused(threebus: Case, tmp_pat
 
 
 @pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize(
-    "name",
-    ["results.csv", "timing.csv", "certificate.json"],
-)
+@pytest.mark.parametrize("name", ["results.csv", "timing.csv", "certificate.json"])
 @pytest.mark.parametrize("text", ["", "a,b\n1,2,3,4\n1\n"])
 def test_a_wrong_table_is_bad_input(ninebus: Case, tmp_path: Path, name: str, text: str) -> None:
     """An error, not a gap in the report."""

@@ -11,14 +11,7 @@ from ded_bench.files.errors import InputError
 from ded_bench.problem.case import REPOSITORY, Case
 from ded_bench.results import folder
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.rows import (
-    OBJECTIVES,
-    Objective,
-    Results,
-    Row,
-    objectives_of,
-    reference_objectives,
-)
+from ded_bench.results.rows import OBJECTIVES, Objective, Results, Row, objectives_of, reference_objectives
 
 RUNS = sorted(path.parent for path in (REPOSITORY / "results").glob("*-reference/results.csv"))
 ROW = Row(

@@ -24,14 +24,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Row
 from ded_bench.results.timing import TIMING, TimingRow, timing_summary
 from ded_bench.run import bench as bench_module
-from ded_bench.run.bench import (
-    ROUNDS,
-    Job,
-    bench,
-    rounds_of,
-    runs_of,
-    timed,
-)
+from ded_bench.run.bench import ROUNDS, Job, bench, rounds_of, runs_of, timed
 from ded_bench.run.pool import WorkerDiedError, Workers
 from ded_bench.run.tasks import prepared
 from ded_bench.solvers.status import Status

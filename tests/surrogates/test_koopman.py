@@ -116,12 +116,7 @@ def test_rollout_equals_its_equation_step_by_step(case: Case) -> None:
     model = linear_model(case)
     rng = np.random.default_rng(1)
     n, n_in = model.b.shape
-    for n_points, batch, own in (
-        (1, (), True),
-        (2, (3,), True),
-        (77, (3,), False),
-        (201, (2, 3), True),
-    ):
+    for n_points, batch, own in ((1, (), True), (2, (3,), True), (77, (3,), False), (201, (2, 3), True)):
         psi = rng.normal(size=(*(batch if own else ()), n))
         inputs = rng.normal(size=(n_points, *batch, n_in))
         states = model.rollout(psi, inputs)

@@ -32,6 +32,7 @@ from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array32
+from ded_bench.surrogates.koopman import hat_functions
 
 #: Where training starts: in the first iteration and the last, and between by equal factors. Penalties, of
 #: bounds, ramps, ω and P_s, in the case's `price`; how often the quadratic model counts the last two;
@@ -101,8 +102,7 @@ def starting_settings(iterations: int) -> Array:
 
 def between_nodes(iterations: int) -> Array:
     """Linear interpolation from the nodes to all iterations, (iterations, NODES)."""
-    at = np.linspace(0.0, NODES - 1.0, iterations)
-    return np.stack([np.interp(at, np.arange(NODES), row) for row in np.eye(NODES)], axis=1)
+    return hat_functions(np.linspace(0.0, NODES - 1.0, iterations), np.arange(NODES, dtype=float))
 
 
 def settings_of(weights: Array, iterations: int) -> Array:

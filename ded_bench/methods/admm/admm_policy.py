@@ -41,9 +41,7 @@ class Options:
     """Parameters of `ded-admm`."""
 
     iterations: int = option(0, "iterations beyond the policy's own", lowest=0)
-    margin: float | None = option(
-        None, "part of the bound to leave free instead of the learned, beside a slack", lowest=0, below=1
-    )
+    margin: float | None = option(None, "part of the bound left free; none: as learned", lowest=0, below=1)
 
 
 class AdmmPolicy(TrainedPolicy):

@@ -120,12 +120,7 @@ def factorise(grid: CompiledGrid, angle: Array, factor: Array) -> None:
 
 @compiled
 def solve_algebraic(
-    grid: CompiledGrid,
-    wanted: Array,
-    factor: Array,
-    angle: Array,
-    f: Array,
-    contraction: float,
+    grid: CompiledGrid, wanted: Array, factor: Array, angle: Array, f: Array, contraction: float
 ) -> bool:
     """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
 

@@ -20,16 +20,7 @@ from ded_bench.files.arrays import read_arrays
 from ded_bench.methods.registry import METHODS
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.scenario import QUALITIES
-from ded_bench.report.figures.style import (
-    DASHES,
-    GREY,
-    PALETTE,
-    legend_below,
-    look,
-    new_figure,
-    placed,
-    plain,
-)
+from ded_bench.report.figures import style
 from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
 
@@ -69,8 +60,8 @@ class Shown:
 
     def curve(self, values: Array) -> Curve:
         """Values over time in the method's colour."""
-        style = look(self.method, self.place) if self.method else {"color": GREY}
-        return self.t, values, {"label": plain(self.label), **style}
+        look = style.look(self.method, self.place) if self.method else {"color": style.GREY}
+        return self.t, values, {"label": style.plain(self.label), **look}
 
 
 #: Labels of frequencies by what is bounded, of a generator or of all.
@@ -111,9 +102,9 @@ def frequency_panels(case: Case, regime: str, shown: Sequence[Shown], count: int
 def load_panel(case: Case, one: Shown) -> Panel:
     """The loads that move most, pu."""
     curves = []
-    for colour, dashes, j in zip(PALETTE, DASHES, busiest([one.p_load], FEW), strict=False):
-        style = {"color": colour, "dashes": dashes, "linewidth": 0.9, "label": f"load {case.loads[j]}"}
-        curves.append((one.t, one.p_load[:, j], style))
+    for colour, dashes, j in zip(style.PALETTE, style.DASHES, busiest([one.p_load], FEW), strict=False):
+        look = {"color": colour, "dashes": dashes, "linewidth": 0.9, "label": f"load {case.loads[j]}"}
+        curves.append((one.t, one.p_load[:, j], look))
     return Panel("loads (pu)", curves)
 
 
@@ -129,12 +120,12 @@ def balance_panel(case: Case, regime: str, shown: Sequence[Shown]) -> Panel:
 def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:
     """All panels, and one legend below."""
     rows = -(-len(panels) // columns)
-    with new_figure(0.7 + (1.35 if columns == 1 else 1.8) * rows) as figure:
+    with style.new_figure(0.7 + (1.35 if columns == 1 else 1.8) * rows) as figure:
         axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
         for ax, panel in zip(axes, panels, strict=False):
-            for t, values, style in panel.curves:
+            for t, values, look in panel.curves:
                 step = max(1, len(t) // POINTS)
-                ax.plot(t[::step], values[::step], **style)
+                ax.plot(t[::step], values[::step], **look)
             for level in panel.limits:
                 ax.axhline(level, color="#444444", linestyle=":", linewidth=1.1, label="bound")
             ax.margins(x=0.0)
@@ -144,8 +135,8 @@ def time_figure(heading: str, panels: Sequence[Panel], columns: int) -> Figure:
             ax.tick_params(labelbottom=True)
         for ax in axes[len(panels) :]:
             ax.set_visible(False)
-        legend_below(figure)
-        figure.suptitle(plain(heading))
+        style.legend_below(figure)
+        figure.suptitle(style.plain(heading))
     return figure
 
 
@@ -177,11 +168,11 @@ def draw_schedules(sources: Sources) -> Iterator[Picture]:
         names = " and ".join(one.label for one in reversed(shown))
         caption = f"{names} on {heading}: set-points with bounds, loads, {last}; the gap is near the median"
         panels = [*power_panels(case, shown), load_panel(case, shown[0]), balance_panel(case, regime, shown)]
-        yield placed(time_figure(heading, panels, 2), sources, f"schedule_{regime}", caption)
+        yield style.placed(time_figure(heading, panels, 2), sources, f"schedule_{regime}", caption)
         if regime == sources.tightest:
             caption = f"Frequencies under {names} on {heading}; dotted: the regime's bounds."
             panels = frequency_panels(case, regime, shown, 4)
-            yield placed(time_figure(heading, panels, 1), sources, f"frequencies_{regime}", caption)
+            yield style.placed(time_figure(heading, panels, 1), sources, f"frequencies_{regime}", caption)
 
 
 def representative(sources: Sources, regime: str) -> pd.DataFrame:
@@ -228,7 +219,7 @@ def draw_scenario(sources: Sources) -> Iterator[Picture]:
         panels += frequency_panels(case, sources.tightest, shown, GENERATORS_SHOWN)
         agc = Panel("AGC (pu)", [one.curve(one.agc) for one in shown if one.agc is not None])
         panels.append(balance_panel(case, sources.tightest, shown) if case.slack else agc)
-        yield placed(time_figure(heading, panels, 1), sources, "online_scenario", caption)
+        yield style.placed(time_figure(heading, panels, 1), sources, "online_scenario", caption)
 
 
 def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:

@@ -52,14 +52,8 @@ class Options:
     accelerated: bool = option(False, "linear programs first; IPOPT where they do not get through")
 
 
-def check(case: Case, settings: Settings) -> None:
-    """Raise InputError if the case has another network."""
-    lossless(case)
-
-
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
-    check(case, settings)
     options = read_options(Options, settings.options)
     solve = _accelerated if options.accelerated else _solve
     return functools.partial(solve, case, regime, settings.time_limit_s)

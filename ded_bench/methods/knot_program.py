@@ -290,14 +290,9 @@ class KnotProgram:
         )
 
     def divide(self, columns: Array, predicted: Prediction) -> bool:
-        """Divide the pieces of |P_s| in which its sign changes, if what cancels there matters to the cost.
+        """Divide pieces in which P_s changes its sign, if what cancels matters to the cost; whether it did.
 
-        Args:
-            columns: a solution, shape (n_columns,).
-            predicted: of it.
-
-        Returns:
-            Whether the program is another now.
+        See `predict` for the columns.
         """
         old, size = self._columns, np.abs(predicted.p_slack)
         unpaid = old.slack_price * float(size.sum() - columns[old.s].sum())

@@ -1,14 +1,14 @@
 """METHODS, the registry: a new method is one module and one line here, or a function elsewhere (`plugin`).
 
 A method's module offers `Options`, its parameters (see `methods.options`); `VERSION`, a whole number that is
-raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. If there are
-cases that it does not plan on, `check(case, settings)` says so. If it plans with a surrogate, its line here
-names the usual one. If it depends on other trained models or policies, it offers `artifacts(case, regime,
-settings) -> tuple[Artifact, ...]`, all of them. If it is a policy to be trained, its line here names the
-module whose `train` does it (see `training_record`), and `ded-bench train-dpc` knows it. What `prepare`
-returns may also have `solve(instance, last=None)`, which the closed loop calls: it may start from the plan in
-force, and where no schedule meets every limit it may answer `Infeasible` with the schedule that exceeds them
-least.
+raised when answers change; and `prepare(case, regime, settings) -> (instance -> Solution)`. Cases that it
+does not plan on have another network than its line here says, or `check(case, settings)` refuses them. If it
+plans with a surrogate, its line here names the usual one. If it depends on other trained models or policies,
+it offers `artifacts(case, regime, settings) -> tuple[Artifact, ...]`, all of them. If it is a policy to be
+trained, its line here names the module whose `train` does it (see `training_record`), and `ded-bench
+train-dpc` knows it. What `prepare` returns may also have `solve(instance, last=None)`, which the closed loop
+calls: it may start from the plan in force, and where no schedule meets every limit it may answer `Infeasible`
+with the schedule that exceeds them least.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from ded_bench.methods.options import options_text, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
+from ded_bench.problem.lossless_case import lossless
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Method:
     trainer: str = ""  # the module that trains it
     takes_device: bool = False  # it can be trained on a GPU
     model: str = ""  # the surrogate that it plans with unless told otherwise, if it takes any
+    lossless: bool = False  # it plans on lossless networks alone
 
     @property
     def _answering(self) -> Any:
@@ -68,6 +70,8 @@ class Method:
 
     def check(self, case: Case, settings: Settings) -> None:
         """Raise InputError if it does not plan on a case, or not with these options."""
+        if self.lossless:
+            lossless(case)
         if check := getattr(self._answering, "check", None):
             check(case, settings)
 
@@ -78,7 +82,8 @@ class Method:
             InputError: unknown regime or options, or a model or policy that does not fit.
         """
         case.check_regimes([regime])
-        solver: Solver = self._answering.prepare(case, regime, self.canonical(settings))
+        self.check(case, own := self.canonical(settings))
+        solver: Solver = self._answering.prepare(case, regime, own)
         return solver
 
     def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
@@ -110,7 +115,7 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("ded", "ded_bench.methods.ded", "DED"),
+        Method("ded", "ded_bench.methods.ded", "DED", lossless=True),
         Method("ded-radau", "ded_bench.methods.ded_radau", "DED (Radau)"),
         Method("ded-slp", "ded_bench.methods.ded_slp", "DED (SLP)"),
         Method("ded-rti", "ded_bench.methods.ded_rti", "DED (real-time iteration)", model="trajectory"),
@@ -123,6 +128,7 @@ METHODS: dict[str, Method] = {
             "DED-DPC (paper's recipe)",
             trainer="ded_bench.methods.dpc_paper.paper_training",
             takes_device=True,
+            lossless=True,
         ),
         Method(
             "ded-dpc",
@@ -130,6 +136,7 @@ METHODS: dict[str, Method] = {
             "DED-DPC",
             trainer="ded_bench.methods.dpc.training",
             model="koopman",
+            lossless=True,
         ),
         Method(
             "ded-admm",

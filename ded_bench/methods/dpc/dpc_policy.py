@@ -23,7 +23,6 @@ from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.methods.training_record import DEFAULT_MODEL
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.lossless_case import lossless
 from ded_bench.surrogates.find import find_model
 
 VERSION = 1
@@ -76,18 +75,12 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
     return (*found, model_artifact(case, settings)) if refined else found
 
 
-def check(case: Case, settings: Settings) -> None:
-    """Raise InputError if the case has another network."""
-    lossless(case)
-
-
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return the policy as a method; condensing and factorising are done once per time grid.
 
     Raises:
         InputError: there is no policy or model (names the command that makes one), or it does not fit.
     """
-    check(case, settings)
     policy = DispatchPolicy.find(case, regime, settings)
     steps = read_options(Options, settings.options).refine
     if not steps:

@@ -19,7 +19,6 @@ from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.lossless_case import lossless
 
 Options = NoOptions
 VERSION = 1
@@ -56,18 +55,12 @@ class PaperPolicy(TrainedPolicy):
 artifacts = PaperPolicy.artifacts
 
 
-def check(case: Case, settings: Settings) -> None:
-    """Raise InputError if the case has another network."""
-    lossless(case)
-
-
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return the policy as a method.
 
     Raises:
         InputError: there is no policy (names the command that trains one), or it does not fit.
     """
-    check(case, settings)
     policy = PaperPolicy.find(case, regime, settings)
     return as_solver(policy, lambda instance: policy.answers([instance])[0])
 

@@ -29,7 +29,7 @@ help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "  Settings: CASE=$(CASE) RESULTS=$(RESULTS) SPLIT=test|train|all REGIME=r LIMIT=n WORKERS=$(WORKERS)"
 	@echo "    SCENARIOS=n TIMED=n; further options of commands: KOOPMAN=\"--count 24\" TRAIN=\"--seconds 60\" BENCH=..."
-	@echo "  CASE: a shipped case ($(CASES)) or a folder"
+	@echo "  CASE: a shipped case ($(CASES), and the islands two-area-agc ...) or a folder"
 
 venv: $(STAMP)  ## make .venv with the pinned versions
 $(STAMP): constraints.txt setup.cfg pyproject.toml

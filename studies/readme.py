@@ -51,7 +51,7 @@ def paper() -> str:
     ]
     heads = [
         head
-        for name in ("% over DED", "time (s)", "frequency (Hz)", "ramp (pu)")
+        for name in ("% over DED", "median time (s)", "frequency (Hz)", "ramp (pu)")
         for head in (name, "paper's")
     ]
     return markdown(["Regime", "Method", *heads], rows)

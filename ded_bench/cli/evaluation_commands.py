@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
     """Declare these commands and their options."""
     p = command(commands, "bench", "time methods in turns, alone on the machine, one thread")
     declare(p, "--case", "--results")
-    p.add_argument("--method", type=names, metavar="M[,M]", help="default: all in the results")
+    p.add_argument("--method", type=names, metavar="M[,M]", help="default: all registered in the results")
     p.add_argument("--instances", type=positive, default=10, help="how many test instances to time")
     p.add_argument("--repeats", type=positive, help="rounds; default: by the method's speed")
     p.add_argument("--force", action="store_true", help="time again what the table holds")
@@ -86,7 +86,8 @@ def _bench(a: argparse.Namespace) -> int:
     results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
     known = {key.method for key in results.rows}
-    skipped = {name: "no method has this name" for name in known if not a.method and name not in methods}
+    lacking = "it has no registered name: give it as --method module:function"
+    skipped = {name: lacking for name in known if not a.method and name not in methods}
     skipped |= {name: "the results hold no rows of it" for name in methods if a.method and name not in known}
     for key in results.rows:
         if key.method in methods and (reason := not_timed(key, methods[key.method])):

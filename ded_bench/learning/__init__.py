@@ -1,6 +1,6 @@
 """For those who train: a split as arrays, simulation in batches, linear maps, and a differentiable layer.
 
-`split_arrays`, `simulate_many`, `linearise` and `condense` need NumPy only; `simulated` and
+`split_arrays`, `simulate_many`, `linearise` and `condense` need no PyTorch; `simulated` and
 `cost_and_excess`, which PyTorch differentiates, need the extra `train`. `casadi_model` has
 the equations for optimisers, `export_programs` writes the linear programs of a closed loop.
 Each is imported when first asked for.

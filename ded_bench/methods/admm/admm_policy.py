@@ -110,6 +110,12 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
     return (AdmmPolicy if case.slack is not None else IslandPolicy).artifacts(case, regime, own)
 
 
+def check(case: Case, settings: Settings) -> None:
+    """Raise InputError if a margin is asked for on an island."""
+    if case.slack is None and read_options(Options, settings.options).margin is not None:
+        raise InputError("--set", "margin", "policies of islands have none but the learned")
+
+
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return the policy as a method.
 
@@ -118,8 +124,6 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """
     options, own = read_options(Options, settings.options), replace(settings, model="")
     iterations, margin = options.iterations, options.margin
-    if margin is not None and case.slack is None:
-        raise InputError("--set", "margin", "policies of islands have none but the learned")
     if case.slack is None:
         return IslandSolver(IslandPolicy.find(case, regime, own), iterations)
     policy = AdmmPolicy.find(case, regime, own)

@@ -24,6 +24,8 @@ ISLANDS = ("two-area-agc", "39bus-agc")
 BUDGETS = {"1 ms": 1e-3, "10 ms": 1e-2, "1 s": 1.0, "offline": float("inf")}
 #: A method is of use if it keeps every limit on so many instances.
 KEPT = 0.95
+#: Instances that a method must have been run on.
+ENOUGH = 10
 
 
 @functools.cache
@@ -67,7 +69,8 @@ def methods() -> str:
         setup = run(case).timing.set_index(GROUP)["setup_s"].rename("setup_s")
         found = run(case).outcome.join(setup, on=GROUP)
         found["seconds"] += found["setup_s"].fillna(0.0)
-        useful = found[(found["regime"] == "TO") & (found["correct_rate"] >= KEPT) & found["alone"]]
+        useful = found[(found["regime"] == "TO") & found["alone"]]
+        useful = useful[(useful["correct_rate"] >= KEPT) & (useful["rows"] >= ENOUGH)]
         cells = []
         for seconds in BUDGETS.values():
             able = useful[useful["seconds"] <= seconds].sort_values(["gap_percent", "seconds"])

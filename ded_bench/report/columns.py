@@ -191,7 +191,7 @@ GRIDS = (
     Column("judged", "instances with rows"),
     Column("modes_hz", "modes", "Hz"),
     Column("damping", "least damping", form=".1%"),
-    Column("tight_hz", "tightest bound", "Hz"),
+    Column("tight_hz", "deviation that the tightest regime allows", "Hz"),
     Column("knots", "knots"),
     Column("reference", "gaps are to"),
 )

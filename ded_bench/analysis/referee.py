@@ -164,10 +164,14 @@ def speeds(python: str, grid: Mapping[str, Any], run: Mapping[str, Any]) -> tupl
             if done.returncode < 0:  # it was killed, perhaps for its memory: others may have an answer
                 raise SimulationError(f"ANDES was ended by signal {-done.returncode}")
             raise InputError(python, "", f"ANDES ended without an answer ({last})")
-        answer = json.loads(done.stdout)
-        if answer["error"]:
-            raise SimulationError(answer["error"])
-        return np.load(place, allow_pickle=False), answer["andes"]
+        try:
+            answer = json.loads(done.stdout)
+            problem, made_by = answer["error"], answer["andes"]
+        except (ValueError, LookupError, TypeError):
+            raise InputError(python, "", f"is no Python that answers ({done.stdout.strip()[:60]})") from None
+        if problem:
+            raise SimulationError(problem)
+        return np.load(place, allow_pickle=False), made_by
 
 
 def referee(

@@ -15,5 +15,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return run(argv)
     except KeyboardInterrupt:
-        print("ded-bench: interrupted; what was finished is saved, run again to continue", file=sys.stderr)
+        hint = "run again to continue (trainings: with --resume)"
+        print(f"ded-bench: interrupted; what was finished is saved, {hint}", file=sys.stderr)
         return 130

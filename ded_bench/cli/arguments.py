@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from collections.abc import Callable
@@ -151,7 +152,10 @@ def chosen_methods(
 
 def say(sentence: str) -> None:
     """Tell on stderr: what went wrong, or what is about to be done, before imports and work take seconds."""
-    print(f"ded-bench: {sentence}", file=sys.stderr, flush=True)
+    line = "".join(sign if sign.isprintable() else " " for sign in sentence)
+    if sys.stderr:
+        with contextlib.suppress(OSError, ValueError):  # nobody listens
+            print(f"ded-bench: {line}", file=sys.stderr, flush=True)
 
 
 def counted(n: int, noun: str) -> str:

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         arguments = parser().parse_args(argv)
-        if sys.stderr.isatty():  # the first imports take a second, and some commands work for minutes
+        if sys.stderr and sys.stderr.isatty():  # imports take a second, and some commands work for minutes
             say(f"{arguments.task} ...")
         code: int = arguments.run(arguments)
         return code

@@ -85,16 +85,17 @@ def _bench(a: argparse.Namespace) -> int:
     case = chosen.case
     results = Results(a.results or default_results(case))
     methods = {m.name: m for m in map(get_method, a.method)} if a.method else registered()
-    known = {key.method for key in results.rows}
+    own = [row for row in results.rows.values() if row.case in ("", case.id)]
+    known = {row.method for row in own}
     lacking = "it has no registered name: give it as --method module:function"
     skipped = {name: lacking for name in known if not a.method and name not in methods}
     skipped |= {name: "the results hold no rows of it" for name in methods if a.method and name not in known}
-    for key in results.rows:
+    for key in (row.key for row in own):
         if key.method in methods and (reason := not_timed(key, methods[key.method])):
             skipped[title(key.method, key.settings, model_name(key.model))] = reason
     for name, reason in sorted(skipped.items()):
         say(f"{name}: not timed, since {reason}")
-    jobs = runs_of(results.rows.values(), Settings(search=search_folders(case, results.folder)), methods)
+    jobs = runs_of(own, Settings(search=search_folders(case, results.folder)), methods)
     if not jobs:
         raise InputError(
             results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"

@@ -241,6 +241,8 @@ def _rows_of(a: argparse.Namespace) -> tuple[Results, Case, dict[str, Instance]]
     results = Results(a.results)
     if not results.rows:
         raise InputError(results.path, "", "is missing or has no rows")
+    if lost := set(getattr(a, "method", ())) - {row.method for row in results.rows.values()}:
+        raise InputError("--method", min(lost), f"has no rows in {results.path}")
     if a.instance:
         chosen = _chosen(a)
         return results, chosen.case, {instance.id: instance for instance, _ in chosen.instances}

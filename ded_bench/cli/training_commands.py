@@ -61,7 +61,7 @@ def add_commands(commands: Any) -> None:
 def _train_ko(a: argparse.Namespace) -> int:
     case = Case.load(a.case)
     out = a.out or ResultsFolder(a.results or default_results(case)).model(a.kind)
-    if out.exists() and not a.force:
+    if out.is_file() and not a.force:
         print(f"{out} is there already (--force makes it anew)")
         return 0
     check_writable(out)
@@ -119,7 +119,7 @@ def _train_one(a: argparse.Namespace, name: str, regime: str) -> str:
     case = Case.load(a.case)
     results = a.results or default_results(case)
     out: Path = a.out or policy_file(results, name, regime, a.model)
-    if out.exists() and not (a.force or a.resume):
+    if out.is_file() and not (a.force or a.resume):
         return f"{out} is there already (--force trains anew)"
     instances = [instance for instance, _ in select_split(a.case, "train", a.limit).instances]
     check_writable(out)

@@ -11,7 +11,7 @@ import safetensors
 import safetensors.numpy
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.strict import regular_size, write_atomically
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict[str, Any]) -> None:
@@ -27,6 +27,7 @@ def read_arrays(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
     Raises:
         InputError: the file cannot be read, is no safetensors file, or holds non-finite numbers.
     """
+    regular_size(path)
     try:
         with safetensors.safe_open(str(path), framework="np") as file:
             header = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}

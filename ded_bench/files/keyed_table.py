@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import naming, write_atomically
+from ded_bench.files.strict import naming, regular_size, write_atomically
 from ded_bench.files.table import Table, records
 
 K = TypeVar("K", bound=Hashable)
@@ -62,6 +62,7 @@ class KeyedTable(Generic[K, T]):
 
     def reload(self) -> None:
         """Read what other processes have added; InputError if the file is wrong."""
+        regular_size(self.path)
         try:
             with open(self.path, "rb") as file:
                 mark = _mark(os.fstat(file.fileno()))
@@ -135,7 +136,8 @@ class KeyedTable(Generic[K, T]):
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing to tables of a folder; not to be nested."""
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as lock:
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW  # a link may lead to a file of somebody's
+    with open(folder / ".lock", "r+b", 0, opener=lambda path, _: os.open(path, flags, 0o666)) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield  # closing the file releases the lock
 

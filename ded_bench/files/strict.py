@@ -77,13 +77,7 @@ def read_text(path: str | Path, largest: int = MAX_BYTES) -> str:
     Raises:
         InputError: it cannot be read, is no regular file, or larger than `largest`, also when unpacked.
     """
-    try:
-        found = os.stat(path)
-    except (OSError, ValueError):
-        found = None  # whoever opens it says why it cannot be
-    if found and not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
-        raise InputError(path, "", "is no regular file")
-    if found and found.st_size > largest:
+    if regular_size(path) > largest:
         raise InputError(path, "", f"is larger than {largest >> 20} MiB")
     try:
         opened: Any = gzip.open if str(path).endswith(".gz") else open
@@ -97,6 +91,17 @@ def read_text(path: str | Path, largest: int = MAX_BYTES) -> str:
     if len(text) > largest:
         raise InputError(path, "", f"is larger than {largest >> 20} MiB")
     return text
+
+
+def regular_size(path: str | Path) -> int:
+    """Size in bytes, 0 without a file; InputError if it is no regular one, whose reading might never end."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return 0  # whoever opens it says why it cannot be
+    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+        raise InputError(path, "", "is no regular file")
+    return found.st_size
 
 
 def parse_record(kind: type[R], text: str, source: str | Path) -> R:

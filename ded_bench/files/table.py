@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 def plain_name(text: str) -> str:
     """Check of a cell that also names a file or folder; ValueError if it would leave its folder."""
-    if "/" in text or "\\" in text or text.startswith("."):
+    if "/" in text or "\\" in text or text.startswith(".") or not text.isprintable():
         raise ValueError(text)
     return text
 

@@ -44,7 +44,7 @@ class Options:
     """How often is dispatched."""
 
     every: float | None = option(
-        None, "s from one dispatch to the next; none: 60, on islands 1 and at kinks of loads", lowest=1e-3
+        None, "s from one dispatch to the next; none: 60, on islands 1 and at kinks", lowest=1e-3, below=1e6
     )
     lead: bool = option(False, "on islands: turbines deliver the dispatch, governors' lags are led")
 

@@ -106,7 +106,8 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
     try:
         value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
         is_number = kind in (int, float)
-        fits = lowest <= value < below and math.isfinite(value) if is_number else not set(text) & set("/\\")
+        in_a_path = text.isprintable() and not set(text) & set("/\\")
+        fits = lowest <= value < below and math.isfinite(value) if is_number else in_a_path
         if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):
@@ -114,7 +115,7 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
         wanted += f" of at least {lowest:g}" if math.isfinite(lowest) else ""
         wanted += f" and less than {below:g}" if math.isfinite(below) else ""
         raise InputError("--set", field.name, f"{text[:40]!r} is not {wanted}") from None
-    return value
+    return value + 0 if kind in (int, float) else value  # no -0
 
 
 def _text(value: Any) -> str:

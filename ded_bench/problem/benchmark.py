@@ -111,6 +111,7 @@ def write_benchmark(
         write_record(case, place)
     else:
         copy_case(source, folder)
+    (folder / MANIFEST).unlink(missing_ok=True)  # what is cut short has no version
     written: dict[str, int] = {}
     for instance, redraws in sampling.drawn_with_redraws(case, seed, count, servable=servable):
         written[instance.id] = redraws
@@ -146,6 +147,7 @@ def write_scenarios(
     Raises:
         InputError: the case's ranges leave hardly anything to draw.
     """
+    (folder / MANIFEST).unlink(missing_ok=True)  # what is cut short has no version
     names = []
     wanted = [*((i, duration_s) for i in range(count)), *((i, sampling.HOUR_S) for i in range(hours))]
     for index, lasting_s in wanted:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import write_atomically
+from ded_bench.files.strict import regular_size, write_atomically
 from ded_bench.problem.case import Case
 from ded_bench.problem.schedule import MAX_BYTES, Schedule, columns_of
 
@@ -45,6 +45,7 @@ class Archive:
             InputError: it is missing or damaged, is of other generators, or does not span the horizon.
         """
         source, wanted = f"{self.path}: {name}", columns_of(case)
+        regular_size(self._file(name))
         try:  # in this order: a schedule that is packed meanwhile is found
             data = self._file(name).read_bytes()
         except FileNotFoundError:
@@ -111,6 +112,7 @@ class Archive:
 
     def _packed(self) -> frozenset[str]:
         """Names in the archive file, which is read again when it has changed."""
+        regular_size(self.path)
         try:
             found = self.path.stat()
         except FileNotFoundError:

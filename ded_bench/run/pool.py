@@ -187,13 +187,14 @@ class _Child:
     def __init__(self) -> None:
         self._connection, theirs = multiprocessing.Pipe()
         code = f"from ded_bench.run.pool import serve; serve({theirs.fileno()})"
+        places = [place or os.getcwd() for place in sys.path if not place or os.path.isabs(place)]
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", code],
+                [sys.executable, "-P", "-c", code],  # no module of the working directory shadows others
                 env=os.environ
                 | dict.fromkeys(THREAD_VARIABLES, "1")
                 | MEMORY_VARIABLES
-                | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                | {"PYTHONPATH": os.pathsep.join(places)},
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=2,  # what a method prints is no row

@@ -125,7 +125,8 @@ def validate(
     rows = []
     for row, verdict in verdicts(case, instances, results, workers, plant):
         rows.append(ValidatedRow(**vars(scored_row(dataclasses.replace(row, plant=plant), verdict))))
-        table.add(rows[-1:])
+        if isinstance(verdict, Score | SimulationError) or rows[-1].key not in table.rows:
+            table.add(rows[-1:])
     table.compact()
     return rows
 

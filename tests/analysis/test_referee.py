@@ -14,6 +14,7 @@ import pytest
 
 from ded_bench.analysis.referee import ABSOLUTE_HZ, REFEREE, grid_data, judged, referee, run_data, verdict
 from ded_bench.cli import main
+from ded_bench.files.errors import InputError
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import IslandRegime, Regime
@@ -180,8 +181,10 @@ def test_without_andes_the_command_ends_with_one_line(
     place = tmp_path / "b.json"
     place.write_text(instances["b"].model_dump_json(by_alias=True))
     bare = executable(tmp_path / "bare", f'#!/bin/sh\nexec {sys.executable} -S "$@"\n')
-    with pytest.raises(Exception, match="has no ANDES"):
+    with pytest.raises(InputError, match="has no ANDES"):
         referee(mixed, instances, folder, python=bare)
+    with pytest.raises(InputError, match="is no Python that answers"):
+        referee(mixed, instances, folder, python="/bin/echo")
     shown = "referee", "--results", str(folder.folder), "--case", "39bus", "--python", bare
     assert main(list(shown)) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

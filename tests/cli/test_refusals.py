@@ -212,6 +212,31 @@ def test_instances_and_scenarios_that_are_not_there(problem: Path, tmp_path: Pat
     assert f"`ded-bench scenarios --case {problem}` draws some" in line
 
 
+def test_one_line_whatever_a_name_holds(problem: Path, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "a.json"
+    path.write_text('{"x\\ny\\u001b[31m": 1}')
+    assert "\x1b" not in refused(capsys, *SOLVE, "--case", problem, "--instance", path)
+
+
+def test_nobody_listens_to_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard error is closed: the exit code says what is to be said."""
+    monkeypatch.setattr("sys.stderr", None)
+    assert main(["path", "nowhere"]) == 2
+
+
+def test_times_are_of_the_case_of_the_rows(problem: Path, tmp_path: Path, capsys) -> None:
+    assert (
+        main(["solve", "--method", "ed", "--case", str(problem), "--regime", "NO", "--out", str(tmp_path)])
+        == 0
+    )
+    capsys.readouterr()
+    assert main(["bench", "--case", "9bus", "--results", str(tmp_path)]) == 2
+    assert "holds no rows of these methods" in capsys.readouterr().err
+    assert "--method: ded: has no rows" in refused(
+        capsys, "reproduce", "--results", tmp_path, "--method", "ded"
+    )
+
+
 def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """While libraries are imported, too: one line."""
 

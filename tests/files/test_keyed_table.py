@@ -184,6 +184,20 @@ def test_kill_at_any_moment_loses_nothing(tmp_path: Path) -> None:
     assert Table(Old).read(tmp_path / "table.csv") == list(table.rows.values())
 
 
+def test_neither_a_lock_nor_a_table_leads_elsewhere(tmp_path: Path) -> None:
+    """Folders come from strangers: a link would empty its target, a pipe never ends."""
+    target, folder = tmp_path / "precious", tmp_path / "a"
+    target.write_text("precious")
+    folder.mkdir()
+    (folder / ".lock").symlink_to(target)
+    with pytest.raises(OSError, match="symbolic links"):
+        old(folder).add([Old("a", 1)])
+    assert target.read_text() == "precious"
+    os.mkfifo(folder / "table.csv")
+    with pytest.raises(InputError, match="no regular file"):
+        old(folder)
+
+
 def test_a_quotation_mark_out_of_place_hides_no_row(tmp_path: Path) -> None:
     """What follows is refused; it is neither passed over nor cut off."""
     old(tmp_path).add([Old("a", 1), Old("b", 2), Old("c", 3)])

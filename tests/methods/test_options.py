@@ -36,6 +36,7 @@ def test_what_differs_from_the_defaults_is_the_canonical_text() -> None:
         ("steps=3,fast=off,length_s=none", "default"),
         ("fast=on, steps=7", "steps=7,fast=on"),
         ("length_s=0.10,plain=3.0,solver=b", "length_s=0.1,solver=b,plain=3"),
+        ("margin=-0", "margin=0"),
     ]:
         options = read_options(Options, text)
         assert options_text(options) == canonical

@@ -100,6 +100,20 @@ def test_draws_make_room_for_draws_of_their_case_alone(tmp_path: Path, threebus:
     assert found == ["threebus-0000.json", "threebus-0001.json", "threebus-s0000.json"]
 
 
+def test_draws_that_are_cut_short_have_no_version(
+    tmp_path: Path, threebus: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_benchmark(threebus, 3, 1, tmp_path)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ded_bench.problem.benchmark.draw_split", full)
+    with pytest.raises(OSError, match="No space"):
+        write_benchmark(threebus, 3, 2, tmp_path)
+    assert select_split(tmp_path, "all").version == ""
+
+
 def test_a_copy_of_a_benchmark_has_its_version(tmp_path: Path, threebus: Case) -> None:
     """The case's file keeps its bytes, however it is written."""
     source = tmp_path / "mine.json"

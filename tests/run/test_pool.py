@@ -137,6 +137,25 @@ def test_an_interruption_leaves_no_process(tmp_path: Path) -> None:
         wait_until(lambda pid=pid: not runs(int(pid)))
 
 
+def test_modules_of_the_working_directory_shadow_no_others(tmp_path: Path) -> None:
+    """A command may be called within a folder that comes from a stranger."""
+    (tmp_path / "queue.py").write_text("raise SystemExit('a stranger speaks')")
+    code = (
+        "import sys; sys.path.remove('')\n"  # as in `ded-bench`
+        "from ded_bench.run.pool import Workers; import math\n"
+        "with Workers(1) as pool: print([answer for _, answer in pool.imap([(math.sqrt, (4.0,))], 'a')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    assert done.stdout == "[2.0]\n", done.stderr
+
+
 def test_workers_end_with_their_parent(tmp_path: Path) -> None:
     """Even if it is killed, and they are in the middle of something."""
     pids = tmp_path / "pids"

@@ -14,6 +14,7 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import VALIDATED, Results, Row
+from ded_bench.run import scoring
 from ded_bench.run.scoring import rescore, scored_row, validate
 
 pytestmark = pytest.mark.usefixtures("inline")
@@ -112,7 +113,9 @@ def test_nothing_to_check_is_an_error(threebus: Case, instances, results) -> Non
         rescore(threebus, {"d": instances["d"]}, results)
 
 
-def test_other_plants_have_a_table_of_their_own(threebus: Case, instances, results) -> None:
+def test_other_plants_have_a_table_of_their_own(
+    threebus: Case, instances, results, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One line per row and plant, as often as one asks; the rows stay as they are."""
     before = results.path.read_bytes()
     for _ in range(2):
@@ -121,3 +124,7 @@ def test_other_plants_have_a_table_of_their_own(threebus: Case, instances, resul
         assert [row.objective for row in rows] == [row_of(results, name).objective for name in "abc"]
         assert VALIDATED.read(results.paths.validated) == rows
     assert results.path.read_bytes() == before
+    kept, died = results.paths.validated.read_bytes(), RuntimeError("the process died")
+    monkeypatch.setattr(scoring, "verdicts", lambda *_: [(row_of(results, name), died) for name in "abc"])
+    assert {row.objective for row in validate(threebus, instances, results, "lossless")} == {None}
+    assert results.paths.validated.read_bytes() == kept  # that says nothing of a schedule

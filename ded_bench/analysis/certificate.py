@@ -20,7 +20,6 @@ from typing import Any, Literal
 
 import pandas as pd
 from pydantic import Field, model_validator
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
@@ -267,10 +266,6 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
 
 
 def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:
-    if workers == 1:
-        with threadpool_limits(1):
-            yield from (judge(*call) for call in calls)
-        return
     with Workers(workers) as pool:
         for _, answer in pool.imap([(judge, call) for call in calls], calls):
             if not isinstance(answer, list):

@@ -21,7 +21,7 @@ from ded_bench.cli.arguments import (
 )
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import check_writable
-from ded_bench.methods.registry import fitting, get_method, trainable
+from ded_bench.methods.registry import get_method, trainable
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
 from ded_bench.problem.benchmark import select_split
@@ -88,7 +88,7 @@ def _train_dpc(a: argparse.Namespace) -> int:
     case = Case.load(a.case)
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
-    methods = [get_method(name) for name in a.method or fitting(case)]
+    methods = [get_method(name) for name in a.method or trainable(case)]
     jobs = [(method.name, regime) for method in methods for regime in regimes]
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method and regime with --out")

@@ -13,7 +13,6 @@ with the schedule that exceeds them least.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from ded_bench.methods.options import options_text, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
-from ded_bench.problem.lossless_case import lossless
+from ded_bench.problem.lossless_case import LosslessCase, lossless
 
 
 @dataclass(frozen=True)
@@ -158,19 +157,10 @@ def registered() -> dict[str, Method]:
     return METHODS | {name: Method(name, others[name], name) for name in names}
 
 
-def trainable() -> list[str]:
-    """Names of the methods that are trained; imports none of them."""
-    return [method.name for method in METHODS.values() if method.trainer]
-
-
-def fitting(case: Case) -> list[str]:
-    """Names of the trained methods that plan on a case."""
-    found = []
-    for name in trainable():
-        with contextlib.suppress(InputError):
-            METHODS[name].check(case, Settings())
-            found.append(name)
-    return found
+def trainable(case: Case | None = None) -> list[str]:
+    """Names of the methods that are trained, and plan on a case if one is given; imports none of them."""
+    fits = case is None or isinstance(case, LosslessCase)
+    return [method.name for method in METHODS.values() if method.trainer and (fits or not method.lossless)]
 
 
 def get_method(name: str) -> Method:

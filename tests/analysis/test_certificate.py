@@ -32,6 +32,8 @@ from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.run.tasks import prepared
 
+pytestmark = pytest.mark.usefixtures("inline")
+
 
 @pytest.mark.parametrize(("successes", "count"), [(1, 1), (7, 10), (995, 1000), (9950, 10_000)])
 def test_clopper_pearson_is_the_exact_bound(successes: int, count: int) -> None:
@@ -112,18 +114,19 @@ def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case,
     assert set(calls().values()) == {2}
 
 
+def stopped(*call):
+    """A judge who is interrupted at the third instance."""
+    if 2 in call[-1]:
+        raise KeyboardInterrupt
+    return judge(*call)
+
+
 def test_an_interrupted_certificate_goes_on(
     calls, threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     regime = next(iter(threebus.regimes))
     with monkeypatch.context() as patch:
-
-        def stop(*call):
-            if 2 in call[-1]:
-                raise KeyboardInterrupt
-            return judge(*call)
-
-        patch.setattr(certificate, "judge", stop)
+        patch.setattr(certificate, "judge", stopped)
         with pytest.raises(KeyboardInterrupt):
             run(threebus, tmp_path, regime)
     assert len(rows_of(tmp_path, regime)) == 2

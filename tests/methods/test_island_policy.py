@@ -24,7 +24,7 @@ from ded_bench.methods.island.island_iterations import (
 from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
 from ded_bench.methods.island.island_training import FIRST, train
 from ded_bench.methods.knots import knot_points
-from ded_bench.methods.registry import fitting, get_method
+from ded_bench.methods.registry import get_method, trainable
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.trained_policy import Scope
 from ded_bench.methods.training_record import TrainingOptions
@@ -114,7 +114,7 @@ def test_a_trained_policy_keeps_the_bounds(
 
 
 def test_no_other_policy_is_trained_by_default(island: Case) -> None:
-    assert fitting(island) == ["ded-admm"]
+    assert trainable(island) == ["ded-admm"]
 
 
 def test_one_instance_is_too_few_to_train_on(island: Case, instance: Instance, tmp_path: Path) -> None:

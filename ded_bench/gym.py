@@ -139,12 +139,10 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         Raises:
             InputError: the action is no number for each generator, or no episode goes on.
         """
-        if not hasattr(self, "_run"):
-            raise InputError("step", "", "no episode has begun: reset the environment")
-        run = self._run
+        run = getattr(self, "_run", None)
+        if run is None or run.now == self.instance.steps or not self._points:
+            raise InputError("step", "", "the episode has ended, or none has begun: reset the environment")
         first, last = run.now, min(run.now + self._points, self.instance.steps)
-        if first == last:
-            raise InputError("step", "", "the episode has ended: reset the environment")
         if np.shape(action) != self.action_space.shape or not np.isfinite(np.asarray(action, float)).all():
             raise InputError("action", "", f"must be finite, of the shape {self.action_space.shape}")
         grid = self.instance.grid

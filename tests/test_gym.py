@@ -108,7 +108,7 @@ def test_seeds_say_which_training_draws_come(env: DispatchEnv) -> None:
 
 def test_what_is_no_step_of_an_episode_is_said() -> None:
     folder = FOLDERS["fivemachine"]
-    with pytest.raises(InputError, match="no episode has begun"):
+    with pytest.raises(InputError, match="none has begun"):
         DispatchEnv(folder, "TO").step(np.zeros(1))
     with pytest.raises(InputError, match="must be an Instance"):
         DispatchEnv(folder, "TO").reset(options={"instance": "fivemachine-0000"})

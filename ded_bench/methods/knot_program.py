@@ -290,10 +290,7 @@ class KnotProgram:
         )
 
     def divide(self, columns: Array, predicted: Prediction) -> bool:
-        """Divide pieces in which P_s changes its sign, if what cancels matters to the cost; whether it did.
-
-        See `predict` for the columns.
-        """
+        """Divide pieces in which P_s changes sign, if what cancels matters to the cost; whether it did."""
         old, size = self._columns, np.abs(predicted.p_slack)
         unpaid = old.slack_price * float(size.sum() - columns[old.s].sum())
         if unpaid <= CANCELLED * abs(predicted.objective):

@@ -46,6 +46,7 @@ def option(
         choices: the texts that a str may be.
         lowest, below: a number is at least the one and less than the other.
     """
+    text += f"; one of {', '.join(choices)}" if choices else ""
     limits = {"choices": tuple(choices), "lowest": lowest, "below": below}
     return dataclasses.field(default=default, metadata={"text": text, **limits})
 
@@ -84,14 +85,7 @@ def options_text(options: Any) -> str:
 
 def described(kind: type[Any]) -> list[tuple[str, str, str]]:
     """Name, default and help of every option, as texts."""
-    fields = dataclasses.fields(kind)
-    helps = ["; ".join(filter(None, (f.metadata.get("text"), _one_of(f)))) for f in fields]
-    return [(f.name, _text(f.default), text) for f, text in zip(fields, helps, strict=True)]
-
-
-def _one_of(field: dataclasses.Field[Any]) -> str:
-    choices = field.metadata.get("choices", ())
-    return f"one of {', '.join(choices)}" if choices else ""
+    return [(f.name, _text(f.default), f.metadata.get("text", "")) for f in dataclasses.fields(kind)]
 
 
 def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
@@ -111,7 +105,7 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
         if not fits or (choices and value not in choices):
             raise ValueError(text)
     except (KeyError, ValueError):
-        wanted = _one_of(field) or _KINDS.get(kind, kind.__name__)
+        wanted = f"one of {', '.join(choices)}" if choices else _KINDS.get(kind, kind.__name__)
         wanted += f" of at least {lowest:g}" if math.isfinite(lowest) else ""
         wanted += f" and less than {below:g}" if math.isfinite(below) else ""
         raise InputError("--set", field.name, f"{text[:40]!r} is not {wanted}") from None

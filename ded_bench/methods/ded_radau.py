@@ -47,11 +47,7 @@ CLOSE = 5e-8
 class Options:
     """How finely time is divided."""
 
-    element_s: float | None = option(
-        None,
-        "mean length of an element, s; none: 0.1, or an eighth of the fastest period; islands: longest, 1",
-        lowest=1e-3,
-    )
+    element_s: float | None = option(None, "length of elements, s; none: by the fastest mode", lowest=1e-3)
 
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:

@@ -43,9 +43,7 @@ LEAD_S = 0.1
 class Options:
     """How often is dispatched."""
 
-    every: float | None = option(
-        None, "s from one dispatch to the next; none: 60, on islands 1 and at kinks", lowest=1e-3, below=1e6
-    )
+    every: float | None = option(None, "s between dispatches; none: 60, islands: 1", lowest=1e-3, below=1e6)
     lead: bool = option(False, "on islands: turbines deliver the dispatch, governors' lags are led")
 
 

@@ -3,9 +3,8 @@
 `ded-slp` solves it along one trajectory after another, `ded-ko`, `ded-ko-knots` and `ded-rti` once on a
 surrogate.
 
-Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over
-every piece p of a few grid points, so that every row is local to one interval between knots (pieces within
-which much of P_s cancels are divided, see `divide`):
+Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over every piece p of
+a few grid points (see `divide`), so that every row is local to one interval between knots:
 
     min  Σ_j weight_j c · (P_j + u_j) + c_s Σ_p s_p
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j

@@ -27,6 +27,7 @@ from ded_bench.methods.admm.admm_training import with_margin
 from ded_bench.methods.admm.modal_kernels import interval_maps, modal_change, oscillators
 from ded_bench.methods.admm.problems import POINTS, problems_of
 from ded_bench.methods.admm.torch_iterations import ModalChange, TorchIterations, Transposed, judged
+from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import TrainingOptions
 from ded_bench.plants.plant import simulate
@@ -246,7 +247,7 @@ def test_margin_is_left_free_of_the_bound(ninebus: Case, tmp_path: Path) -> None
 @pytest.mark.parametrize(("case", "options"), [("9bus", "margin=1"), ("two-area-agc", "margin=0.1")])
 def test_margin_is_refused_where_there_is_none(case: str, options: str) -> None:
     with pytest.raises(InputError, match="margin"):
-        prepare(Case.load(case), "TO", Settings(options))
+        get_method("ded-admm").prepare(Case.load(case), "TO", Settings(options))
 
 
 def test_weights_learned_for_few_iterations_do_not_serve_many(ninebus: Case) -> None:

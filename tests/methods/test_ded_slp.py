@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+import json
 
 import numpy as np
 import pytest
 
+from ded_bench.files.strict import parse_record
 from ded_bench.methods import ded_slp, ed, knot_columns
 from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.registry import get_method
 from ded_bench.methods.slp import Attempt, Parts
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import SimulationError, plant_of, simulate
@@ -150,6 +153,26 @@ def test_failures_are_said(case, monkeypatch):
     solution = prepare(case, "TO", Settings())(short(case, 0))
     assert solution.status == Status.FAILED
     assert solution.error == "lost"
+
+
+def test_a_program_that_was_too_careful_is_not_the_last(alter) -> None:
+    """Its trajectory stays clear of a bound that held it, at just the cost it said: the slack is free."""
+    case = alter(Case.load("two-area"), ramp_pu_per_s=0.5, regimes={"TO": {"omega_hz": 0.03}}, knots=4)
+    power, omega = {"g1": 8.96, "g2": 6.993102, "g4": 3.5}, {"g1": 0.056548, "g2": 0.056548, "g4": -0.056548}
+    data = {
+        **{"schema": "ded-bench/instance/2", "id": "careful", "case": "two-area", "seed": [1, 1]},
+        **{"horizon_s": 8.0, "dt_s": 0.1, "initial": {"power": power, "omega": omega}},
+        "cost": {"g3": 0.0, "g1": 0.3, "g2": 0.9828, "g4": 0.3403},
+        "load": {
+            "7": {"initial": -8.97473, "start": 1.99889, "duration": 2.23837, "rate": -0.0199167},
+            "9": {"initial": -18.3045, "start": 1.86961, "duration": 4.89043, "rate": -0.0161650},
+        },
+    }
+    instance = parse_record(Instance, json.dumps(data), "careful instance")
+    careful = prepare(case, "TO", Settings())(instance)
+    other = get_method("ded-rti").prepare(case, "TO", Settings())(instance)
+    assert careful.status == Status.OPTIMAL
+    assert careful.solver_objective < 1.0001 * score(case, instance, other.schedule, "TO").objective
 
 
 def test_what_is_feasible_but_not_confirmed_is_no_optimum(case, monkeypatch):

@@ -152,7 +152,7 @@ class Koopman:
     def check_step(self, instance: Instance) -> None:
         """Raise InputError unless the model's time step is the instance's."""
         if abs(self.dt_s - instance.dt_s) > 1e-9 * instance.dt_s:
-            problem = f"is {instance.dt_s:g}, but the Koopman model was identified at {self.dt_s:g}"
+            problem = f"is {instance.dt_s:g}, but the model {self.kind} has steps of {self.dt_s:g}"
             raise InputError(f"instance {instance.id}", "dt_s", problem)
 
     @property

@@ -128,6 +128,7 @@ def operate(
 
     Raises:
         WorkersLostError: the workers cannot run this package.
+        OSError: a trajectory cannot be kept.
     """
     table = results.table
     todo = [o for o in operations if not _is_there(table, o.row)]
@@ -137,6 +138,8 @@ def operate(
         calls = ((operate_one, (case, o, results.files)) for o in todo)
         with tqdm(total=len(todo), unit="scenario", disable=None, desc="online") as bar:
             for operation, answer in pool.imap(calls, todo):
+                if isinstance(answer, OSError):
+                    raise answer  # the folder refuses, which is nothing of the method's
                 row = answer if isinstance(answer, OnlineRow) else _row(operation, error=reason_of(answer))
                 row = _compared(case, operation, row, results)
                 table.add([row])

@@ -116,6 +116,18 @@ def test_faults_are_in_the_row(threebus, scenarios, tmp_path):
 
 
 @pytest.mark.usefixtures("inline")
+def test_a_full_disk_is_no_fault_of_the_method(threebus, scenarios, tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ded_bench.run.online.operation.keep_trajectory", full)
+    chosen, results = operations(threebus, scenarios[:1]), OnlineResults(tmp_path)
+    with pytest.raises(OSError, match="No space"):
+        operate(threebus, chosen, results, look_back=False)
+    assert not results.table.rows
+
+
+@pytest.mark.usefixtures("inline")
 def test_no_plan_is_no_result(threebus, scenarios, tmp_path, capsys):
     """Exit code 1, the reason in a line, the traceback in a log; one that is not timed is timed first."""
     line = ["online", "--case", str(CASE_FILES["threebus"]), "--regime", "TO", "--out", str(tmp_path)]

@@ -124,7 +124,7 @@ class Koopman:
             _: what else other surrogates take.
 
         Raises:
-            InputError: the model was identified at another time step than the instance's.
+            InputError: the model has another time step than the instance.
         """
         self.check_step(instance)
         n_gen, lengths = len(self.case.generators), np.diff(points)

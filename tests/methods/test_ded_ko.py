@@ -122,7 +122,7 @@ def test_initial_power_just_outside_comes_back_in_one_step(method, case: Case, k
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_does_not_fit_is_refused(method, case: Case, koopman: Koopman) -> None:
-    with pytest.raises(InputError, match=r"identified at 0\.01"):
+    with pytest.raises(InputError, match=r"has steps of 0\.01"):
         prepared(method, case, koopman, "NO")(short(case, 0, dt_s=0.02))
     with pytest.raises(InputError, match="no such model"):
         method.prepare(case, "NO", Settings(model="nowhere"))

@@ -15,6 +15,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return run(argv)
     except KeyboardInterrupt:
-        hint = "run again to continue (trainings: with --resume)"
-        print(f"ded-bench: interrupted; what was finished is saved, {hint}", file=sys.stderr)
+        print("ded-bench: interrupted; run again to continue (trainings: with --resume)", file=sys.stderr)
         return 130

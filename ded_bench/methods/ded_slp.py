@@ -42,7 +42,8 @@ REFINEMENT = 0.01
 FREE_STEPS = 3
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
-#: A program that a bound holds, which its trajectory stays clear of by this part of it, is no last one.
+#: A program is not the last if its trajectory stays clear, by this part of it, of a bound that held it: on
+#: validation draws by 6e-4 at most.
 PESSIMISM = 5e-3
 
 

@@ -27,7 +27,7 @@ from ded_bench.problem.compiled import compiled, inlined
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.quantities import Array32
 
-#: Distance of points, s, about. Swings of shipped islands are slower than 1.5 Hz.
+#: Distance of rows for swings, s, about: those of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
 #: Part of what a knot does to swings that iterations leave out, once it is long ago.
 FORGOTTEN = 0.02
@@ -79,21 +79,18 @@ class Maps(NamedTuple):
 class IslandGrid:
     """What is the same for all instances of a case, a regime and a horizon."""
 
-    def __init__(self, case: Case, regime: str, horizon_s: float) -> None:
-        """Linearise; InputError where the plant has no coarse steps that fit."""
+    def __init__(self, case: Case, regime: str, horizon_s: float, substeps: int = 1) -> None:
+        """Linearise; InputError where the plant has no coarse steps that fit, so many between rows."""
         self.case, self.plant, bounds = case, plant_of(case), case.bounds(regime)
         self.knots = case.knot_times(horizon_s)
-        self.between = max(round(float(self.knots[1]) / SPACING_S), 1)
+        self.substeps, self.between = substeps, substeps * max(round(float(self.knots[1]) / SPACING_S), 1)
         self.points = np.linspace(0.0, horizon_s, self.between * (len(self.knots) - 1) + 1)
         self.coarse = CoarsePlant(self.plant.system, float(self.points[1]))  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
         self.hat = np.maximum(1.0 - np.abs(part), 0.0)
         self.step = case.ramp * float(self.knots[1])
-        weight = np.full(len(self.points), self.points[1])
-        weight[[0, -1]] /= 2.0
-        self.weight = weight / horizon_s
-        kinds = np.array(bounds.kinds)
-        rows = np.concatenate([np.flatnonzero(kinds == "mean"), np.flatnonzero(kinds == "relative")])
+        self.weight = np.trapezoid(np.eye(len(self.points)), dx=self.points[1]) / horizon_s
+        rows = [i for kind in ("mean", "relative") for i, own in enumerate(bounds.kinds) if own == kind]
         #: The mean frequency and swings in parts of their bounds, by frequencies, (1 + n_relative, n_gen).
         self.outputs = bounds.matrix[rows] / bounds.limit[rows, None]
         #: The bound on the mean at the end, as a part of that before.
@@ -113,7 +110,9 @@ class IslandGrid:
         #: Swings while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
         self.ramping = self.outputs[1:] @ omega[-1]
         omega, _ = self.coarse.response(self.hat[:, 1][:, None, None] * each, agc=False)
-        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[1:]).reshape(n_gen, n, -1)
+        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[self.substeps :: self.substeps]).reshape(
+            n_gen, n, -1
+        )
         size = np.linalg.norm(swings, axis=(0, 2)) ** 2
         memory = int(np.count_nonzero(np.cumsum(size[::-1])[::-1] > FORGOTTEN**2 * size.sum()))
         swings = swings[:, :memory]
@@ -178,7 +177,7 @@ class IslandGrid:
         omega, delivered = self.coarse.follow(asked.begun, self.hat @ schedule)
         outputs = omega @ self.outputs.T
         most = max(float(np.abs(outputs).max()), abs(float(outputs[-1, 0])) / self.last)
-        mean, swings = outputs[self.between :: self.between, 0], outputs[1:, 1:]
+        mean, swings = outputs[self.between :: self.between, 0], outputs[self.substeps :: self.substeps, 1:]
         swings = swings.reshape(len(schedule) - 1, -1)
         return Found(schedule, mean, swings, float(self.weight @ delivered @ asked.cost), most - 1.0)
 

@@ -44,14 +44,15 @@ mending_of = functools.lru_cache(maxsize=8)(functools.partial(IslandIterations, 
 
 
 class IslandPolicy(TrainedPolicy):
-    """Learned settings; `training` has the rounds and iterations with costs, and those of mending."""
+    """Learned settings; `training` has rounds, iterations with costs, those of mending, and substeps."""
 
     method = "ded-admm"
 
     @functools.cached_property
     def grid(self) -> IslandGrid:
         """The island as the policy sees it."""
-        return _grid_of(self.scope.case, self.scope.regime, self.scope.horizon_s)
+        substeps = self.training.get("substeps", 1)
+        return _grid_of(self.scope.case, self.scope.regime, self.scope.horizon_s, substeps)
 
     @functools.cached_property
     def iterate(self) -> IslandIterations:
@@ -107,9 +108,9 @@ class IslandPolicy(TrainedPolicy):
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """See `TrainedPolicy.shapes`."""
-        for name in ("rounds", "iterations", "mending"):
-            count = training.get(name)
-            if not (isinstance(count, int) and 0 < count < 1000):
+        for name, most in (("rounds", 999), ("iterations", 999), ("mending", 999), ("substeps", 8)):
+            count = training.get(name, 1 if name == "substeps" else None)
+            if not (isinstance(count, int) and 0 < count <= most):
                 raise ValueError(f"number of {name} is missing or mistyped")
         return {"settings": (len(SETTINGS),)}
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyomo.environ as pyo
 from numpy.typing import NDArray
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import is_reachable, knot_points
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.radau_detailed import DetailedProgram, mesh
@@ -55,6 +56,8 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     length_s = read_options(Options, settings.options).element_s
     if case.plant_name == "detailed":
         return functools.partial(_on_detailed, case, regime, length_s or DETAILED_S, settings.time_limit_s)
+    if case.plant_name != "lossless":
+        raise InputError(f"case {case.id}", "schema", f"no equations of plant {case.plant_name} are known")
     length_s = length_s or default_element(case)
 
     def solve(instance: Instance) -> Solution:

@@ -24,7 +24,6 @@ from ded_bench.methods.options import options_text, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
 from ded_bench.methods.training_record import Trainer
 from ded_bench.problem.case import Case
-from ded_bench.problem.lossless_case import LosslessCase, lossless
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,8 @@ class Method:
 
     def check(self, case: Case, settings: Settings) -> None:
         """Raise InputError if it does not plan on a case, or not with these options."""
-        if self.lossless:
-            lossless(case)
+        if self.lossless and case.plant_name != "lossless":
+            raise InputError(f"case {case.id}", "schema", "has no lossless network, which is needed here")
         if check := getattr(self._answering, "check", None):
             check(case, settings)
 
@@ -159,7 +158,7 @@ def registered() -> dict[str, Method]:
 
 def trainable(case: Case | None = None) -> list[str]:
     """Names of the methods that are trained, and plan on a case if one is given; imports none of them."""
-    fits = case is None or isinstance(case, LosslessCase)
+    fits = case is None or case.plant_name == "lossless"
     return [method.name for method in METHODS.values() if method.trainer and (fits or not method.lossless)]
 
 

@@ -126,7 +126,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
         *folded("What is missing or mixed", *[bullets(notes)] * bool(notes)),
         *folded("How to read the tables", bullets(EXPLANATION)),
         "## Schedules and frequencies",
-        *pictures["schedules"],
+        *(p for topic, drawn in pictures.items() if topic not in ("tradeoff", "online") for p in drawn),
     ]
 
 
@@ -134,7 +134,8 @@ def idealisation(case: Case) -> str:
     """What a case's own plant is, in words."""
     if case.plant_name == "lossless":
         return "a lossless network with classical machines and an infinite slack"
-    return f"full machine models, {'an island' if case.slack is None else 'with an infinite slack'}"
+    what = "full machine models" if case.plant_name == "detailed" else f"the plant {case.plant_name}"
+    return f"{what}, {'an island' if case.slack is None else 'with an infinite slack'}"
 
 
 def _in_operation(sources: Sources) -> Iterator[PageTable]:

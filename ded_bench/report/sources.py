@@ -136,7 +136,7 @@ def read_sources(case: Case, folder: Path) -> Sources:
     def is_of_today(one: Row | RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
         return one.method_version in (0, newest_of.get(one.method, one.method_version))
 
-    elsewhere = [r for r in VALIDATED.existing(paths.validated) if r.plant != case.plant_name]
+    elsewhere = [r for r in VALIDATED.existing(paths.validated) if r.plant == "detailed" != case.plant_name]
     judgements: dict[str, dict[Key, bool | None]] = {
         "validated": {r.key[0]: r.feasible for r in filter(is_of_today, elsewhere)},
         "confirmed": {r.key: r.confirmed for r in filter(is_of_today, REFEREE.existing(paths.referee))},

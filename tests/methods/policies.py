@@ -87,8 +87,13 @@ def torch_iterations(grid: ModalGrid, size: float = 0.3) -> TorchIterations:
     return network
 
 
+#: Methods whose policies `random_policy` makes.
+RANDOM = ("ded-dpc", "ded-admm", "ded-dpc-paper")
+
+
 def random_policy(method: str, case: Case, size: float = 0.3, horizon: float = HORIZON) -> TrainedPolicy:
     """A policy of the last regime."""
+    assert method in RANDOM
     scope = Scope(case, list(case.regimes)[-1], horizon)
     if method == "ded-dpc":
         staged = staged_network(case, size, horizon)

@@ -33,8 +33,8 @@ from ded_bench.solvers.ipopt import CasadiIpopt
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import find_surrogate
 
-#: `ded-admm` needs a policy, and says so (`test_island_policy`).
-PLANNING = ("ed", "ded-slp", "ded-rti", "ded-ko-knots", "ded-radau")
+#: What needs a lossless grid, a model that islands lack, or a policy.
+REFUSING = [*(name for name, method in METHODS.items() if method.lossless), "ded-ko", "ded-admm"]
 HORIZON = 8.0
 
 
@@ -211,7 +211,7 @@ def test_programs_along_trajectories_nearly_keep_bounds(
     assert found.freq_violation_hz < share * island.regimes["TO"].relative_hz
 
 
-@pytest.mark.parametrize("method", sorted(set(METHODS) - set(PLANNING)))
+@pytest.mark.parametrize("method", REFUSING)
 def test_others_refuse_with_one_line(island: Case, instance: Instance, method: str) -> None:
     for model in (None, "linear"):
         with pytest.raises(InputError) as refusal:

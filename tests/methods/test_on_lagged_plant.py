@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.ed import slow_dispatch
 from ded_bench.methods.knot_program import KnotProgram
-from ded_bench.methods.registry import get_method
+from ded_bench.methods.registry import METHODS, get_method
 from ded_bench.methods.slp import Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import plant_of, simulate
@@ -35,6 +36,12 @@ def test_the_case_names_its_plant(slow: Case, ninebus: Case) -> None:
     assert plant.name == "lagged"
     assert plant_of(slow, "lossless").name == plant_of(ninebus).name == "lossless"
     assert plant.fingerprint != plant_of(slow, "lossless").fingerprint
+
+
+@pytest.mark.parametrize("name", [*(n for n, method in METHODS.items() if method.lossless), "ded-radau"])
+def test_what_has_its_own_equations_of_the_lossless_plant_refuses(slow: Case, name: str) -> None:
+    with pytest.raises(InputError, match=r"has no lossless network|no equations of plant lagged"):
+        get_method(name).prepare(slow, "TO", Settings())
 
 
 def test_delivered_powers_lag_behind_a_ramp(slow: Case, quiet_instance) -> None:

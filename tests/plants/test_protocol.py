@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import pickle
+import pkgutil
 
 import numpy as np
 import pytest
@@ -100,6 +101,14 @@ def test_what_is_observed_leads_to_the_same_state(plant, case, alter):
     part = simulate(case, rest, Schedule(rest.grid, whole.p_set[k:]), plant)
     np.testing.assert_allclose(part.omega, whole.omega[k:], rtol=0, atol=2e-9)
     np.testing.assert_allclose(part.p_slack, whole.p_slack[k:], rtol=0, atol=2e-9)
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_a_registered_plant_has_the_whole_protocol(kind):
+    """Also what planning and drawing ask of it, which the toys of these tests need not have."""
+    asked = {name for name in vars(Plant) if not name.startswith("_")}
+    own = pkgutil.resolve_name(PLANTS[kind])
+    assert asked <= set(dir(own)) | {field.name for field in dataclasses.fields(own)}
 
 
 class Least:

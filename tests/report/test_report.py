@@ -170,7 +170,7 @@ def test_the_page_needs_nothing_else(report, finished: Path) -> None:
     assert {str(attributes["href"]) for attributes in page.every("a")} <= {f"#{name}" for name in anchors}
     pictures = [str(attributes["src"]) for attributes in page.every("img")]
     in_markdown = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", (finished / "report.md").read_text())
-    assert len(pictures) == len(in_markdown) == 4
+    assert len(pictures) == len(in_markdown) >= 4
     for source, path in zip(pictures, in_markdown, strict=True):
         head, data = source.split(",", 1)
         assert head == "data:image/png;base64"

@@ -23,19 +23,12 @@ from ded_bench.report.page import Picture
 from ded_bench.report.sources import Sources
 
 BLACK, GREY = "#000000", "#7f7f7f"
-#: Colours that the colour-blind can distinguish (Okabe and Ito's first).
+#: Colours that the colour-blind can distinguish (Okabe and Ito's first); the last is for methods of others.
 PALETTE = (
     *("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"),
-    *("#882255", "#332288", "#661100", "#999933", "#7f7f7f"),
+    *("#882255", "#332288", "#661100", "#44AA99", "#999933"),
 )
-DASHES: tuple[tuple[float | None, ...], ...] = (
-    (None, None),
-    (5, 2),
-    (1.5, 1.5),
-    (6, 2, 1.5, 2),
-    (3, 1.5),
-    (8, 3),
-)
+DASHES: tuple[Any, ...] = ((None, None), (5, 2), (1.5, 1.5), (6, 2, 1.5, 2), (3, 1.5), (8, 3))
 MARKERS = "osD^vP*Xph<>"
 #: Width of a figure, inches, and its resolution.
 WIDTH, DPI = 7.2, 130
@@ -97,17 +90,17 @@ def look(method: str, place: int = 0) -> dict[str, Any]:
 
 def colour(method: str) -> str:
     """A method's colour, the same in every figure and for all its lines."""
-    return (BLACK, *PALETTE)[_place(method) % (len(PALETTE) + 1)]
+    return (BLACK, *PALETTE)[_place(method)]
 
 
 def marker(method: str) -> str:
     """A method's marker in scatter plots, the same for all its lines."""
-    return MARKERS[_place(method) % len(MARKERS)]
+    return MARKERS[_place(method)]
 
 
 def _place(method: str) -> int:
     known = list(METHODS)
-    return known.index(method) if method in known else len(known)
+    return known.index(method) % len(PALETTE) if method in known else -1
 
 
 def legend_below(figure: Figure) -> None:

@@ -13,12 +13,13 @@ import numpy as np
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import Plant, simulate
-from ded_bench.plants.score import STRICT_HZ, Score, judge, mean_hz
+from ded_bench.plants.score import STRICT_HZ, judge, mean_hz
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario, forecast
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.results.online_results import Judgement
+from ded_bench.results.rows import OfIslands
 from ded_bench.run.online.loop import LoopOptions, Planned, run_loop
 from ded_bench.solvers.status import Status
 
@@ -31,7 +32,7 @@ EPSILON_HZ, MINUTE_S = 0.018, 60.0
 
 
 #: What islands have in addition, as the scorer names it.
-OF_ISLANDS = tuple(f.name for f in fields(Score) if f.default is None)
+OF_ISLANDS = tuple(f.name for f in fields(OfIslands))
 
 
 def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regime: str) -> Judgement:

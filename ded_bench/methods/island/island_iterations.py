@@ -80,7 +80,7 @@ class IslandGrid:
     """What is the same for all instances of a case, a regime and a horizon."""
 
     def __init__(self, case: Case, regime: str, horizon_s: float, substeps: int = 1) -> None:
-        """Linearise; InputError where the plant has no coarse steps that fit, so many between rows."""
+        """Linearise; `substeps` are those of simulations between two rows. InputError: the plant has none."""
         self.case, self.plant, bounds = case, plant_of(case), case.bounds(regime)
         self.knots = case.knot_times(horizon_s)
         self.substeps, self.between = substeps, substeps * max(round(float(self.knots[1]) / SPACING_S), 1)

@@ -99,25 +99,13 @@ def _operations(
     from ded_bench.run.online.loop import LIMIT_S, PERIOD_S, LoopOptions
     from ded_bench.run.online.operation import make_operations
 
-    return [
-        operation
-        for forecast, latency, method in itertools.product(a.forecast, a.latency, methods)
-        for operation in make_operations(
-            case,
-            scenarios,
-            method,
-            a.regime or tuple(case.regimes),
-            LoopOptions(
-                a.period or get_method(method[0]).interval_s(method[1]) or PERIOD_S,
-                forecast=forecast,
-                predict=a.state == "predicted",
-                warm=not a.cold,
-            ),
-            latency,
-            a.time_limit or LIMIT_S,
-            a.plant,
-        )
-    ]
+    made: list[Operation] = []
+    for forecast, latency, method in itertools.product(a.forecast, a.latency, methods):
+        period_s = a.period or get_method(method[0]).interval_s(method[1]) or PERIOD_S
+        options = LoopOptions(period_s, forecast=forecast, predict=a.state == "predicted", warm=not a.cold)
+        asked = case, scenarios, method, a.regime or tuple(case.regimes), options, latency
+        made += make_operations(*asked, a.time_limit or LIMIT_S, a.plant)
+    return made
 
 
 def _timed(a: argparse.Namespace, case: Case, methods: Sequence[tuple[str, Settings]]) -> bool:

@@ -1,8 +1,4 @@
-"""Full DED: the swing DAE discretised by Pyomo.DAE (backward Euler), solved by IPOPT.
-
-With the option `accelerated` a short sequence of linear programs (see `euler_program`) solves the same
-problem first; where it does not get through, IPOPT decides in what is left of the time.
-"""
+"""Full DED: the swing DAE discretised by Pyomo.DAE (backward Euler), solved by IPOPT."""
 
 from __future__ import annotations
 

@@ -3,9 +3,6 @@
 Knots are rounded to the grid, as those of `ded-slp`. On `trajectory` an instance is simulated once, under
 the static dispatch of every second, followed slowly, and linearised once; unlike `ded-slp` nothing confirms
 the answer.
-
-In operation a frequency limit may be out of reach: a load has begun to ramp that nobody announced. Then
-every interval between knots has a frequency excess of its own, and the sum of all is the least one.
 """
 
 from __future__ import annotations

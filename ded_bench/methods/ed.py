@@ -7,9 +7,6 @@ What operators do without DED. Frequency limits play no role in it.
 * On an island base points go from one dispatch to the next, which balances forecast loads and losses at the
   interval's end. With `lead` they are sent through the inverse of the governors, so that turbines deliver
   them, as far as ramps and limits of set-points let them.
-
-Methods that linearise do so first along schedules of here: static dispatch, a plan in force, what the grid
-can carry.
 """
 
 from __future__ import annotations

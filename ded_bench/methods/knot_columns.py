@@ -95,12 +95,7 @@ class KnotColumns:
     """
 
     def __init__(
-        self,
-        case: Case,
-        instance: Instance,
-        model: TimeVarying,
-        condensed: bool,
-        pieces: Indices | None = None,
+        self, case: Case, instance: Instance, model: TimeVarying, condensed: bool, pieces: Indices | None
     ) -> None:
         self._case, self._instance, self._model = case, instance, model
         self._condensed = condensed

@@ -1,8 +1,5 @@
 """The linear program over schedules linear between knots, on a linear model along a trajectory.
 
-`ded-slp` solves it along one trajectory after another, `ded-ko`, `ded-ko-knots` and `ded-rti` once on a
-surrogate.
-
 Variables are input increments u = δP and deviations x at the knots, and s_p >= |Σ P_s| over every piece p of
 a few grid points (see `divide`), so that every row is local to one interval between knots:
 

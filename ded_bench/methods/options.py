@@ -94,9 +94,7 @@ def _value(field: dataclasses.Field[Any], hint: Any, text: str) -> Any:
         return None
     kind = next(k for k in kinds if k is not types.NoneType)
     choices = field.metadata.get("choices", ())
-    lowest, below = (
-        field.metadata.get(name, end) for name, end in (("lowest", -math.inf), ("below", math.inf))
-    )
+    lowest, below = field.metadata.get("lowest", -math.inf), field.metadata.get("below", math.inf)
     try:
         value = {_TRUE: True, _FALSE: False}[text] if kind is bool else kind(text)
         is_number = kind in (int, float)

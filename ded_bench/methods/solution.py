@@ -1,7 +1,4 @@
-"""What a method answers: a frozen Solution, the settings under which it was found, what it was derived from.
-
-A program that would take too much memory is refused by its size, before it is made (`too_large`).
-"""
+"""What a method answers: a frozen Solution; the settings under which it was found, and its artifacts."""
 
 from __future__ import annotations
 

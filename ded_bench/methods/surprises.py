@@ -7,10 +7,6 @@ five are announced, with a start and a rate that err. So a planner that remember
 * an announced ramp is late: its load does not move yet. No plan counts on it before `WAIT_S` from now, else
   generators follow a ramp that is not there;
 * the start of a ramp is uncertain: about when it is announced. Plans leave more room there.
-
-Machines may be so slow that a plan comes before a ramp moves them far: then there is less to leave free.
-
-A plan is made when what is forecast is news, or the last plan is old.
 """
 
 from __future__ import annotations

@@ -56,11 +56,8 @@ def solve_on_surrogate(
     """
     started = built = time.perf_counter()
     deadline = started + (np.inf if time_limit_s is None else time_limit_s)
-    if plan is None:
-        rows = Rows(OMEGA_TOLERANCE, OMEGA_TOLERANCE)
-    else:
-        left = SOFT_TOLERANCE * float(bounds.limit.min())
-        rows = Rows(left, left, soft=True)
+    left = OMEGA_TOLERANCE if plan is None else SOFT_TOLERANCE * float(bounds.limit.min())
+    rows = Rows(left, left, soft=plan is not None)
 
     def follow(p_gen: Array) -> TimeVarying:
         return surrogate.along(instance, p_gen, points, plan is None, plan and plan.state)

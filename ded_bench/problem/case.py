@@ -300,11 +300,8 @@ class Case(Fingerprinted, Extended):
         """Raise InputError unless the case knows every one of the regimes."""
         for regime in regimes:
             if regime not in self.regimes:
-                raise InputError(
-                    f"case {self.id}",
-                    "regime",
-                    f"unknown regime {regime!r} (known: {', '.join(self.regimes)})",
-                )
+                problem = f"unknown regime {regime!r} (known: {', '.join(self.regimes)})"
+                raise InputError(f"case {self.id}", "regime", problem)
 
 
 def _record_of(text: str, path: Path) -> type[Case]:

@@ -151,6 +151,12 @@ class Scenario(Fingerprinted):
         """Times t_k = k dt, shape (steps + 1,), s."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.dt_s
 
+    @functools.cached_property
+    def courses(self) -> dict[str, Array]:
+        """Of each load: see `ScenarioLoad.courses`; an operator's hour asks for them 3,600 times."""
+        most = max(len(load.ramps) for load in self.load.values())
+        return {bus: load.courses(most) for bus, load in self.load.items()}
+
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """True load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
         times = self.grid if t is None else t
@@ -247,9 +253,8 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
         return Forecast(tuple((np.array([now, until]), np.full(2, load.at(np.array(now)))) for load in loads))
     if quality == "perfect":
         return Forecast(tuple(_true(load, now, until) for load in loads))
-    # All loads at once: an operator's hour asks for 3,600 forecasts.
-    most = max(len(load.ramps) for load in loads)
-    start, duration, rate, told_start, told_rate = np.stack([load.courses(most) for load in loads], axis=1)
+    courses = np.stack([scenario.courses[bus] for bus in case.loads], axis=1)
+    start, duration, rate, told_start, told_rate = courses
     wrong = WORSE if quality == "worse" else 1.0
     begun = start <= now
     start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))

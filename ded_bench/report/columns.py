@@ -75,7 +75,6 @@ TABLE_VI = (
     Column("against_paper_ramp", "ramp against the paper"),
 )
 
-
 #: What became of the rows of every line, of `summary.outcome`.
 OUTCOME = (
     *_HEAD,

@@ -48,14 +48,12 @@ def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = (
     Raises:
         InputError: a folder holds no results, or not those of one case that is known.
     """
-    grids = sorted(
-        (read_grid(folder, cases) for folder in folders), key=lambda grid: len(grid.case.generators)
-    )
+    grids = [read_grid(folder, cases) for folder in folders]
+    grids.sort(key=lambda grid: len(grid.case.generators))
     found, said = points(grids), list[str]()
     for grid in grids:  # of default settings, in its tightest regime
-        lines = grid.outcome[
-            (grid.outcome["regime"] == grid.tightest) & (grid.outcome["settings"] == DEFAULT)
-        ]
+        rows = grid.outcome
+        lines = rows[(rows["regime"] == grid.tightest) & (rows["settings"] == DEFAULT)]
         said += [f"{grid.case.id}: {text}" for text in findings(lines, grid.reference.title)]
     made: list[Block] = [
         f"# Dynamics-aware economic dispatch on {len(grids)} grids",

@@ -17,7 +17,6 @@ REFERENCE_RUNS = next(
     REPOSITORY / "results",
 )
 
-
 #: The plant of rows of the closed loop that name none.
 PLANT = "lossless"
 

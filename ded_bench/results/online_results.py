@@ -22,7 +22,6 @@ from ded_bench.results.rows import Made, OfIslands
 #: Trajectories are kept at points this far apart, s.
 KEPT_S = 0.1
 
-
 _Forecast = Annotated[str, Field(pattern=f"^({'|'.join(QUALITIES)})$")]
 
 

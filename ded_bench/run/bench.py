@@ -51,7 +51,6 @@ ROUNDS, ENOUGH_S = (1, 2, 5, 10), 5.0
 #: Changes with the way in which calls are timed: a run that was timed in another way is timed anew.
 PROCEDURE = "all instances in a row"
 
-
 #: Cells of a `TimingRow` that one call fills.
 Told = dict[str, Any]
 

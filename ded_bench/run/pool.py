@@ -255,7 +255,6 @@ def _read(answer: Answer) -> object:
     if not isinstance(answer, bytes):
         return answer
     try:
-        result: object = pickle.loads(answer)  # from our own child, or a worker of our own cluster
+        return pickle.loads(answer)  # from our own child, or a worker of our own cluster
     except Exception as error:  # an exception class may want more than its message
         return RuntimeError(f"the answer cannot be read: {error}")
-    return result

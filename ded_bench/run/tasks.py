@@ -1,7 +1,4 @@
-"""Tasks: one row to be made each, and what worker processes do for it; a failure is an answer, too.
-
-A worker that does not have the results folder gets models and policies with the task, a few hundred kB.
-"""
+"""Tasks: one row to be made each, and what worker processes do for it; a failure is an answer, too."""
 
 from __future__ import annotations
 

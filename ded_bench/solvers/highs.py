@@ -39,23 +39,10 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, start: Basis | None
     rows, low, high = form.all_rows()
     (n_rows, n_columns), least, by_column = rows.shape, 1, 1  # minimise; columns of a sparse matrix
     # Arrays as they are: HighsLp takes them number by number, a quarter of a solve on 39bus-agc.
-    highs.passModel(
-        n_columns,
-        n_rows,
-        rows.nnz,
-        by_column,
-        least,
-        0.0,
-        form.cost,
-        form.lower,
-        form.upper,
-        low,
-        high,
-        rows.indptr,
-        rows.indices,
-        rows.data,
-        np.zeros(n_columns, dtype=np.int32),  # all continuous
-    )
+    sizes, each = (n_columns, n_rows, rows.nnz), (form.cost, form.lower, form.upper, low, high)
+    entries = rows.indptr, rows.indices, rows.data, np.zeros(n_columns, dtype=np.int32)  # all continuous
+    arguments: tuple[Any, ...] = (*sizes, by_column, least, 0.0, *each, *entries)
+    highs.passModel(*arguments)
     if start is not None:
         begun, basic = highspy.HighsBasis(), highspy.HighsBasisStatus.kBasic
         begun.col_status = start.columns.tolist()

@@ -200,7 +200,7 @@ def held_out(case: Case, seed: int = 0, count: int = HELD_OUT) -> Trajectories:
 
 def make_model(case: Case, form: EnergyForm, training: dict[str, int | float] | None = None) -> Koopman:
     """The Koopman model with the parameters of an energy form."""
-    return physical_model(case, "koopman", form.generator(), form.feedthrough, training or {})
+    return physical_model(case, "koopman", form.generator(), form.feedthrough, training or {}, None)
 
 
 def _is_small(case: Case) -> bool:

@@ -282,15 +282,9 @@ class CondensedRollout:
         for g in range(n_gen):  # one generator at a time: the states of all would fill the memory
             response = model.rollout(at_rest, hats[:, :, None], slice(g, g + 1), stride)
             gamma[..., g] = np.moveaxis(response[..., : n_gen + 1], 2, 0)
-        return CondensedRollout(
-            model,
-            stride,
-            knots,
-            points,
-            gamma.reshape(n_gen + 1, len(points), -1),
-            hats.sum(axis=0),
-            hat_functions(grid, points).sum(axis=0) if stride > 1 else np.ones(len(grid)),
-        )
+        by_output = gamma.reshape(n_gen + 1, len(points), -1)
+        sums = hat_functions(grid, points).sum(axis=0) if stride > 1 else np.ones(len(grid))
+        return CondensedRollout(model, stride, knots, points, by_output, hats.sum(axis=0), sums)
 
 
 def free_response(model: Koopman, psi: Array, p_load: Array, stride: int = 1) -> Array:

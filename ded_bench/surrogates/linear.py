@@ -100,12 +100,7 @@ def injection_lift(case: Case) -> Array:
 
 
 def physical_model(
-    case: Case,
-    kind: str,
-    rates: Array,
-    feedthrough: Array,
-    training: dict[str, Any],
-    dt_s: float | None = None,
+    case: Case, kind: str, rates: Array, feedthrough: Array, training: dict[str, Any], dt_s: float | None
 ) -> Koopman:
     """A model dψ/dt = A (ψ - B P) + F dP/dt, exactly discretised, that starts with the true P_s and N = f(θ).
 
@@ -117,7 +112,7 @@ def physical_model(
         rates: A, (2 n_gen, 2 n_gen), 1/s.
         feedthrough: F, (2 n_gen, n_in).
         training: facts of where A and F are from.
-        dt_s: step, s; the case's own by default.
+        dt_s: step, s; None: the case's own.
     """
     dt_s, b = case.sampling.dt_s if dt_s is None else dt_s, steady_state(case)
     k, g = discretised(rates, b, feedthrough, dt_s)

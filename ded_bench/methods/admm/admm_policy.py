@@ -57,9 +57,8 @@ class AdmmPolicy(TrainedPolicy):
 
     @functools.cached_property
     def _compiled(self) -> CompiledIterations:
-        return CompiledIterations(
-            self.grid, self.grid.bound, self.weights["nodes"], self.training["iterations"]
-        )
+        nodes, iterations = self.weights["nodes"], self.training["iterations"]
+        return CompiledIterations(self.grid, self.grid.bound, nodes, iterations)
 
     def further(self, iterations: int, margin: float = MARGIN) -> CompiledIterations:
         """So many iterations to go on with."""

@@ -45,9 +45,8 @@ class CompiledStages:
     def __init__(self, case: Case, response: Response, state: Mapping[str, np.ndarray]) -> None:
         half = 0.5 * (case.p_max - case.p_min)
         stages = [_matrices(state, f"stages.{i}.", half) for i in range(STAGES)]
-        self._weights = StageWeights(
-            *(np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
-        )
+        layers = (np.stack(layer).astype(np.float32) for layer in zip(*stages, strict=True))
+        self._weights = StageWeights(*layers)
         self._limits = case.p_min, case.p_max, case.ramp * (response.knots[1] - response.knots[0])
         self._of_power, self._dilations = response.of_power, np.array(DILATIONS)
 

@@ -40,17 +40,11 @@ class PaperNetwork(nn.Module):
 
     def __init__(self, n_channels: int, p_min: Array, p_max: Array) -> None:
         super().__init__()
-        first, middle, last = WINDOWS
-        self.layers = nn.Sequential(
-            _same_padding(first),
-            nn.Conv1d(n_channels, FILTERS, first),
-            nn.ReLU(),
-            _same_padding(middle),
-            nn.Conv1d(FILTERS, FILTERS, middle),
-            nn.ReLU(),
-            _same_padding(last),
-            nn.Conv1d(FILTERS, len(p_min), last),
-        )
+        sizes, layers = (n_channels, FILTERS, FILTERS, len(p_min)), list[nn.Module]()
+        for i, window in enumerate(WINDOWS):
+            zeros = nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)  # a convolution keeps the length
+            layers += [zeros, nn.Conv1d(sizes[i], sizes[i + 1], window), nn.ReLU()]
+        self.layers = nn.Sequential(*layers[:-1])
         self.mean = nn.Buffer(torch.zeros(n_channels, 1))  # of inputs: raw in the paper's recipe
         self.scale = nn.Buffer(torch.ones(n_channels, 1))
         self.p_min = nn.Buffer(torch.as_tensor(p_min, dtype=torch.float32)[:, None])
@@ -61,11 +55,6 @@ class PaperNetwork(nn.Module):
         out = self.layers((channels - self.mean) / self.scale)
         power = self.p_min + 0.5 * (1.0 + torch.tanh(out)) * (self.p_max - self.p_min)
         return power.transpose(1, 2)
-
-
-def _same_padding(window: int) -> nn.Module:
-    """Zeros on both sides, so that a convolution with this window keeps the length."""
-    return nn.ConstantPad1d(((window - 1) // 2, window // 2), 0.0)
 
 
 class Batch(NamedTuple):

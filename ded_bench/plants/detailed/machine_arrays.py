@@ -19,7 +19,6 @@ DELTA, SPEED, E1Q, E1D, E2D, E2Q, EXCITER, FIELD, FEEDBACK, WASHOUT, LEAD_A, LEA
     N_STATES
 )
 
-
 #: Constants of a machine: network, rotor, windings, exciter, stabiliser, governor.
 MACHINE = np.dtype(
     [

@@ -1,8 +1,4 @@
-"""Curves over time in panels: powers, loads, frequencies of trajectories.
-
-Of one representative instance per regime, with frequencies in the tightest; of one scenario of the closed
-loop under several methods, static dispatch and on islands practice among them.
-"""
+"""Curves over time in panels: powers, loads, frequencies of trajectories."""
 
 from __future__ import annotations
 

@@ -30,10 +30,8 @@ SIDES = (
 
 def draw(sources: Sources) -> Iterator[Picture]:
     """One point per line of the tables, where there is a gap."""
-    points = sources.outcome
-    points = points[points["regime"].isin(list(sources.case.regimes))].dropna(
-        subset=["gap_percent", "seconds"]
-    )
+    points = sources.outcome.dropna(subset=["gap_percent", "seconds"])
+    points = points[points["regime"].isin(list(sources.case.regimes))]
     if not len(points):
         return
     grey = "; grey: the paper's numbers" if sources.paper else ""

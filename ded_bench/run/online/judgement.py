@@ -31,10 +31,6 @@ WINDOW_S = 300.0
 EPSILON_HZ, MINUTE_S = 0.018, 60.0
 
 
-#: What islands have in addition, as the scorer names it.
-OF_ISLANDS = tuple(f.name for f in fields(OfIslands))
-
-
 def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regime: str) -> Judgement:
     """Judge a trajectory over the whole scenario.
 
@@ -53,7 +49,7 @@ def judge_operation(case: Case, scenario: Scenario, trajectory: Trajectory, regi
         ramp_violation=score.ramp_violation,
         bound_violation=score.bound_violation,
         slack_travel_pu=float(np.abs(np.diff(trajectory.p_slack)).sum()),
-        **{name: getattr(score, name) for name in OF_ISLANDS},
+        **{f.name: getattr(score, f.name) for f in fields(OfIslands)},
         cps1=cps1(trajectory.t, mean_hz(trajectory)) if case.slack is None else None,
     )
 

@@ -110,7 +110,6 @@ def build_ded(case: Case, steps: int, dt: float) -> pyo.ConcreteModel:
     pyo.TransformationFactory("dae.finite_difference").apply_to(m, nfe=steps, wrt=m.t, scheme="BACKWARD")
     theta_rate, omega_rate = eliminated(m, m.dtheta), eliminated(m, m.domega)
 
-    # Constraints.
     injection = injections(m, case, network)
 
     @m.Constraint(m.gen, m.t)

@@ -130,7 +130,6 @@ def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:
     add_powers(m, case, m.point)
     m.psi = pyo.Var(m.observable, m.point)
 
-    # Constraints.
     inputs = [(m.p_gen, g) for g in case.generators] + [(m.p_load, bus) for bus in case.loads]
     before = (np.eye(n_psi) - koopman.k) @ koopman.b - koopman.g
 

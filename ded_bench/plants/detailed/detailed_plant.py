@@ -211,11 +211,10 @@ class DetailedPlant:
         t2 = np.maximum(data.reheat[machines] * t3, LEAST_LEAD_S)
         change = np.diff(p_gen, axis=0, append=p_gen[-1:])
         gate = p_gen + t1 * change / dt_s
-        kept, lagging = np.exp(-dt_s / t2), np.empty_like(gate)
+        kept, lagging, mean = np.exp(-dt_s / t2), np.empty_like(gate), gate + change / 2
         lagging[0] = p_gen[0]
         for k in range(len(gate) - 1):
-            mean = gate[k] + change[k] / 2
-            lagging[k + 1] = mean + kept * (lagging[k] - mean)
+            lagging[k + 1] = mean[k] + kept * (lagging[k] - mean[k])
         return np.asarray(gate * (t3 / t2) + lagging * (1.0 - t3 / t2))
 
     def check_followed(self, instance: Instance) -> None:

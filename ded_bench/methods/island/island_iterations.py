@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ded_bench.methods.island.block_factors import Factors, factored, solve
 from ded_bench.methods.knots import knot_points, track, transfer_room
 from ded_bench.plants.detailed.coarse import CoarsePlant, CoarseStart
 from ded_bench.plants.detailed.power_system import DetailedState
@@ -30,7 +31,7 @@ from ded_bench.problem.quantities import Array32
 #: Distance of rows for swings, s, about: those of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
 #: Part of what a knot does to swings that iterations leave out, once it is long ago.
-FORGOTTEN = 0.02
+FORGOTTEN = 0.035
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of set-points, pu: 1.5 kW, and half the size in archives.
@@ -64,7 +65,6 @@ class Found:
     schedule: Array  # (n_knots, n_gen), pu
     mean: Array  # mean frequency at the knots after the first, in parts of its bound, (n_intervals,)
     swings: Array  # in parts of their bound, at the points of an interval, (n_intervals, n_swings)
-    cost: float
     excess: float  # over the bounds, as a part of them; negative within
 
 
@@ -73,7 +73,7 @@ class Maps(NamedTuple):
 
     mean: Array32  # mean frequency at the knots, (n_intervals, n_columns)
     swing: Array32  # swings in an interval by the knots of the last n_memory, (n_memory n_gen, n_swings)
-    back: Array32  # the same, transposed: (n_memory n_swings, n_gen)
+    back: Array32  # the same, transposed, by the knots of the next n_memory: (n_swings, n_memory n_gen)
 
 
 class IslandGrid:
@@ -85,7 +85,7 @@ class IslandGrid:
         self.knots = case.knot_times(horizon_s)
         self.substeps, self.between = substeps, substeps * max(round(float(self.knots[1]) / SPACING_S), 1)
         self.points = np.linspace(0.0, horizon_s, self.between * (len(self.knots) - 1) + 1)
-        self.coarse = CoarsePlant(self.plant.system, float(self.points[1]))  # type: ignore[attr-defined]
+        self.coarse = CoarsePlant(self.plant.system, float(self.points[1]), single=True)  # type: ignore[attr-defined]
         part = self.points[:, None] / self.knots[1] - np.arange(len(self.knots))
         self.hat = np.maximum(1.0 - np.abs(part), 0.0)
         self.step = case.ramp * float(self.knots[1])
@@ -117,7 +117,7 @@ class IslandGrid:
         memory = int(np.count_nonzero(np.cumsum(size[::-1])[::-1] > FORGOTTEN**2 * size.sum()))
         swings = swings[:, :memory]
         recent = swings[:, ::-1].swapaxes(0, 1).reshape(memory * n_gen, -1)
-        back = swings.reshape(n_gen, -1).T
+        back = swings.T.reshape(-1, memory * n_gen)
         return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in (mean, recent, back)))
 
     def ask(self, instance: Instance, state: DetailedState | None = None) -> IslandProblem:
@@ -172,14 +172,24 @@ class IslandGrid:
         track(kept[None], self.case.p_min, self.case.p_max, self.step)
         return kept
 
-    def follow(self, asked: IslandProblem, schedule: Array) -> Found:
+    def follow(self, asked: IslandProblem, schedule: Array, linear: bool = False) -> Found:
         """Simulate in coarse steps; SimulationError where the network has no voltages any more."""
-        omega, delivered = self.coarse.follow(asked.begun, self.hat @ schedule)
+        omega, _ = self.coarse.follow(asked.begun, self.hat @ schedule, linear)
         outputs = omega @ self.outputs.T
-        most = max(float(np.abs(outputs).max()), abs(float(outputs[-1, 0])) / self.last)
         mean, swings = outputs[self.between :: self.between, 0], outputs[self.substeps :: self.substeps, 1:]
-        swings = swings.reshape(len(schedule) - 1, -1)
-        return Found(schedule, mean, swings, float(self.weight @ delivered @ asked.cost), most - 1.0)
+        most = float(np.abs(outputs).max())
+        return self._found(schedule, mean, swings.reshape(len(schedule) - 1, -1), most)
+
+    def moved(self, near: Found, schedule: Array) -> Found:
+        """What a schedule leads to by the linear answer to its distance from another one."""
+        change = (schedule - near.schedule)[1:].astype(np.float32)
+        mean = near.mean + self.maps.mean @ change.ravel()
+        swings = near.swings + swings_by(self.maps, change)
+        most = max(float(np.abs(mean).max()), float(np.abs(swings).max()))
+        return self._found(schedule, mean, swings, most)
+
+    def _found(self, schedule: Array, mean: Array, swings: Array, most: float) -> Found:
+        return Found(schedule, mean, swings, max(most, abs(float(mean[-1])) / self.last) - 1.0)
 
 
 class IslandIterations:
@@ -188,23 +198,11 @@ class IslandIterations:
     def __init__(self, grid: IslandGrid, settings: Sequence[float] | Array) -> None:
         self.grid = grid
         mean, swing, limit, ramp, self.price = np.exp(np.asarray(settings, float)).tolist()
-        n_gen, n = len(grid.case.generators), grid.maps.mean.shape[1]
-        n_swings, identity = grid.maps.swing.shape[1], np.eye(n)
         self.penalties = np.array([mean, swing, limit, ramp, limit], dtype=np.float32)
-        rows = np.zeros((n // n_gen, n_swings, n))
-        for column, one in zip(np.moveaxis(rows, 2, 0), identity, strict=True):
-            column[:] = swings_by(grid.maps, one.reshape(-1, n_gen).astype(np.float32))
-        blocks = [
-            (mean, grid.maps.mean.astype(np.float64)),
-            (swing, rows.reshape(-1, n)),
-            (limit + REGULARISATION, identity),
-            (ramp, (identity - np.eye(n, k=-n_gen)) / np.tile(grid.step, n // n_gen)[:, None]),
-            (limit, np.kron(np.eye(n // n_gen), grid.case.transfer_rows[0])),
-        ]
-        inverse = np.linalg.inv(sum(penalty * rows.T @ rows for penalty, rows in blocks))
-        self.inverse = inverse.astype(np.float32)
+        near, phi = squares(grid, swing, limit, ramp), grid.maps.mean.astype(np.float64)
+        self.factors, answer = factored(near, phi, 1.0 / mean, len(grid.maps.swing), grid.delivered.T)
         #: Set-points by the costs of machines.
-        self.pull = (inverse @ grid.delivered.T).astype(np.float32)
+        self.pull = answer.astype(np.float32)
 
     def __call__(
         self, asked: IslandProblem, near: Found, iterations: int, margins: Array, dual: Array32 | None = None
@@ -244,17 +242,36 @@ class IslandIterations:
         offset32, low32, high32 = flat
         dual = np.zeros_like(offset32) if dual is None else dual.copy()
         change = np.zeros((n, n_gen), dtype=np.float32)
-        given = Iterated(self.inverse, pull, self.penalties, by_transfer, step, offset32, low32, high32)
+        given = Iterated(self.factors, pull, self.penalties, by_transfer, step, offset32, low32, high32)
         iterate(grid.maps, given, change, dual, iterations)
         found = near.schedule.copy()
         found[1:] = np.round((found[1:] + change) / RESOLUTION) * RESOLUTION
         return grid.within(found, asked.p_initial, asked.room), dual
 
 
+def squares(grid: IslandGrid, swing: float, limit: float, ramp: float) -> Array:
+    """Of all rows but the mean's, times their penalties, summed, (n_columns, n_columns)."""
+    n_gen, n = len(grid.case.generators), len(grid.knots) - 1
+    by_lag = grid.maps.swing.astype(np.float64).reshape(-1, n_gen, grid.maps.swing.shape[1])[::-1]
+    identity, by_transfer = np.eye(n), grid.case.transfer_rows[0]
+    own = (limit + REGULARISATION) * np.eye(n_gen) + limit * by_transfer.T @ by_transfer
+    change = identity - np.eye(n, k=-1)
+    found: Array = np.kron(identity, own) + np.kron(change.T @ change, np.diag(ramp / grid.step**2))
+    blocks = found.reshape(n, n_gen, n, n_gen)
+    for k in range(n):
+        for lag in range(min(len(by_lag), n - k)):
+            count = min(len(by_lag) - lag, n - k - lag)
+            block = swing * np.tensordot(by_lag[:count], by_lag[lag : lag + count], ((0, 2), (0, 2)))
+            blocks[k + lag, :, k] += block
+            if lag:
+                blocks[k, :, k + lag] += block.T
+    return found
+
+
 class Iterated(NamedTuple):
     """What iterations are given. Rows: mean at knots, swings, set-points, ramps in parts, transfers."""
 
-    inverse: Array32  # (n_columns, n_columns)
+    factors: Factors
     pull: Array32  # of costs, (n_columns,), pu
     penalties: Array32  # of the five kinds of rows
     by_transfer: Array32  # (n_transfers, n_gen)
@@ -307,19 +324,17 @@ def _pulled(maps: Maps, given: Iterated, rows: Array32, shape: tuple[int, int]) 
     (n, n_gen), n_swings = shape, maps.swing.shape[1]
     at, memory = n + n * n_swings, len(maps.swing) // n_gen
     transfers, ramps = at + 2 * n * n_gen, at + n * n_gen
-    ahead = np.zeros((n, memory * n_swings), dtype=np.float32)
-    for k in range(n):
-        for lag in range(min(memory, n - k)):
-            for i in range(n_swings):
-                ahead[k, lag * n_swings + i] = rows[n + (k + lag) * n_swings + i]
     asked = np.dot(rows[transfers:].reshape(n, len(given.by_transfer)), given.by_transfer)
-    swings = np.dot(ahead, maps.back)
+    swings = np.dot(rows[n:at].reshape(n, n_swings), maps.back)
     found: Array32 = np.dot(rows[:n], maps.mean)
     for k in range(n):
         for g in range(n_gen):
             row = k * n_gen + g
             ramp = rows[ramps + row] - rows[ramps + row + n_gen] if k + 1 < n else rows[ramps + row]
-            pull = given.penalties[0] * found[row] + given.penalties[1] * swings[k, g]
+            swing = np.float32(0.0)
+            for lag in range(min(memory, n - k)):
+                swing += swings[k + lag, lag * n_gen + g]
+            pull = given.penalties[0] * found[row] + given.penalties[1] * swing
             pull += given.penalties[2] * rows[at + row]
             pull += given.penalties[3] * ramp / given.step[g]
             found[row] = pull + given.penalties[4] * asked[k, g]
@@ -338,7 +353,7 @@ def iterate(maps: Maps, given: Iterated, change: Array32, dual: Array32, count: 
     for _ in range(count):
         for i in range(len(dual)):
             rows[i] = kept[i] - dual[i] - given.offset[i]
-        found = np.dot(given.inverse, _pulled(maps, given, rows, change.shape))
+        found = solve(given.factors, _pulled(maps, given, rows, change.shape))
         for k in range(n):
             for g in range(n_gen):
                 change[k, g] = found[k * n_gen + g] - given.pull[k * n_gen + g]

@@ -2,7 +2,8 @@
 
 From the loads' changes shared by all machines, sent through the governors' inverse filter, iterations with
 costs lead to a first answer; where its simulation comes too near a bound, iterations without costs lead to
-set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
+set-points near it that keep away. What these change little is not simulated again. Limits, ramps and P_0 hold
+for any settings.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from ded_bench.problem.schedule import Schedule
 
 #: Penalties of mending, and no price.
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
-#: What is as near a bound as this part of it is mended.
-NEAR = 0.05
+#: What is as near a bound as this part of it is mended; what exceeds it by more is simulated when it is
+#: mended: up to there the linear answer errs by less than margins leave.
+NEAR, FAR = 0.05, 0.5
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
 MENDED, WIDENED = 5, 2.0
 #: The grid of a case, regime and horizon, made once.
@@ -71,32 +73,36 @@ class IslandPolicy(TrainedPolicy):
             further: iterations with costs along the answer, after which it is mended again.
             state: at t = 0; None: what is not measured is stationary.
         """
-        asked = self.grid.ask(instance, state)
-        try:
-            first = self.grid.follow(asked, asked.start)
-        except SimulationError:  # static dispatch is what every instance can be served by
+        asked, count = self.grid.ask(instance, state), self.training["iterations"]
+        found = self._improved(asked, self.grid.follow(asked, asked.start, linear=True), count)
+        if found is None:  # static dispatch is what every instance can be served by
             case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
             served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
-            try:
-                first = self.grid.follow(asked, served)
-            except SimulationError:
+            found = self._improved(asked, self.grid.follow(asked, served, linear=True), count)
+            if found is None:
                 return served
-        for count in filter(None, (self.training["iterations"], further)):
-            first = self._improved(asked, first, count)
-        return first.schedule
+        if further:
+            found = self._improved(asked, found, further) or found
+        return found.schedule
 
-    def _improved(self, asked: IslandProblem, first: Found, count: int) -> Found:
-        """The first far enough from the bounds, else that with the least excess."""
+    def _improved(self, asked: IslandProblem, first: Found, count: int) -> Found | None:
+        """The first far enough from bounds, else that with the least excess; None: none can be carried."""
         dual, seen, margins = None, [first], np.exp(self.weights["settings"][len(MENDING) :])
         for _ in range(self.training["rounds"]):
             answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
             seen.append(self._followed(asked, seen[-1], answer))
-        for more in np.linspace(1.0, WIDENED, MENDED):
+        if seen[-1] is first:
+            return None
+        for number, more in enumerate(np.linspace(1.0, WIDENED, MENDED), 1):
             if seen[-1].excess <= -NEAR:
                 return seen[-1]
-            answer, _ = mending_of(self.grid)(asked, seen[-1], self.training["mending"], more * margins)
+            count = number * self.training["mending"]  # few serve most instances
+            answer, _ = mending_of(self.grid)(asked, seen[-1], count, more * margins)
+            mended = self.grid.moved(seen[-1], answer)
+            if seen[-1].excess <= FAR and mended.excess <= -NEAR:
+                return mended
             seen.append(self._followed(asked, seen[-1], answer))
-        return min(seen, key=lambda found: found.excess)
+        return min(seen[1:], key=lambda found: found.excess)
 
     def _followed(self, asked: IslandProblem, last: Found, answer: Array) -> Found:
         """An answer, or the one before where the plant cannot carry it."""

@@ -26,11 +26,11 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
 #: Iterations of each round with costs, and of mending.
-ITERATIONS, MENDING = 28, 16
+ITERATIONS, MENDING = 12, 10
 #: What a second round, or twice as many steps of simulations, must gain, as a part of cost: each costs time.
 WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
-CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 8, 5, 8
+CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 16, 5, 8
 #: Where the search starts, and its first standard deviation.
 FIRST = np.log([0.2, 0.25, 2.5, 0.2, 20.0, 0.3, 0.1])
 SIGMA = 0.4
@@ -99,7 +99,8 @@ def _one(policy: IslandPolicy, grid: IslandGrid, instance: Instance) -> float:
     try:
         answer = Schedule(policy.knots, policy.powers(instance))
         found = score(policy.scope.case, instance, answer, policy.scope.regime)
-        start = grid.follow(asked, asked.start).cost * (instance.steps + 1)
+        _, delivered = grid.coarse.follow(asked.begun, grid.hat @ asked.start)
     except SimulationError:
         return HOPELESS
+    start = float(grid.weight @ delivered @ asked.cost) * (instance.steps + 1)
     return found.objective / start - 1.0 + (0.0 if found.feasible else INFEASIBLE)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -35,13 +35,13 @@ from ded_bench.plants.detailed.power_system import DetailedState, PowerSystem, i
 from ded_bench.plants.detailed.start import start
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.compiled import compiled, copy_row
-from ded_bench.problem.quantities import Array, Indices
+from ded_bench.problem.quantities import Array, Array32, Indices
 
 if TYPE_CHECKING:
     from ded_bench.problem.instance import Instance
 
 #: Voltages are solved for less sharply than where schedules are judged, pu, in at most so many steps.
-CHANGE, STEPS = 1e-5, 30
+CHANGE, STEPS = 1e-4, 30
 #: Step of differences of loads, pu.
 DIFFERENCE = 1e-6
 #: Loads are linear between so many points of a step.
@@ -56,8 +56,8 @@ class CoarseMaps(NamedTuple):
     moving: Indices  # places of these states in a flat state array, (n,)
     seen: Indices  # those of them whose rates are not linear, (n_seen,)
     curved: Indices  # of the states that move, those that N depends on, (n_curved,)
-    onward: Array  # exp(A h), and h φ_1 of what is seen, (n, n + n_seen)
-    slopes: Array  # A, (n_seen, n_curved), 1/s
+    onward: Array | Array32  # exp(A h), and h φ_1 of what is seen, (n, n + n_seen)
+    slopes: Array | Array32  # A, (n_seen, n_curved), 1/s
     by_load: Array  # of rates by loads drawn, (n_seen, n_load)
     x: Array  # nominal states, (N_STATES, n_machine)
     v: Array  # nominal voltages, (2 n_port,), pu
@@ -76,14 +76,14 @@ class CoarseStart(NamedTuple):
     v_ref: Array  # exciters' references, (n_machine,), pu
     drawn: Array  # loads at the points, (n_steps + 1, n_load), pu
     by_drawn: Array  # linear answer of rates to them, (n_steps + 1, n_seen)
-    push: Array  # linear answer to loads, and to governors' offsets, over each step, (n_steps, n)
+    push: Array | Array32  # linear answer to loads, and to governors' offsets, over each step, (n_steps, n)
     held: float  # what secondary control holds at t = 0, pu
     first: int  # step at which it acts next
 
 
 @dataclass(frozen=True)
 class CoarsePlant:
-    """An island of one case in steps of `spacing_s`.
+    """An island of one case in steps of `spacing_s`; deviations have double precision, or single.
 
     Raises:
         InputError: secondary control acts between steps.
@@ -91,6 +91,11 @@ class CoarsePlant:
 
     system: PowerSystem
     spacing_s: float
+    single: bool = False
+
+    @property
+    def _number(self) -> type[np.floating[Any]]:
+        return np.float32 if self.single else np.float64
 
     @functools.cached_property
     def _linear(self) -> tuple[Array, Array, Array]:
@@ -153,8 +158,8 @@ class CoarsePlant:
             system.moving,
             seen,
             curved,
-            np.ascontiguousarray(np.hstack([f, first[:, seen]])),
-            np.ascontiguousarray(a[np.ix_(seen, curved)]),
+            np.ascontiguousarray(np.hstack([f, first[:, seen]]), dtype=self._number),
+            np.ascontiguousarray(a[np.ix_(seen, curved)], dtype=self._number),
             np.ascontiguousarray(by_load[seen]),
             *(x, v, drawn, load, p_ref),
             first @ by_reference @ self.system.shares,
@@ -166,7 +171,8 @@ class CoarsePlant:
     def _inputs(self) -> tuple[Array, Array]:
         """h φ_1 and h φ_2 of all governors' references, (n, n_machine)."""
         _, first, second = self._holds(self.spacing_s)
-        return first @ self._linear[1], second @ self._linear[1]
+        by_reference = self._linear[1]
+        return (first @ by_reference).astype(self._number), (second @ by_reference).astype(self._number)
 
     @functools.cached_property
     def _load_answer(self) -> Array:
@@ -178,7 +184,7 @@ class CoarsePlant:
             answer[part] += (after @ (first - second) @ by_load).T
             answer[part + 1] += (after @ second @ by_load).T
             after = after @ f
-        return answer.reshape(-1, len(f))
+        return answer.reshape(-1, len(f)).astype(self._number)
 
     def begin(self, instance: Instance, state: DetailedState | None = None) -> CoarseStart:
         """What an instance says, from its own state at t = 0 or another.
@@ -193,9 +199,10 @@ class CoarsePlant:
             instance.p_load(system.case, np.linspace(0.0, instance.horizon_s, n * PARTS + 1))
         )
         drawn = np.ascontiguousarray(drawn[:, : len(maps.drawn)])
-        windows = np.lib.stride_tricks.sliding_window_view(drawn - maps.drawn, PARTS + 1, axis=0)[::PARTS]
+        change = (drawn - maps.drawn).astype(self._number)
+        windows = np.lib.stride_tricks.sliding_window_view(change, PARTS + 1, axis=0)[::PARTS]
         push = windows.swapaxes(1, 2).reshape(n, -1) @ self._load_answer
-        push += self._inputs[0] @ (state.offset - maps.p_ref)
+        push += self._inputs[0] @ (state.offset - maps.p_ref).astype(self._number)
         first = round(state.next_s / self.spacing_s) if system.case.agc is not None else maps.period
         at_points = drawn[::PARTS].copy()
         by_drawn = (at_points - maps.drawn) @ maps.by_load.T
@@ -214,7 +221,8 @@ class CoarsePlant:
         """
         system, machines = self.system, self.system.scheduled
         first, second = (part[:, machines].T for part in self._inputs)
-        push = begun.push + p_set[:-1] @ first + np.diff(p_set, axis=0) @ second
+        level, change = (part.astype(self._number) for part in (p_set[:-1], np.diff(p_set, axis=0)))
+        push = begun.push + level @ first + change @ second
         states = np.empty((len(p_set), *begun.x.shape))
         network = system.compiled_network if linear else system.compiled_network._replace(change=CHANGE)
         if advance(system.data, network, self.maps, begun, push, linear, states) < len(states):
@@ -256,7 +264,7 @@ def advance(
     network: CompiledNetwork,
     maps: CoarseMaps,
     begun: CoarseStart,
-    push: Array,
+    push: Array | Array32,
     linear: bool,
     states: Array,
 ) -> int:
@@ -270,8 +278,9 @@ def advance(
     flat, changing, nominal = state.ravel(), rates.ravel(), maps.x.ravel()
     source, v = np.empty(len(maps.v)), maps.v.copy()
     last = v.copy()
-    both, bent, held = np.zeros(n + n_seen), np.empty(len(maps.curved)), begun.held
-    before, sloped, after = np.zeros(n_seen), np.empty(n_seen), np.empty(n)
+    both, bent = np.zeros(n + n_seen, maps.onward.dtype), np.empty(len(maps.curved), maps.onward.dtype)
+    sloped, after = np.empty(n_seen, maps.onward.dtype), np.empty(n, maps.onward.dtype)
+    before, held = np.zeros(n_seen), begun.held
     for i in range(n):
         both[i] = flat[maps.moving[i]] - nominal[maps.moving[i]]
         flat[maps.moving[i]] = nominal[maps.moving[i]]

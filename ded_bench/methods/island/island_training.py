@@ -25,9 +25,10 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
 
-#: Iterations of each round with costs, and of mending.
-ITERATIONS, MENDING = 12, 10
-#: What a second round, or twice as many steps of simulations, must gain, as a part of cost: each costs time.
+#: Iterations of each round with costs, few or many, and of mending.
+ITERATIONS, MANY, MENDING = 12, 28, 10
+#: What a second round, many iterations, or twice as many steps of simulations must gain, as a part of cost:
+#: each costs time.
 WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 16, 5, 8
@@ -65,7 +66,7 @@ def train(
     search = cma.CMAEvolutionStrategy(FIRST, SIGMA, own | {"seed": np.nan, "verbose": -9})
     history: list[dict[str, float]] = []
     best, best_loss = FIRST, loss(policy(FIRST), check)
-    for name, count, most in (("substeps", 2, -WORTH), ("rounds", 1, WORTH)):
+    for name, count, most in (("substeps", 2, -WORTH), ("rounds", 1, WORTH), ("iterations", MANY, -WORTH)):
         usual, facts[name] = facts[name], count
         if (other := loss(policy(FIRST), check)) >= best_loss + most:
             other, facts[name] = best_loss, usual

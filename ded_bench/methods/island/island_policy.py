@@ -74,24 +74,26 @@ class IslandPolicy(TrainedPolicy):
             state: at t = 0; None: what is not measured is stationary.
         """
         asked, count = self.grid.ask(instance, state), self.training["iterations"]
-        found = self._improved(asked, self.grid.follow(asked, asked.start, linear=True), count)
+        found = self._improved(asked, self._followed(asked, asked.start, linear=True), count)
         if found is None:  # static dispatch is what every instance can be served by
             case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
             served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
-            found = self._improved(asked, self.grid.follow(asked, served, linear=True), count)
+            found = self._improved(asked, self._followed(asked, served, linear=True), count)
             if found is None:
                 return served
         if further:
             found = self._improved(asked, found, further) or found
         return found.schedule
 
-    def _improved(self, asked: IslandProblem, first: Found, count: int) -> Found | None:
+    def _improved(self, asked: IslandProblem, first: Found | None, count: int) -> Found | None:
         """The first far enough from bounds, else that with the least excess; None: none can be carried."""
+        if first is None:
+            return None
         dual, seen, margins = None, [first], np.exp(self.weights["settings"][len(MENDING) :])
         for _ in range(self.training["rounds"]):
             answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
-            seen.append(self._followed(asked, seen[-1], answer))
-        if seen[-1] is first:
+            seen.append(self._followed(asked, answer) or seen[-1])
+        if seen[1] is first:
             return None
         for number, more in enumerate(np.linspace(1.0, WIDENED, MENDED), 1):
             if seen[-1].excess <= -NEAR:
@@ -101,15 +103,15 @@ class IslandPolicy(TrainedPolicy):
             mended = self.grid.moved(seen[-1], answer)
             if seen[-1].excess <= FAR and mended.excess <= -NEAR:
                 return mended
-            seen.append(self._followed(asked, seen[-1], answer))
+            seen.append(self._followed(asked, answer) or seen[-1])
         return min(seen[1:], key=lambda found: found.excess)
 
-    def _followed(self, asked: IslandProblem, last: Found, answer: Array) -> Found:
-        """An answer, or the one before where the plant cannot carry it."""
+    def _followed(self, asked: IslandProblem, answer: Array, linear: bool = False) -> Found | None:
+        """What an answer leads to; None where the plant cannot carry it."""
         try:
-            return self.grid.follow(asked, answer)
+            return self.grid.follow(asked, answer, linear)
         except SimulationError:
-            return last
+            return None
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

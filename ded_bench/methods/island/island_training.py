@@ -27,8 +27,7 @@ from ded_bench.problem.schedule import Schedule
 
 #: Iterations of each round with costs, few or many, and of mending.
 ITERATIONS, MANY, MENDING = 12, 28, 10
-#: What a second round, many iterations, or twice as many steps of simulations must gain, as a part of cost:
-#: each costs time.
+#: What a second round, many iterations, or steps half as long must gain, as a part of cost: each takes time.
 WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 16, 5, 8

@@ -1,8 +1,4 @@
-"""Columns of a program over schedules linear between knots, its rows, and a simplex basis by them.
-
-See `knot_program` for the program. Rows of outputs in the set-points alone are those of condensed programs;
-every limit of an output has a place, by grid points.
-"""
+"""Columns of a program on knots, its rows, and a simplex basis by them; see `knot_program`."""
 
 from __future__ import annotations
 

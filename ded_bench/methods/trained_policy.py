@@ -1,8 +1,4 @@
-"""A trained policy as a method: its weights, and one answer, timed from the instance to the powers.
-
-A policy's file has weights and a JSON header in safetensors. Who answers reads weights as arrays; torch is
-for training alone.
-"""
+"""A trained policy as a method: its weights, and one answer, timed; torch is for training alone."""
 
 from __future__ import annotations
 

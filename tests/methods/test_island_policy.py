@@ -41,8 +41,8 @@ from tests.methods.test_on_island import followed
 HORIZON = 8.0
 
 
-def policy(case: Case, settings: Any = FIRST, regime: str = "TO") -> IslandPolicy:
-    facts = {"rounds": 2, "iterations": 15, "mending": 6}
+def policy(case: Case, settings: Any = FIRST, regime: str = "TO", quick: bool = True) -> IslandPolicy:
+    facts = {"rounds": 2, "iterations": 15, "mending": 6, "quick": quick}
     return IslandPolicy(Scope(case, regime, HORIZON), {"settings": np.float32(settings)}, facts)
 
 
@@ -168,8 +168,9 @@ def test_one_instance_is_too_few_to_train_on(island: Case, instance: Instance, t
         train(island, "TO", [instance], tmp_path / "p.safetensors", TrainingOptions(epochs=1))
 
 
-def test_further_iterations_are_no_dearer(island: Case, instance: Instance) -> None:
-    made = policy(island)
+@pytest.mark.parametrize("quick", [False, True])
+def test_further_iterations_are_no_dearer(island: Case, instance: Instance, quick: bool) -> None:
+    made = policy(island, quick=quick)
     own, further = (Schedule(made.knots, made.powers(instance, count)) for count in (0, 60))
     cost, more = (score(island, instance, one, "TO") for one in (own, further))
     assert more.feasible

@@ -1,8 +1,4 @@
-"""DED-DPC with the paper's policy (`ded-dpc-paper`): a network that answers with powers at the knots.
-
-It sees ζ = (loads, c, x_0, P_0) of an instance. Answers do without torch, whose overhead would be most of
-their time.
-"""
+"""DED-DPC with the paper's policy (`ded-dpc-paper`): a network that answers with powers at the knots."""
 
 from __future__ import annotations
 

@@ -2,8 +2,9 @@
 
 From the loads' changes shared by all machines, sent through the governors' inverse filter, iterations with
 costs lead to a first answer; where its simulation comes too near a bound, iterations without costs lead to
-set-points near it that keep away. What these change little is not simulated again. Limits, ramps and P_0 hold
-for any settings.
+set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
+
+A quick policy simulates less: its first schedule by the linear model alone, and small repairs not again.
 """
 
 from __future__ import annotations
@@ -34,8 +35,7 @@ from ded_bench.problem.schedule import Schedule
 
 #: Penalties of mending, and no price.
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
-#: What is as near a bound as this part of it is mended; what exceeds it by more is simulated when it is
-#: mended: up to there the linear answer errs by less than margins leave.
+#: What is as near a bound as this part of it is mended; a quick policy simulates again what was farther beyond.
 NEAR, FAR = 0.05, 0.5
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
 MENDED, WIDENED = 5, 2.0
@@ -46,7 +46,7 @@ mending_of = functools.lru_cache(maxsize=8)(functools.partial(IslandIterations, 
 
 
 class IslandPolicy(TrainedPolicy):
-    """Learned settings; `training` has rounds, iterations with costs, those of mending, and substeps."""
+    """Learned settings; `training` has rounds, iterations, those of mending, substeps, and if it is quick."""
 
     method = "ded-admm"
 
@@ -73,12 +73,12 @@ class IslandPolicy(TrainedPolicy):
             further: iterations with costs along the answer, after which it is mended again.
             state: at t = 0; None: what is not measured is stationary.
         """
-        asked, count = self.grid.ask(instance, state), self.training["iterations"]
-        found = self._improved(asked, self._followed(asked, asked.start, linear=True), count)
+        asked, count, quick = self.grid.ask(instance, state), self.training["iterations"], self._is_quick
+        found = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
         if found is None:  # static dispatch is what every instance can be served by
             case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
             served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
-            found = self._improved(asked, self._followed(asked, served, linear=True), count)
+            found = self._improved(asked, self._followed(asked, served, linear=quick), count)
             if found is None:
                 return served
         if further:
@@ -101,10 +101,14 @@ class IslandPolicy(TrainedPolicy):
             count = number * self.training["mending"]  # few serve most instances
             answer, _ = mending_of(self.grid)(asked, seen[-1], count, more * margins)
             mended = self.grid.moved(seen[-1], answer)
-            if seen[-1].excess <= FAR and mended.excess <= -NEAR:
+            if self._is_quick and seen[-1].excess <= FAR and mended.excess <= -NEAR:
                 return mended
             seen.append(self._followed(asked, answer) or seen[-1])
         return min(seen[1:], key=lambda found: found.excess)
+
+    @property
+    def _is_quick(self) -> bool:
+        return bool(self.training.get("quick", False))
 
     def _followed(self, asked: IslandProblem, answer: Array, linear: bool = False) -> Found | None:
         """What an answer leads to; None where the plant cannot carry it."""

@@ -27,7 +27,8 @@ from ded_bench.problem.schedule import Schedule
 
 #: Iterations of each round with costs, few or many, and of mending.
 ITERATIONS, MANY, MENDING = 12, 28, 10
-#: What a second round, many iterations, or steps half as long must gain, as a part of cost: each takes time.
+#: What simulating everything, a second round, many iterations, or steps half as long must gain, as a part of
+#: cost: each takes time.
 WORTH = 3e-4
 #: Candidates of a generation, instances on which they are compared, generations of an epoch, epochs.
 CANDIDATES, BATCH, GENERATIONS, EPOCHS = 8, 16, 5, 8
@@ -52,7 +53,8 @@ def train(
         raise InputError("--resume", "", "policies of islands train in minutes, and start anew")
     if len(instances) < 2:
         raise InputError("--limit", str(len(instances)), "is too few: one instance is held out")
-    facts = options.facts() | {"rounds": 2, "iterations": ITERATIONS, "mending": MENDING, "substeps": 1}
+    facts = options.facts() | {"rounds": 2, "iterations": ITERATIONS, "mending": MENDING}
+    facts |= {"substeps": 1, "quick": False}
     scope = Scope(case, regime, instances[0].horizon_s)
     held = min(HELD_OUT, len(instances) // 2)
     trained, check = instances[: len(instances) - held], instances[len(instances) - held :]
@@ -65,8 +67,14 @@ def train(
     search = cma.CMAEvolutionStrategy(FIRST, SIGMA, own | {"seed": np.nan, "verbose": -9})
     history: list[dict[str, float]] = []
     best, best_loss = FIRST, loss(policy(FIRST), check)
-    for name, count, most in (("substeps", 2, -WORTH), ("rounds", 1, WORTH), ("iterations", MANY, -WORTH)):
-        usual, facts[name] = facts[name], count
+    tried = (
+        ("substeps", 2, -WORTH),
+        ("quick", True, WORTH),
+        ("rounds", 1, WORTH),
+        ("iterations", MANY, -WORTH),
+    )
+    for name, other_fact, most in tried:
+        usual, facts[name] = facts[name], other_fact
         if (other := loss(policy(FIRST), check)) >= best_loss + most:
             other, facts[name] = best_loss, usual
         best_loss = other

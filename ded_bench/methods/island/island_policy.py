@@ -35,7 +35,7 @@ from ded_bench.problem.schedule import Schedule
 
 #: Penalties of mending, and no price.
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
-#: What is as near a bound as this part of it is mended; a quick policy simulates again what was farther beyond.
+#: What is as near a bound as this part of it is mended; quick policies simulate again what was far beyond.
 NEAR, FAR = 0.05, 0.5
 #: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
 MENDED, WIDENED = 5, 2.0

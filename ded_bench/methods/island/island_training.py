@@ -85,8 +85,8 @@ def train(
         if options.seconds is not None and spent >= options.seconds:
             break
     write_history(out, history)
-    of_quick, facts["quick"] = loss(policy(best), telling), False
-    facts["quick"] = loss(policy(best), telling) > of_quick - WORTH
+    of_quick, facts["quick"] = loss(policy(best), instances), False
+    facts["quick"] = loss(policy(best), instances) > of_quick - WORTH
     best_loss = loss(policy(best), check)
     facts |= {"epochs": len(history), "seconds": time.perf_counter() - began, "held_out_loss": best_loss}
     facts |= {"instances": len(trained), "held_out": held, "cma": cma.__version__}

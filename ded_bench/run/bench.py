@@ -218,7 +218,7 @@ def _told(solution: Solution, seconds: float | None = None, peak_memory: float |
         "setup_s": solution.setup_s,
         "solve_s": solution.solve_s,
         "call_s": seconds,
-        "load_average": os.getloadavg()[0],
+        "load_average": round(os.getloadavg()[0], 2),
         "peak_memory_mib": peak_memory,
         "error": "" if solution.schedule is not None else solution.error or solution.status.sentence,
         "solver_version": solution.solver_version,
@@ -264,7 +264,7 @@ def timed(solve: Solver, instance: Instance) -> Told:
 def _peak_memory_mib() -> float:
     """The most memory that this process has held, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, KiB elsewhere
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)  # bytes there, KiB elsewhere
 
 
 def runs_of(rows: Iterable[Row], settings: Settings, methods: Mapping[str, Method]) -> list[Job]:

@@ -30,18 +30,16 @@ from ded_bench.problem.quantities import Array32
 
 #: Distance of rows for swings, s, about: those of shipped islands are slower than 1.5 Hz.
 SPACING_S = 0.25
-#: Part of what a knot does to swings that iterations leave out, once it is long ago.
-FORGOTTEN = 0.035
+#: What a knot does to swings is left out after so long, s, or earlier, once this part of it is left.
+REMEMBERED_S, FORGOTTEN = 12.0, 0.035
 #: Transfers are kept by so much, pu, and ramps by this part of them: what iterations leave open.
 TRANSFER_MARGIN, RAMP_MARGIN = 2e-3, 0.02
 #: Of set-points, pu: 1.5 kW, and half the size in archives.
 RESOLUTION = 2.0**-16
-#: Of squares of set-points, beside the penalties.
-REGULARISATION = 1e-4
+#: Of squares of set-points, beside the penalties; over-relaxation.
+REGULARISATION, RELAXATION = 1e-4, 1.6
 #: Part of the bound on swings that the first schedule's way to the merit order takes.
 PACE = 0.7
-#: Over-relaxation.
-RELAXATION = 1.6
 #: Names of the learned settings, logarithms: penalties of outputs, limits and ramps; the price; parts of the
 #: bounds on the mean frequency and on swings that are left to errors of the model.
 SETTINGS = ("mean", "swing", "limit", "ramp", "price", "mean margin", "swing margin")
@@ -115,10 +113,10 @@ class IslandGrid:
         )
         size = np.linalg.norm(swings, axis=(0, 2)) ** 2
         memory = int(np.count_nonzero(np.cumsum(size[::-1])[::-1] > FORGOTTEN**2 * size.sum()))
-        swings = swings[:, :memory]
-        recent = swings[:, ::-1].swapaxes(0, 1).reshape(memory * n_gen, -1)
-        back = swings.T.reshape(-1, memory * n_gen)
-        return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in (mean, recent, back)))
+        swings = swings[:, : min(memory, round(REMEMBERED_S / float(self.knots[1])))]
+        recent = swings[:, ::-1].swapaxes(0, 1).reshape(-1, swings.shape[2])
+        parts = mean, recent, swings.T.reshape(swings.shape[2], -1)
+        return Maps(*(np.ascontiguousarray(part, dtype=np.float32) for part in parts))
 
     def ask(self, instance: Instance, state: DetailedState | None = None) -> IslandProblem:
         """Read an instance, which begins in its own state or another.

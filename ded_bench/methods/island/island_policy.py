@@ -37,8 +37,9 @@ from ded_bench.problem.schedule import Schedule
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
 #: What is as near a bound as this part of it is mended; quick policies simulate again what was far beyond.
 NEAR, FAR = 0.05, 0.5
-#: How often, at most; how many times as much is left free the last time, since the mean peaks between knots.
-MENDED, WIDENED = 5, 2.0
+#: How often, at most, and until excess changes no more: in operation plans may begin beyond a bound; how many
+#: times as much is left free the last time, since the mean peaks between knots.
+MENDED, STUCK, WIDENED = 5, 1e-3, 2.0
 #: The grid of a case, regime and horizon, made once.
 _grid_of = functools.lru_cache(maxsize=8)(IslandGrid)
 #: Iterations without costs, made once for all settings.
@@ -104,6 +105,8 @@ class IslandPolicy(TrainedPolicy):
             if self._is_quick and seen[-1].excess <= FAR and mended.excess <= -NEAR:
                 return mended
             seen.append(self._followed(asked, answer) or seen[-1])
+            if seen[-1] is not seen[-2] and abs(seen[-1].excess - seen[-2].excess) < STUCK:
+                break
         return min(seen[1:], key=lambda found: found.excess)
 
     @property

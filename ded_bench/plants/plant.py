@@ -42,6 +42,7 @@ class Piece:
     p_slack: Array  # (n,), pu
     states: Any  # at all points, for the plant's own use
     end: PlantState
+    agc: Array | float = 0.0  # what secondary control asks of all machines together, (n,), pu
 
 
 @dataclass(frozen=True, eq=False)

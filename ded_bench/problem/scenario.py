@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ded_bench.files.errors import InputError
@@ -84,12 +85,6 @@ class ScenarioLoad(Record):
         ramped = sum(ramp.rate * np.clip(t - ramp.start, 0.0, ramp.duration) for ramp in self.ramps)
         return np.asarray(self.initial + ramped + self.fluctuation_at(t))
 
-    def courses(self, count: int) -> Array:
-        """Start, duration, rate, announced start and rate of ramps, (5, count); unannounced: NaN."""
-        given = [(r.start, r.duration, r.rate, r.announced_start, r.announced_rate) for r in self.ramps]
-        none = [(np.inf, 0.0, 0.0, None, None)] * (count - len(given))
-        return np.array(given + none, dtype=np.float64).reshape(count, 5).T
-
     def fluctuation_at(self, t: Array) -> Array:
         """Fluctuation in pu at times `t` in s (any shape)."""
         return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
@@ -114,17 +109,6 @@ class Scenario(Fingerprinted):
         if given := self.initial.measured:
             raise ValueError(f"initial.{given}: a scenario starts from the power flow")
         return self
-
-    @staticmethod
-    def load_file(path: str | Path, case: Case) -> Scenario:
-        """Read a scenario of a case.
-
-        Raises:
-            InputError: the file is missing or wrong, or belongs to another case.
-        """
-        scenario = read_record(Scenario, path)
-        scenario.check_case(case, path)
-        return scenario
 
     def check_case(self, case: Case, source: str | Path = "") -> None:
         """Raise InputError unless this names exactly the buses of `case` and its loads last long enough."""
@@ -152,10 +136,23 @@ class Scenario(Fingerprinted):
         return np.arange(self.steps + 1, dtype=np.float64) * self.dt_s
 
     @functools.cached_property
-    def courses(self) -> dict[str, Array]:
-        """Of each load: see `ScenarioLoad.courses`; an operator's hour asks for them 3,600 times."""
+    def ramps(self) -> Array:
+        """Start, duration, rate, announced start and rate, (5, n_load, most ramps); unannounced: NaN."""
         most = max(len(load.ramps) for load in self.load.values())
-        return {bus: load.courses(most) for bus, load in self.load.items()}
+        found = np.tile([np.inf, 0.0, 0.0, np.nan, np.nan], (len(self.load), most, 1))
+        for own, load in zip(found, self.load.values(), strict=True):
+            for i, r in enumerate(load.ramps):
+                own[i] = r.start, r.duration, r.rate, r.announced_start, r.announced_rate
+        return np.moveaxis(found, 2, 0)
+
+    @functools.cached_property
+    def fluctuations(self) -> tuple[Array, Array, Array]:
+        """Steps and decays, (n_load, 1), s, and values, (n_load, most values), pu; the last stays."""
+        given = [load.fluctuation for load in self.load.values()]
+        most = max(len(own.values) for own in given)
+        values = [np.pad(own.array, (0, most - len(own.values)), mode="edge") for own in given]
+        step, decay = np.array([(own.step_s, own.decay_s) for own in given]).T[:, :, None]
+        return step, decay, np.array(values)
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """True load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
@@ -185,11 +182,12 @@ def load_scenarios(paths: Sequence[str | Path], case: Case) -> list[Scenario]:
     """Read several scenarios of one case.
 
     Raises:
-        InputError: no file given, a file is wrong, or two have the same id.
+        InputError: no file given, a file is missing, wrong or of another case, or two have the same id.
     """
     found: dict[str, Scenario] = {}
     for path in paths:
-        scenario = Scenario.load_file(path, case)
+        scenario = read_record(Scenario, path)
+        scenario.check_case(case, path)
         if scenario.id in found:
             raise InputError(path, "id", f"{scenario.id} was already given by another file")
         found[scenario.id] = scenario
@@ -253,42 +251,46 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
         return Forecast(tuple((np.array([now, until]), np.full(2, load.at(np.array(now)))) for load in loads))
     if quality == "perfect":
         return Forecast(tuple(_true(load, now, until) for load in loads))
-    courses = np.stack([scenario.courses[bus] for bus in case.loads], axis=1)
-    start, duration, rate, told_start, told_rate = courses
+    start, duration, rate, told_start, told_rate = scenario.ramps
     wrong = WORSE if quality == "worse" else 1.0
     begun = start <= now
     start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))
     rate = np.where(begun, rate, rate + wrong * (told_rate - rate))
     start, rate = np.where(np.isnan(rate), np.inf, start), np.nan_to_num(rate)  # nobody told of these
-    fluctuations = [load.fluctuation for load in loads]
-    step, decay = np.array([(f.step_s, f.decay_s) for f in fluctuations]).T[:, :, None]
+    step, decay, fluctuations = scenario.fluctuations
     steps = now + step * np.arange(math.ceil((until - now) / step.min()) + 1)
     times = np.sort(np.concatenate([np.minimum(steps, until), start, start + duration], axis=1), axis=1)
     times = np.clip(times, now, until)
     gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
-    fallen = np.exp((now - times) / decay)
-    present = np.array([(load.initial, float(load.fluctuation_at(np.array(now)))) for load in loads])
-    values = present[:, :1] + (gone_on @ rate[:, :, None])[:, :, 0] + present[:, 1:] * fallen
-    return Forecast(tuple(map(_distinct, times, values)))
+    k = np.minimum(now // step, fluctuations.shape[1] - 2).astype(int)
+    before, after = (np.take_along_axis(fluctuations, i, axis=1) for i in (k, k + 1))
+    present = before + (after - before) * (now - k * step) / step
+    initial = np.array([[load.initial] for load in scenario.load.values()])
+    values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
+    by_bus = dict(zip(scenario.load, zip(times, values, _are_new(times), strict=True), strict=True))
+    return Forecast(tuple((t[new], v[new]) for t, v, new in (by_bus[bus] for bus in case.loads)))
 
 
 def _true(load: ScenarioLoad, now: float, until: float) -> tuple[Array, Array]:
     ends = [t for ramp in load.ramps for t in (ramp.start, ramp.end)]
     times = np.sort(np.concatenate([[now, until], load.fluctuation.times, ends]).clip(now, until))
-    return _distinct(times, load.at(times))
+    return (new := times[_are_new(times)]), load.at(new)
 
 
-def _distinct(times: Array, values: Array) -> tuple[Array, Array]:
-    """Points in order, without all but the first, and the last, of those at the same time."""
-    new = np.ones(len(times), dtype=bool)
-    new[1:-1] = (times[1:-1] - times[:-2] > RESOLUTION) & (times[1:-1] < times[-1] - RESOLUTION)
-    return times[new], values[new]
+def _are_new(times: Array) -> NDArray[np.bool_]:
+    """All but those at the time of the one before, or of the last; of times in order, (..., n)."""
+    new, inner = np.ones(times.shape, dtype=bool), times[..., 1:-1]
+    new[..., 1:-1] = (inner - times[..., :-2] > RESOLUTION) & (inner < times[..., -1:] - RESOLUTION)
+    return new
 
 
 def _points(times: Array, values: Array, start: float, horizon_s: float) -> LoadPoints:
     end = start + horizon_s
-    inside = slice(*np.searchsorted(times, [start + RESOLUTION, end - RESOLUTION]))
-    relative = [0.0, *(times[inside] - start).tolist(), horizon_s]
-    ends = np.interp([start, end], times, values).tolist()
-    points = tuple(zip(relative, [ends[0], *values[inside].tolist(), ends[1]], strict=True))
+    if times[0] < start or times[-1] > end:
+        inside = slice(*np.searchsorted(times, [start + RESOLUTION, end - RESOLUTION]))
+        first, last = np.interp([start, end], times, values)
+        times = np.concatenate([[start], times[inside], [end]])
+        values = np.concatenate([[first], values[inside], [last]])
+    relative = [0.0, *(times[1:-1] - start).tolist(), horizon_s]
+    points = tuple(zip(relative, values.tolist(), strict=True))
     return LoadPoints.model_construct(points=points)  # times increase; checks would take as long as the plant

@@ -126,7 +126,7 @@ def test_wrong_scenarios_are_refused(known, threebus, tmp_path, field, value):
     path = tmp_path / "scenario.json"
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match=r"scenario\.json"):
-        Scenario.load_file(path, threebus)
+        load_scenarios([path], threebus)
 
 
 def test_the_sampler_repeats_itself(case, tmp_path):

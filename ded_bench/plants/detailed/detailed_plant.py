@@ -137,7 +137,7 @@ class DetailedPlant:
         p_gen = system.turbines(states.x)[:, machines]
         p_slack = np.zeros(n) if system.island else states.p_e[:, system.network.balancing]
         run = DetailedRun(states, np.arange(control.first, n - 1, control.period), steps)
-        return Piece(omega, p_gen, p_slack, run, end)
+        return Piece(omega, p_gen, p_slack, run, end, states.held)
 
     def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
         """See `Plant.linearise_along` and `linearised`.

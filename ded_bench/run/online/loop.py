@@ -194,9 +194,7 @@ class History:
         k = slice(self.now, self.now + len(p_set))
         piece = self.ahead(p_set, self.p_load[k])
         self.omega[k], self.p_set[k], self.p_gen[k] = piece.omega, p_set, piece.p_gen
-        self.p_slack[k], self.state = piece.p_slack, piece.end
-        if self._case.agc is not None:
-            self.agc[k] = self._plant.columns(piece.states)[AGC_COLUMN]
+        self.p_slack[k], self.agc[k], self.state = piece.p_slack, piece.agc, piece.end
         self.now += len(p_set) - 1
 
     def ahead(self, p_set: Array, p_load: Array) -> Piece:

@@ -264,7 +264,7 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
     gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
     k = np.minimum(now // step, fluctuations.shape[1] - 2).astype(int)
     before, after = (np.take_along_axis(fluctuations, i, axis=1) for i in (k, k + 1))
-    present = before + (after - before) * (now - k * step) / step
+    present = (after - before) / ((k + 1) * step - k * step) * (now - k * step) + before  # as np.interp
     initial = np.array([[load.initial] for load in scenario.load.values()])
     values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
     by_bus = dict(zip(scenario.load, zip(times, values, _are_new(times), strict=True), strict=True))

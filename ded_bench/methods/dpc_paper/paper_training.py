@@ -166,7 +166,7 @@ class PaperTraining(TrainingRun):
 
     def loss(self, rows: Tensor, progress: float) -> Tensor:
         """The sum of the terms."""
-        batch = Batch(*(part[rows] for part in self.data))
+        batch = type(self.data)(*(part[rows] for part in self.data))
         terms = {name: term.mean() for name, term in self.judge(self.network(batch.channels), batch).items()}
         for name, value in terms.items():
             self.totals[name] = self.totals.get(name, 0.0) + value.item() * len(rows)

@@ -178,7 +178,7 @@ def test_further_iterations_are_no_dearer(island: Case, instance: Instance, quic
 
 
 def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instance: Instance) -> None:
-    """Set-points from the true state, to their resolution; others from what is measured alone."""
+    """Near the plan in force, and from the true state to their resolution; else from what is measured."""
     made = policy(island)
     solver = IslandSolver(made, 0)
     first = solver.solve(instance).schedule
@@ -187,8 +187,9 @@ def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instan
     true, later, in_force = followed(island, instance, first)
     plan = solver.solve(later, Solution(Status.FEASIBLE, in_force)).schedule
     assert plan is not None
-    np.testing.assert_allclose(plan.p, made.powers(later, state=true), rtol=0, atol=2 * RESOLUTION)
-    assert np.abs(plan.p - made.powers(later)).max() > 100 * RESOLUTION
+    known = made.powers(later, state=true, last=in_force)
+    np.testing.assert_allclose(plan.p, known, rtol=0, atol=2 * RESOLUTION)
+    assert np.abs(plan.p - made.powers(later, last=in_force)).max() > 100 * RESOLUTION
 
 
 @pytest.mark.parametrize("carried", [0, 3])

@@ -27,8 +27,7 @@ from ded_bench.methods.knots import knot_points
 from ded_bench.methods.solution import Solution
 from ded_bench.methods.state_estimate import StateEstimate
 from ded_bench.methods.trained_policy import TrainedPolicy, answered, warm_up
-from ded_bench.plants.detailed.power_system import DetailedState
-from ded_bench.plants.plant import SimulationError
+from ded_bench.plants.plant import PlantState, SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.schedule import Schedule
@@ -66,16 +65,28 @@ class IslandPolicy(TrainedPolicy):
         """See `TrainedPolicy.answers`."""
         return np.stack([self.powers(instance) for instance in instances])
 
-    def powers(self, instance: Instance, further: int = 0, state: DetailedState | None = None) -> Array:
+    def powers(
+        self, instance: Instance, further: int = 0, state: PlantState = None, last: Schedule | None = None
+    ) -> Array:
         """Set-points at the knots, (n_knots, n_gen), pu.
 
         Args:
             instance: to answer, within the scope.
             further: iterations with costs along the answer, after which it is mended again.
             state: at t = 0; None: what is not measured is stationary.
+            last: the plan in force, a warm start from which one round is enough.
         """
-        asked, count, quick = self.grid.ask(instance, state), self.training["iterations"], self._is_quick
-        found = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
+        asked, count, quick = (
+            self.grid.ask(instance, state),
+            self.training["iterations"],
+            self.training.get("quick", False),
+        )
+        found = None
+        if last is not None:
+            start = self.grid.within(last.at(self.knots), asked.p_initial, asked.room)
+            found = self._improved(asked, self._followed(asked, start, linear=quick), count, rounds=1)
+        if found is None:
+            found = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
         if found is None:  # static dispatch is what every instance can be served by
             case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
             served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)
@@ -86,12 +97,14 @@ class IslandPolicy(TrainedPolicy):
             found = self._improved(asked, found, further) or found
         return found.schedule
 
-    def _improved(self, asked: IslandProblem, first: Found | None, count: int) -> Found | None:
+    def _improved(
+        self, asked: IslandProblem, first: Found | None, count: int, rounds: int | None = None
+    ) -> Found | None:
         """The first far enough from bounds, else that with the least excess; None: none can be carried."""
         if first is None:
             return None
         dual, seen, margins = None, [first], np.exp(self.weights["settings"][len(MENDING) :])
-        for _ in range(self.training["rounds"]):
+        for _ in range(rounds or self.training["rounds"]):
             answer, dual = self.iterate(asked, seen[-1], count, margins, dual)
             seen.append(self._followed(asked, answer) or seen[-1])
         if seen[1] is first:
@@ -102,16 +115,12 @@ class IslandPolicy(TrainedPolicy):
             count = number * self.training["mending"]  # few serve most instances
             answer, _ = mending_of(self.grid)(asked, seen[-1], count, more * margins)
             mended = self.grid.moved(seen[-1], answer)
-            if self._is_quick and seen[-1].excess <= FAR and mended.excess <= -NEAR:
+            if self.training.get("quick", False) and seen[-1].excess <= FAR and mended.excess <= -NEAR:
                 return mended
             seen.append(self._followed(asked, answer) or seen[-1])
             if seen[-1] is not seen[-2] and abs(seen[-1].excess - seen[-2].excess) < STUCK:
                 break
         return min(seen[1:], key=lambda found: found.excess)
-
-    @property
-    def _is_quick(self) -> bool:
-        return bool(self.training.get("quick", False))
 
     def _followed(self, asked: IslandProblem, answer: Array, linear: bool = False) -> Found | None:
         """What an answer leads to; None where the plant cannot carry it."""
@@ -142,8 +151,9 @@ class IslandSolver:
         """Answer; `last` is the plan in force."""
 
         def powers(instance: Instance) -> Array:
-            state = self._estimate.initial(instance, None if last is None else last.schedule)
-            found = self._policy.powers(instance, self._further, state)
+            in_force = None if last is None else last.schedule
+            state = self._estimate.initial(instance, in_force)
+            found = self._policy.powers(instance, self._further, state, in_force)
             self._estimate.keep(instance, state, Schedule(self._policy.knots, found))
             return found
 

@@ -54,10 +54,8 @@ NEAR, PARTS = 0.9, 8
 #: exceeded, at peaks and at so many points of an interval. Chosen on validation draws of two-area-agc and
 #: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
 HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
-
 #: What |P_s| may cost beyond what its pieces pay for, as a part of all; validation draws have up to 1.7e-5.
 CANCELLED = 1e-4
-
 #: Output, grid point, and the sign of the bound that it comes near, of a limit between knots.
 Limit = tuple[int, int, int]
 

@@ -42,10 +42,19 @@ def compiled(function: Function) -> Function:
     What is kept is of use as long as no compiled source of the package changes: Numba itself looks at a
     function's own file only, not at those of the functions that it calls.
     """
+    return _compiled(function, {})
+
+
+def allocation_free(function: Function) -> Function:
+    """As `compiled`, for what makes no arrays: references, whose counting takes long, are not counted."""
+    return _compiled(function, {"_nrt": False})  # as Numba's own do, see its `register_jitable`
+
+
+def _compiled(function: Function, options: dict[str, Any]) -> Function:
     try:
-        made: Any = numba.njit(cache=True, nogil=True)(function)
+        made: Any = numba.njit(cache=True, nogil=True, **options)(function)
     except RuntimeError:  # there is no such folder
-        return cast(Function, numba.njit(nogil=True)(function))
+        return cast(Function, numba.njit(nogil=True, **options)(function))
     if made is function:  # NUMBA_DISABLE_JIT: somebody debugs
         return function
     made._cache._cache_file._version = sources_stamp()  # looked at before anything of the file is unpickled
@@ -72,6 +81,6 @@ def sources_stamp(package: Path = _PACKAGE) -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(package.rglob("*.py")):
         content = path.read_bytes()
-        if b"@compiled" in content:
+        if b"@compiled" in content or b"@allocation_free" in content:
             digest.update(path.relative_to(package).as_posix().encode() + b"\0" + content)
     return digest.hexdigest()

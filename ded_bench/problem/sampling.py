@@ -28,7 +28,6 @@ SCENARIO_SEED = 4_000_000
 DECIMALS = 9
 #: How often one is drawn before the case's ranges are taken to be wrong.
 ATTEMPTS = 1000
-
 #: Scenarios of a case, and their duration, s, unless told otherwise.
 SCENARIOS, DURATION_S = 20, 300.0
 #: Loads of scenarios stay within this part of their nominal value, but for fluctuation and drift.
@@ -44,7 +43,6 @@ ISLAND_STEP_S = 5.0
 #: Duration of an hour, s, whose ramps leave loads within a narrower range, and which drift beside that by up
 #: to a part of their nominal value; points of the drift, and the time within which it returns, s.
 HOUR_S, HOUR_RANGE, DRIFT, DRIFT_STEP_S, DRIFT_DECAY_S = 3600.0, 0.1, 0.05, 60.0, 1200.0
-
 #: A drawn instance as the case's plant can serve it, or None (`plants.plant.servable`).
 Servable = Callable[[Case, Instance], Instance | None]
 

@@ -27,7 +27,6 @@ from ded_bench.run.pool import Answer, Children, Workers, WorkersLostError
 CONNECT_S = 10.0
 #: How often to ask it for its workers, s.
 REFRESH_S = 5.0
-
 #: The processes of a Dask worker; a run leaves them to the next one on the same cluster.
 _children = Children()
 

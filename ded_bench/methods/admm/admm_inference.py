@@ -288,7 +288,7 @@ def _project_response(
     relaxed, tight = np.float32(setting[6]), np.float32(limits.bound * (1.0 - setting[7]))
     weight = np.float32(setting[2] / (limits.bound**2 * points))
     per_weight = np.float32(1.0) / weight
-    on_omega, on_v = np.empty((n_points, n_gen), np.float32), np.empty((1, n_points, n_modes), np.float32)
+    on_omega, on_v = np.empty((n_points, n_gen), np.float32), np.empty((n_points, n_modes), np.float32)
     on_q, on_speed = np.zeros_like(on_v), np.empty_like(on_v)
     heavy, other = setting[3] / (limits.unit**2 * points), np.float32(1.0) - relaxed
     price, per_heavy = given.cost[b, 0] / heavy / (n_points - 1), 1.0 / heavy
@@ -305,18 +305,18 @@ def _project_response(
         slack[0, k], slack[1, k] = least, heavy * (drawn - least)
         force = np.float32(slack[1, k] + heavy * (p_slack[k] - least))
         for m in range(n_gen):
-            on_q[0, k, m] = -force * given.slack_of_mode[b, k, m]
-    np.dot(on_omega, limits.shape.T, on_speed[0])
-    swing_adjoint(modes, given.change[b : b + 1], on_q, on_speed, on_v)
+            on_q[k, m] = -force * given.slack_of_mode[b, k, m]
+    np.dot(on_omega, limits.shape.T, on_speed)
+    swing_adjoint(modes, given.change[b], on_q, on_speed, on_v)
     on_knots = np.zeros((n, n_modes), np.float32)
     for j in range(n - 1):
         for i in range(points):
             later = np.float32(i / points)
             for m in range(n_modes):
-                on_knots[j, m] += (np.float32(1.0) - later) * on_v[0, j * points + i, m]
-                on_knots[j + 1, m] += later * on_v[0, j * points + i, m]
+                on_knots[j, m] += (np.float32(1.0) - later) * on_v[j * points + i, m]
+                on_knots[j + 1, m] += later * on_v[j * points + i, m]
     for m in range(n_modes):
-        on_knots[n - 1, m] += on_v[0, n_points - 1, m]
+        on_knots[n - 1, m] += on_v[n_points - 1, m]
     asked = np.dot(on_knots, limits.gain.T)
     for j in range(n):
         for g in range(n_gen):
@@ -377,22 +377,22 @@ def _respond(
     """What a schedule does: ω (n_points, n_gen) and P_s (n_points,); see `ModalGrid.respond`."""
     (n, n_gen), n_points = powers.shape, len(p_slack)
     n_modes, points = limits.gain.shape[1], (n_points - 1) // (n - 1)
-    force = np.empty((1, n_points, n_modes), np.float32)
+    force = np.empty((n_points, n_modes), np.float32)
     q, speed = np.empty_like(force), np.empty_like(force)
     at_knots = np.dot(powers.astype(np.float32), limits.gain)
     for m in range(n_modes):
-        q[0, 0, m], speed[0, 0, m] = given.state[b, 0, m], given.state[b, 1, m]
-        force[0, n_points - 1, m] = given.offset[b, n_points - 1, m] + at_knots[n - 1, m]
+        q[0, m], speed[0, m] = given.state[b, 0, m], given.state[b, 1, m]
+        force[n_points - 1, m] = given.offset[b, n_points - 1, m] + at_knots[n - 1, m]
     for j in range(n - 1):
         for i in range(points):
             later = np.float32(i / points)
             for m in range(n_modes):
                 here = at_knots[j, m] + later * (at_knots[j + 1, m] - at_knots[j, m])
-                force[0, j * points + i, m] = given.offset[b, j * points + i, m] + here
-    swing(modes, given.change[b : b + 1], force, q, speed)
-    np.dot(speed[0], limits.shape, omega)
+                force[j * points + i, m] = given.offset[b, j * points + i, m] + here
+    swing(modes, given.change[b], force, q, speed)
+    np.dot(speed, limits.shape, omega)
     for k in range(n_points):
         drawn = given.slack[b, k]
         for m in range(n_gen):
-            drawn -= given.slack_of_mode[b, k, m] * q[0, k, m]
+            drawn -= given.slack_of_mode[b, k, m] * q[k, m]
         p_slack[k] = drawn

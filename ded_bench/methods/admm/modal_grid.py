@@ -91,7 +91,10 @@ class ModalGrid:
         #: Solved for generators and buses without machines, and for these, which the last one eliminates.
         network, n_gen = self.network, len(self.mass)
         buses = np.concatenate([network.generators, network.algebraic])
-        self._whole, grid = (g._replace(mismatch=MISMATCH) for g in (network.grid_of(buses), network.grid))
+        self._whole, grid = (
+            g._replace(mismatch=MISMATCH, contraction=CONTRACTION)
+            for g in (network.grid_of(buses), network.grid)
+        )
         self._grids = grid, network.grid_of(buses, kept=n_gen)
         self._factors = [np.empty(len(g.algebraic) + len(g.elimination.met)) for g in (self._whole, grid)]
         for g, factor in zip((self._whole, grid), self._factors, strict=True):
@@ -121,10 +124,10 @@ class ModalGrid:
         network, batch = self.network, len(problems)
         theta, served = np.tile(self.theta, (batch, 1)), np.empty(batch, bool)
         wanted = np.hstack([problems.p_initial, network.load_injections(problems.load[:, 0])])
-        f = np.empty(network.n_bus)
+        f, work = np.empty(network.n_bus), (np.empty(wanted.shape[1]), np.empty(len(network.coupling)))
         for b in range(batch):
             factor = self._factors[0].copy()
-            served[b] = algebraic.solve_algebraic(self._whole, wanted[b], factor, theta[b], f, CONTRACTION)
+            served[b] = algebraic.solve_algebraic(self._whole, wanted[b], factor, theta[b], f, work)
         served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
@@ -195,7 +198,8 @@ class ModalGrid:
         v = linear_between(powers @ self.gain, POINTS) + linear.offset
         q, speed = np.empty_like(v), np.empty_like(v)
         q[:, 0], speed[:, 0] = start.state[:, 0], start.state[:, 1]
-        swing(self.modes, linear.change, v, q, speed)
+        for b in range(len(v)):
+            swing(self.modes, linear.change[b], v[b], q[b], speed[b])
         x, omega = q @ self.shape, speed @ self.shape
         p_slack = linear.slack - (self.slack_stiffness(linear) * x).sum(axis=2)
         return x, omega, p_slack
@@ -257,6 +261,7 @@ def follow_trajectory(
         Whether there is a solution all along.
     """
     grid, reduced = grids
+    work = np.empty(len(grid.algebraic)), np.empty(len(grid.coupling))
     n, n_gen, at = len(grid.algebraic), angles.shape[1], 0
     angle, injection, before, change = theta.copy(), np.empty_like(theta), theta.copy(), np.zeros(len(theta))
     full, eliminated = np.empty((n_gen + n, n_gen + n)), np.empty(n + len(reduced.elimination.met))
@@ -266,7 +271,7 @@ def follow_trajectory(
             angle[bus] = before[bus] + change[bus]
         for g in range(n_gen):
             angle[grid.generators[g]] = angles[k, g]
-        if not algebraic.solve_algebraic(grid, wanted[k], factor, angle, injection, CONTRACTION):
+        if not algebraic.solve_algebraic(grid, wanted[k], factor, angle, injection, work):
             return False
         for i in range(len(angle)):
             change[i] = angle[i] - before[i] if k > 0 else 0.0

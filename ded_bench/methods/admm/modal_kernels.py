@@ -15,6 +15,9 @@ Floats = NDArray[np.floating[Any]]
 
 #: Grid points for which C is held: it changes over many seconds.
 HELD = 4
+#: Smallest square of an angular frequency, 1/s² (a period of ten minutes): what is divided by its square has
+#: eight digits left.
+SLOWEST = 1e-4
 #: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in
 #: one array of constant shape.
 LANES = 8
@@ -49,42 +52,22 @@ def oscillators(squares: Array, rate: float, h: float) -> Array:
     Returns:
         (n_modes, 2, 4).
     """
-    maps, exact, square, term = (
-        np.empty((len(squares), 2, 4)),
-        np.empty((4, 4)),
-        np.empty((4, 4)),
-        np.empty(4),
-    )
+    maps, fall = np.empty((len(squares), 2, 4)), np.exp(-0.5 * rate * h)
     for m in range(len(squares)):
-        halvings = 0
-        while (abs(squares[m]) * h + rate + 1.0) * h > 0.5 * 2.0**halvings:
-            halvings += 1
-        short = h / 2.0**halvings
-        for c in range(4):  # columns of the exponential for (q, q̇, v, v̇)
-            for r in range(4):
-                exact[r, c] = term[r] = 1.0 if r == c else 0.0
-            for power in range(1, 15):
-                part = short / power
-                fall = -(squares[m] * term[0] + rate * term[1]) + term[2]
-                term[0], term[1], term[2], term[3] = part * term[1], part * fall, part * term[3], 0.0
-                for r in range(4):
-                    exact[r, c] += term[r]
-        for _ in range(halvings):
-            for r in range(4):
-                for c in range(4):
-                    square[r, c] = 0.0
-                    for i in range(4):
-                        square[r, c] += exact[r, i] * exact[i, c]
-            exact, square = square, exact
-        for r in range(2):
-            maps[m, r, 0], maps[m, r, 1], maps[m, r, 3] = exact[r, 0], exact[r, 1], exact[r, 3] / h
-            maps[m, r, 2] = exact[r, 2] - maps[m, r, 3]
+        square = squares[m] if abs(squares[m]) > SLOWEST else SLOWEST
+        turn = np.sqrt(square - 0.25 * rate**2 + 1e-12j)  # nearly imaginary where damping is strong; never 0
+        cos, sin = fall * np.cos(turn * h).real, fall * (np.sin(turn * h) / turn).real
+        maps[m, 0, 0], maps[m, 0, 1] = cos + 0.5 * rate * sin, sin
+        maps[m, 1, 0], maps[m, 1, 1] = -square * sin, cos - 0.5 * rate * sin
+        by_step = (1.0 - maps[m, 0, 0]) / square
+        maps[m, 0, 3], maps[m, 1, 3] = (h - sin - rate * by_step) / (square * h), by_step / h
+        maps[m, 0, 2], maps[m, 1, 2] = by_step - maps[m, 0, 3], sin - maps[m, 1, 3]
     return maps
 
 
 @compiled
 def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> None:
-    """Advance problems from one grid point to the next: q̈ + γ q̇ + λ q + δD q̇ + C(t) q = v.
+    """Advance a problem from one grid point to the next: q̈ + γ q̇ + λ q + δD q̇ + C(t) q = v.
 
     Strang's splitting: half a kick by δD and C, the exact map of the rest, half a kick. Both are symmetric,
     so that products add up rows.
@@ -92,46 +75,41 @@ def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> 
     Args:
         modes: the grid; its arrays and the others are all of one precision. Their last axis may have more
             modes, whose values are zero.
-        change: C linear between its points, (batch, n_stiffness, n_modes, n_modes), 1/s².
-        v: inputs, (batch, n_points, n_modes).
-        q: coordinates, (batch, n_points, n_modes); the first row is given.
+        change: C linear between its points, (n_stiffness, n_modes, n_modes), 1/s².
+        v: inputs, (n_points, n_modes).
+        q: coordinates, (n_points, n_modes); the first row is given.
         speed: their derivatives, likewise.
     """
-    n, step, damping = v.shape[2], modes.step, modes.damping
-    kicked, kick, held = np.empty(n, v.dtype), np.empty(n, v.dtype), np.empty(change.shape[2:], v.dtype)
-    damped, shares = np.any(damping != 0.0), np.empty(2, v.dtype)
-    for b in range(len(v)):
-        for k in range(v.shape[1]):
-            if k % HELD == 0:
-                _hold(modes, change, b, k, shares, held)
-            if k > 0:
-                for i in range(n):
-                    q[b, k, i] = (
-                        step[0, 0, i] * q[b, k - 1, i]
-                        + step[0, 1, i] * kicked[i]
-                        + step[0, 2, i] * v[b, k - 1, i]
-                        + step[0, 3, i] * v[b, k, i]
-                    )
-                for i in range(n):
-                    speed[b, k, i] = (
-                        step[1, 0, i] * q[b, k - 1, i]
-                        + step[1, 1, i] * kicked[i]
-                        + step[1, 2, i] * v[b, k - 1, i]
-                        + step[1, 3, i] * v[b, k, i]
-                    )
-            kick[:] = 0.0
-            _add_product(held, q, b, k, kick)
-            if damped:
-                _add_product(damping, speed, b, k, kick)
-            if k > 0:
-                for i in range(n):
-                    speed[b, k, i] -= kick[i]
+    (n_points, n), step, damping = v.shape, modes.step, modes.damping
+    kicked, kick, held = np.empty(n, v.dtype), np.empty(n, v.dtype), np.empty(change.shape[1:], v.dtype)
+    damped, shares, loss = np.any(damping != 0.0), np.empty(2, v.dtype), np.empty(n, v.dtype)
+    for k in range(n_points):
+        if k % HELD == 0:
+            _hold(modes, change, k, shares, held)
+        if k > 0:
             for i in range(n):
-                kicked[i] = speed[b, k, i] - kick[i]
+                pushed = step[0, 2, i] * v[k - 1, i] + step[0, 3, i] * v[k, i]
+                q[k, i] = (step[0, 0, i] * q[k - 1, i] + pushed) + step[0, 1, i] * kicked[i]
+            for i in range(n):
+                pushed = step[1, 2, i] * v[k - 1, i] + step[1, 3, i] * v[k, i]
+                speed[k, i] = (step[1, 0, i] * q[k - 1, i] + pushed) + step[1, 1, i] * kicked[i]
+        _set_product(held, q, k, kick)
+        if damped:
+            _set_product(damping, speed, k, loss)
+            for i in range(n):
+                kick[i] += loss[i]
+        if k > 0:
+            for i in range(n):
+                kicked[i] = speed[k, i] - (kick[i] + kick[i])
+            for i in range(n):
+                speed[k, i] -= kick[i]
+        else:
+            for i in range(n):
+                kicked[i] = speed[k, i] - kick[i]
 
 
 @inlined
-def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Floats) -> None:
+def _hold(modes: Modes, change: Floats, k: int, shares: Floats, held: Floats) -> None:
     """Half a kick by C, for the grid points from k on: C in the middle of them."""
     middle, part = k + 0.5 * (HELD - 1), 0
     while part + 2 < len(modes.stiffness_points) and middle > modes.stiffness_points[part + 1]:
@@ -143,27 +121,30 @@ def _hold(modes: Modes, change: Floats, b: int, k: int, shares: Floats, held: Fl
     shares[0] = modes.half - shares[1]
     for j in range(len(held)):
         for i in range(held.shape[1]):
-            held[j, i] = shares[0] * change[b, part, j, i] + shares[1] * change[b, part + 1, j, i]
+            held[j, i] = shares[0] * change[part, j, i] + shares[1] * change[part + 1, j, i]
 
 
 @inlined
-def _add_product(matrix: Floats, rows: Floats, b: int, k: int, found: Floats) -> None:
-    """Add a symmetric matrix times one of the rows, four columns at a time."""
+def _set_product(matrix: Floats, rows: Floats, k: int, found: Floats) -> None:
+    """A symmetric matrix times one of the rows, four columns at a time, after those that are left over."""
     n = len(matrix)
-    whole = n - n % 4
-    for j in range(0, whole, 4):
-        one, two, three, four = rows[b, k, j], rows[b, k, j + 1], rows[b, k, j + 2], rows[b, k, j + 3]
+    first = n % 4
+    if first == 3:
+        one, two, three = rows[k, 0], rows[k, 1], rows[k, 2]
         for i in range(len(found)):
-            found[i] += (
-                one * matrix[j, i]
-                + two * matrix[j + 1, i]
-                + three * matrix[j + 2, i]
-                + four * matrix[j + 3, i]
+            found[i] = (one * matrix[0, i] + two * matrix[1, i]) + three * matrix[2, i]
+    else:
+        found[:] = 0.0
+        for j in range(first):
+            one = rows[k, j]
+            for i in range(len(found)):
+                found[i] += one * matrix[j, i]
+    for j in range(first, n, 4):
+        one, two, three, four = rows[k, j], rows[k, j + 1], rows[k, j + 2], rows[k, j + 3]
+        for i in range(len(found)):
+            found[i] += (one * matrix[j, i] + two * matrix[j + 1, i]) + (
+                three * matrix[j + 2, i] + four * matrix[j + 3, i]
             )
-    for j in range(whole, n):
-        one = rows[b, k, j]
-        for i in range(len(found)):
-            found[i] += one * matrix[j, i]
 
 
 @compiled
@@ -175,64 +156,64 @@ def swing_adjoint(modes: Modes, change: Floats, on_q: Floats, on_speed: Floats, 
     Args:
         modes: the grid; its arrays and the others are all of one precision.
         change: see `swing`.
-        on_q: (batch, n_points, n_modes).
+        on_q: (n_points, n_modes).
         on_speed: likewise.
         on_v: receives the gradient, likewise.
     """
-    n, step, damping = on_v.shape[2], modes.step, modes.damping
-    by_q, by_speed, by_kicked = np.empty(n, on_v.dtype), np.empty(n, on_v.dtype), np.empty(n, on_v.dtype)
-    kick, loss, held = (
-        np.empty(n, on_v.dtype),
-        np.zeros(n, on_v.dtype),
-        np.empty(change.shape[2:], on_v.dtype),
-    )
-    both, shares, damped = np.empty((1, 1, n), on_v.dtype), np.empty(2, on_v.dtype), np.any(damping != 0.0)
-    for b in range(len(on_v)):
-        by_q[:] = 0.0  # of q and of the kicked speed at this point, from what follows
-        by_kicked[:] = 0.0
-        on_v[b] = 0.0
-        for k in range(on_v.shape[1] - 1, 0, -1):
-            if k % HELD == HELD - 1 or k == on_v.shape[1] - 1:
-                _hold(modes, change, b, k - k % HELD, shares, held)
-            # kicked = speed - kick(q, speed₀) and speed = speed₀ - kick(q, speed₀), where speed₀ came of the
-            # step; kicked takes the kick of both
+    (n_points, n), step, damping = on_v.shape, modes.step, modes.damping
+    by_q, by_speed, by_kicked = np.zeros(n, on_v.dtype), np.empty(n, on_v.dtype), np.zeros(n, on_v.dtype)
+    kick, loss, both = np.empty(n, on_v.dtype), np.empty(n, on_v.dtype), np.empty((1, n), on_v.dtype)
+    held, shares = np.empty(change.shape[1:], on_v.dtype), np.empty(2, on_v.dtype)
+    damped = np.any(damping != 0.0)
+    on_v[n_points - 1] = 0.0
+    for k in range(n_points - 1, 0, -1):
+        if k % HELD == HELD - 1 or k == n_points - 1:
+            _hold(modes, change, k - k % HELD, shares, held)
+        # kicked = speed - kick(q, speed₀) and speed = speed₀ - kick(q, speed₀), where speed₀ came of the
+        # step; kicked takes the kick of both. by_q and by_kicked are of this point, from what follows
+        for i in range(n):
+            both[0, i] = on_speed[k, i] + (by_kicked[i] + by_kicked[i])
+        for i in range(n):
+            by_speed[i] = on_speed[k, i] + by_kicked[i]
+        _set_product(held, both, 0, kick)
+        if damped:
+            _set_product(damping, both, 0, loss)
             for i in range(n):
-                by_speed[i] = on_speed[b, k, i] + by_kicked[i]
-                both[0, 0, i] = by_speed[i] + by_kicked[i]
-            kick[:] = 0.0
-            _add_product(held, both, 0, 0, kick)
-            if damped:
-                loss[:] = 0.0
-                _add_product(damping, both, 0, 0, loss)
-            for i in range(n):
-                by_q[i] += on_q[b, k, i] - kick[i]
                 by_speed[i] -= loss[i]  # of speed₀
-            for i in range(n):
-                on_v[b, k, i] += step[0, 3, i] * by_q[i] + step[1, 3, i] * by_speed[i]
-                on_v[b, k - 1, i] = step[0, 2, i] * by_q[i] + step[1, 2, i] * by_speed[i]
-            for i in range(n):
-                by_kicked[i] = step[0, 1, i] * by_q[i] + step[1, 1, i] * by_speed[i]
-                by_q[i] = step[0, 0, i] * by_q[i] + step[1, 0, i] * by_speed[i]
+        for i in range(n):
+            by_q[i] = (by_q[i] + on_q[k, i]) - kick[i]
+        for i in range(n):
+            on_v[k, i] += step[0, 3, i] * by_q[i] + step[1, 3, i] * by_speed[i]
+        for i in range(n):
+            on_v[k - 1, i] = step[0, 2, i] * by_q[i] + step[1, 2, i] * by_speed[i]
+        for i in range(n):
+            by_kicked[i] = step[0, 1, i] * by_q[i] + step[1, 1, i] * by_speed[i]
+        for i in range(n):
+            by_q[i] = step[0, 0, i] * by_q[i] + step[1, 0, i] * by_speed[i]
 
 
+@compiled
 def interval_maps(step: Array, points: int) -> Array:
     """(q, q̇, v, v⁺) of two knots to (q, q̇) at the grid points between.
 
     Args:
-        step: of `oscillators`, (..., n_modes, 2, 4).
+        step: of `oscillators`, (n_modes, 2, 4).
         points: how many grid points make an interval between knots.
 
     Returns:
-        (..., points + 1, 2, 4, n_modes).
+        (points + 1, 2, 4, n_modes).
     """
-    maps = np.zeros((*step.shape[:-2], points + 1, 2, 4))
-    maps[..., 0, :, :2] = np.eye(2)
-    shares = np.linspace([1.0, 0.0], [0.0, 1.0], points + 1)  # of v and v⁺ in the input at a point
-    inputs = step[..., None, :, 2:3] * shares[:-1, None] + step[..., None, :, 3:4] * shares[1:, None]
-    for i in range(points):
-        maps[..., i + 1, :, :] = step[..., :2] @ maps[..., i, :, :]
-        maps[..., i + 1, :, 2:] += inputs[..., i, :, :]
-    return np.ascontiguousarray(np.moveaxis(maps, -4, -1))
+    maps = np.zeros((points + 1, 2, 4, len(step)))
+    for m in range(len(step)):
+        maps[0, 0, 0, m] = maps[0, 1, 1, m] = 1.0
+        for i in range(points):
+            now, then = i / points, (i + 1) / points  # shares of v⁺ in the input
+            for r in range(2):
+                for c in range(4):
+                    maps[i + 1, r, c, m] = step[m, r, 0] * maps[i, 0, c, m] + step[m, r, 1] * maps[i, 1, c, m]
+                maps[i + 1, r, 2, m] += (1.0 - now) * step[m, r, 2] + (1.0 - then) * step[m, r, 3]
+                maps[i + 1, r, 3, m] += now * step[m, r, 2] + then * step[m, r, 3]
+    return maps
 
 
 def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, points: int) -> MeanModes:
@@ -248,8 +229,7 @@ def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, 
     """
     root = np.sqrt(mass)
     squares, u = np.linalg.eigh(mean / np.outer(root, root))
-    steps = oscillators(squares.ravel() / inertia, rate, h).reshape(*squares.shape, 2, 4)
-    maps = interval_maps(steps, points)
+    maps = np.stack([interval_maps(oscillators(each / inertia, rate, h), points) for each in squares])
     maps[:, :, :, 2:] /= inertia
     shapes = u / root[:, None]
     slack = (mean.sum(axis=2)[:, None] @ shapes)[:, 0]

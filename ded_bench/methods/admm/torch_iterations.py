@@ -167,7 +167,8 @@ class Transposed(torch.autograd.Function):
         grid, linear = ctx.grid, ctx.linear
         v = linear_between(_double(gradients[0]) @ grid.gain, POINTS)
         q, speed = np.zeros_like(v), np.zeros_like(v)
-        swing(grid.modes, linear.change, v, q, speed)
+        for b in range(len(v)):
+            swing(grid.modes, linear.change[b], v[b], q[b], speed[b])
         on_slack = -(grid.slack_stiffness(linear) * (q @ grid.shape)).sum(axis=2)
         return _single(speed @ grid.shape), _single(on_slack), None, None
 
@@ -205,7 +206,9 @@ def _transposed(grid: ModalGrid, linear: ModalLinearisation, on_omega: Array, on
     """Gradient in powers at the knots from those in ω and P_s on the time grid."""
     on_x = -on_slack[:, :, None] * grid.slack_stiffness(linear)
     on_v = np.empty_like(on_omega)
-    swing_adjoint(grid.modes, linear.change, on_x @ grid.shape.T, on_omega @ grid.shape.T, on_v)
+    on_q, on_speed = on_x @ grid.shape.T, on_omega @ grid.shape.T
+    for b in range(len(on_v)):
+        swing_adjoint(grid.modes, linear.change[b], on_q[b], on_speed[b], on_v[b])
     found = on_v[:, ::POINTS].copy()
     for i in range(1, POINTS):
         found[:, :-1] += (1 - i / POINTS) * on_v[:, i::POINTS]

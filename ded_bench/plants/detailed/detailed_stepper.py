@@ -30,8 +30,6 @@ from ded_bench.problem.quantities import Array, Indices
 #: Slopes of loads are renewed where voltages take more fixed-point steps than this, but not within so many
 #: integrator steps: an inversion costs as much as some hundred of those.
 SLOW, RENEWED_AFTER = 3, 50
-
-
 #: A point that no grid has.
 NEVER = 2**62
 

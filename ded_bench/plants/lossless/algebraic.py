@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ded_bench.problem.case import Array, Indices
-from ded_bench.problem.compiled import compiled, inlined
+from ded_bench.problem.compiled import allocation_free, compiled
 
 #: Newton gives up after so many steps.
 NEWTON_STEPS = 30
@@ -22,7 +22,6 @@ NEWTON_STEPS = 30
 CONTRACTION = 0.0001
 #: Coefficients of the sine's Taylor series, the last first: within a quarter turn the next is below rounding.
 SINE = np.array([(-1) ** k / math.factorial(2 * k + 1) for k in range(9, -1, -1)])
-
 #: Half turns from which on an angle has no sine here: doubles resolve it no more to the mismatch.
 MOST_TURNS = 1e4
 
@@ -47,6 +46,7 @@ class CompiledGrid(NamedTuple):
     m: Array  # (n_gen,), s² pu/rad
     d: Array  # (n_gen,), s pu/rad
     mismatch: float  # algebraic equations are solved to this, pu
+    contraction: float  # a step has to leave no more of the mismatch, else the Jacobian is renewed
 
 
 def elimination_order(joined: Iterable[Sequence[int]], n: int, kept: int = 0) -> Elimination:
@@ -73,7 +73,7 @@ def elimination_order(joined: Iterable[Sequence[int]], n: int, kept: int = 0) ->
     return Elimination(np.array(order, int), first, np.array([r for rows in met for r in rows], int))
 
 
-@compiled
+@allocation_free
 def eliminate(elimination: Elimination, matrix: Array, factor: Array) -> None:
     """Eliminate rows of a symmetric matrix; what is left of the others is the Schur complement.
 
@@ -84,17 +84,16 @@ def eliminate(elimination: Elimination, matrix: Array, factor: Array) -> None:
     """
     order, first, met = elimination
     for i in range(len(order)):
-        row = matrix[order[i]]
-        pivot = row[order[i]] if row[order[i]] != 0.0 else np.nan
+        row = order[i]
+        pivot = matrix[row, row] if matrix[row, row] != 0.0 else np.nan
         factor[i] = pivot
         for p in range(first[i], first[i + 1]):
-            entry = factor[len(order) + p] = row[met[p]] / pivot
-            other = matrix[met[p]]
+            entry = factor[len(order) + p] = matrix[row, met[p]] / pivot
             for q in range(first[i], first[i + 1]):
-                other[met[q]] -= entry * row[met[q]]
+                matrix[met[p], met[q]] -= entry * matrix[row, met[q]]
 
 
-@compiled
+@allocation_free
 def solve_factorised(elimination: Elimination, factor: Array, x: Array) -> None:
     """Solve equations whose factors are given; x, (n,), is their right side, and becomes the answer."""
     order, first, met = elimination
@@ -118,25 +117,25 @@ def factorise(grid: CompiledGrid, angle: Array, factor: Array) -> None:
     eliminate(grid.elimination, jacobian, factor)
 
 
-@compiled
+@allocation_free
 def solve_algebraic(
-    grid: CompiledGrid, wanted: Array, factor: Array, angle: Array, f: Array, contraction: float
+    grid: CompiledGrid, wanted: Array, factor: Array, angle: Array, f: Array, work: tuple[Array, Array]
 ) -> bool:
     """Find the angles of algebraic buses that give the wanted injections; f receives those of all buses.
 
-    The Jacobian's factors are renewed where a step makes the mismatch smaller by less than `contraction`.
+    `work` has room for as much as algebraic buses, and for as much as lines.
 
     Returns:
         Whether there is a solution; if there is none, angles and f mean nothing.
     """
-    last, correction = np.inf, np.empty(len(wanted))
+    last, (correction, across) = np.inf, work
     for _ in range(NEWTON_STEPS):
-        worst = _mismatch(grid, wanted, angle, f)
+        worst = _mismatch(grid, wanted, angle, f, across)
         if worst < grid.mismatch:
             return True
         if not worst < np.inf:
             return False
-        if worst > contraction * last:
+        if worst > grid.contraction * last:
             factorise(grid, angle, factor)
         last = worst
         for i in range(len(wanted)):
@@ -160,15 +159,16 @@ def solve_angles(grid: CompiledGrid, wanted: Array, theta: Array, f: Array) -> b
     Returns:
         Whether there is a solution for all.
     """
-    factor = np.empty(len(grid.algebraic) + len(grid.elimination.met))
+    n, n_met = len(grid.algebraic), len(grid.elimination.met)
+    factor, work = np.empty(n + n_met), (np.empty(n), np.empty(len(grid.coupling)))
     for b in range(len(theta)):
         factorise(grid, theta[b], factor)
-        if not solve_algebraic(grid, wanted[b], factor, theta[b], f[b], 0.0):
+        if not solve_algebraic(grid, wanted[b], factor, theta[b], f[b], work):
             return False
     return True
 
 
-@compiled
+@allocation_free
 def _to_sines(angles: Array) -> None:
     """Replace angles, (n,), rad, by their sines: `np.sin` is not vectorised, and takes four times as long."""
     for i in range(len(angles)):
@@ -181,14 +181,14 @@ def _to_sines(angles: Array) -> None:
         angles[i] = x * series
 
 
-@inlined
-def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array) -> float:
+@allocation_free
+def _mismatch(grid: CompiledGrid, wanted: Array, angle: Array, f: Array, across: Array) -> float:
     """Largest difference of algebraic buses' injections from those wanted, pu; infinite if one is no number.
 
-    f receives the injections of all buses.
+    f receives the injections of all buses; `across` is to work on, (n_line,).
     """
-    f[:] = 0.0
-    across = np.empty(len(grid.coupling))
+    for i in range(len(f)):
+        f[i] = 0.0
     for i in range(len(across)):
         across[i] = angle[grid.lines[i, 0]] - angle[grid.lines[i, 1]]
     _to_sines(across)

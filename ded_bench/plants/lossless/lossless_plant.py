@@ -6,7 +6,7 @@ is missing. See `network` for the equations.
 
 from __future__ import annotations
 
-import contextlib
+import copy
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 #: Longest step times the fastest mode: far inside the region of stability; on the shipped grids ω is within
 #: 4e-10 Hz of that of steps a tenth as long.
 STEP_BY_MODE = 0.1
-#: Mismatch of the algebraic equations where a linearisation follows, pu: ω is then within 1e-6 Hz (140bus).
-PLANNING_MISMATCH = 1e-7
+#: Where a linearisation follows, mismatch of the algebraic equations, pu, and how much longer steps may be: ω
+#: is then within 1e-6 Hz (140bus).
+PLANNING_MISMATCH, PLANNING_STEP = 1e-7, 2.0
 
 
 class LosslessState(NamedTuple):
@@ -83,13 +84,12 @@ class LosslessPlant:
         theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
         theta[0], omega[0], p_slack = state.theta, state.omega, np.empty(n)
         inputs = stepper.GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
-        steps = max(int(np.ceil(state.divisions * dt_s)), 1)
+        steps = max(int(np.ceil(state.divisions * dt_s / (1.0 if exact else PLANNING_STEP))), 1)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
-        if state.carried is None:
-            carried = stepper.carried_from(grid, theta[0])
-        else:
-            carried = stepper.Carried(*(part.copy() for part in state.carried))  # type: ignore[arg-type]
-        if stepper.integrate(grid, inputs, steps, carried, theta, omega, p_slack) < n:
+        carried = copy.deepcopy(state.carried) or stepper.carried_from(grid, theta[0])
+        last = carried._replace(recent=carried.recent.copy(), factor=carried.factor.copy())
+        work = stepper.work_of(grid, theta[0])
+        if stepper.integrate(grid, inputs, steps, carried, last, work, theta, omega, p_slack) < n:
             raise SimulationError("the system cannot follow this schedule: the power flow has no solution")
         end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions, carried)
         return Piece(omega, p_set, p_slack, theta, end)
@@ -167,11 +167,6 @@ class LosslessPlant:
         case, times = self.case, instance.kinks
         p_load, p_gen = instance.p_load(case, times), self.static_dispatch(instance, times)
         given = "power" if instance.initial.theta is None else "theta"
-        if given == "power":
-            both = np.vstack([instance.p_initial(case), p_gen]), np.vstack([p_load[:1], p_load])
-            with contextlib.suppress(SimulationError):  # at once is faster, one by one tells where it fails
-                self.network.power_flow(*both)
-                return
         try:
             self.network.initial_angles(instance)
         except SimulationError as error:

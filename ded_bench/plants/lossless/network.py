@@ -98,7 +98,8 @@ class Network:
         inner = [[place[bus] for bus in ends] for ends in self.ends.tolist() if place.keys() >= {*ends}]
         order = compiled.elimination_order(inner, len(algebraic), kept)
         buses = self.generators, algebraic, order, self.slack
-        return compiled.CompiledGrid(self.ends, self.coupling, *buses, self.m, self.d, self.mismatch)
+        machines, accuracy = (self.m, self.d), (self.mismatch, compiled.CONTRACTION)
+        return compiled.CompiledGrid(self.ends, self.coupling, *buses, *machines, *accuracy)
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
@@ -184,6 +185,8 @@ class Network:
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
         n = len(grid.algebraic)
         wanted = np.array(np.broadcast_to(wanted, (*theta.shape[:-1], n)).reshape(-1, n), order="C")
-        if not solve_angles(grid, wanted, *rows):
+        if not solve_angles(
+            grid._replace(contraction=0.0), wanted, *rows
+        ):  # from far: all steps are Newton's
             raise SimulationError("the power flow has no solution")
         return theta, f

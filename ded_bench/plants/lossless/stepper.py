@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.plants.lossless.algebraic import CONTRACTION, CompiledGrid, factorise, solve_algebraic
+from ded_bench.plants.lossless.algebraic import CompiledGrid, factorise, solve_algebraic
 from ded_bench.problem.case import Array, Indices
-from ded_bench.problem.compiled import compiled, copy_row, inlined
+from ded_bench.problem.compiled import allocation_free, copy_row
 
 #: Dormand and Prince's method of order 5 (Hairer, Norsett, Wanner: Solving ODEs I, II.5); SciPy loads slowly.
 STAGES = np.zeros((6, 5))
@@ -64,6 +64,8 @@ class Work(NamedTuple):
     rates: Array  # their derivatives at all of them, (n_stages, 2, n_gen)
     angle: Array  # of all buses, (n_bus,), rad
     f: Array  # injections of all buses, (n_bus,), pu
+    wanted: Array  # injections of the algebraic buses, (n_algebraic,), pu
+    newton: tuple[Array, Array]  # see `solve_algebraic`
 
 
 def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
@@ -82,12 +84,22 @@ def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
     return carried
 
 
-@compiled
+def work_of(grid: CompiledGrid, theta: Array) -> Work:
+    """Arrays to work on, at angles (n_bus,)."""
+    both, n_gen = np.empty((2, 2, len(grid.generators))), len(grid.generators)
+    rates, f, wanted = np.empty((len(NODES), 2, n_gen)), np.empty(len(theta)), np.empty(len(grid.algebraic))
+    newton = np.empty_like(wanted), np.empty(len(grid.coupling))
+    return Work(both[0], both[1], rates, theta.copy(), f, wanted, newton)
+
+
+@allocation_free
 def integrate(
     grid: CompiledGrid,
     inputs: GridInputs,
     steps: int,
     carried: Carried,
+    last: Carried,
+    work: Work,
     theta: Array,
     omega: Array,
     p_slack: Array,
@@ -99,6 +111,8 @@ def integrate(
         inputs: powers at n points of time.
         steps: steps from one point to the next.
         carried: from the piece before; becomes what the next one needs.
+        last: the same but for angles and factors of its own, which the last point may change.
+        work: of the first point's angles.
         theta: angles of all buses, (n, n_bus), rad; the first row is given and the others are computed.
         omega: frequency deviations, (n, n_gen), rad/s; likewise.
         p_slack: receives the slack's power, (n,), pu.
@@ -107,17 +121,16 @@ def integrate(
         The number of points computed: less than n where the algebraic equations have no solution.
     """
     n: int = len(omega)
-    n_gen, n_bus = omega.shape[1], theta.shape[1]
-    n_stages = len(NODES)
-    h = inputs.dt / steps
-    state, stage, rates = np.empty((2, n_gen)), np.empty((2, n_gen)), np.empty((n_stages, 2, n_gen))
-    angle, f = theta[0].copy(), np.empty(n_bus)
-    work = Work(state, stage, rates, angle, f)
+    n_gen, n_stages, h = omega.shape[1], len(NODES), inputs.dt / steps
+    state, stage, rates, angle = work.state, work.stage, work.rates, work.angle
     for g in range(n_gen):
         state[0, g], state[1, g] = angle[grid.generators[g]], omega[0, g]
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
-            carried = _set_apart(carried)
+            copy_row(carried.factor, last.factor)
+            for i in range(len(carried.recent)):
+                copy_row(carried.recent[i], last.recent[i])
+            carried = last
         elif _bends(inputs, k, carried.slope):
             carried.linear[0] = 0
         for j in range(steps):
@@ -128,7 +141,7 @@ def integrate(
             if j == 0:
                 copy_row(angle, theta[k])
                 copy_row(state[1], omega[k])
-                p_slack[k] = f[grid.slack]
+                p_slack[k] = work.f[grid.slack]
                 if k == n - 1:
                     return n
             if _adams(grid, inputs, (k, (j + 1) / steps), h, carried, work):
@@ -148,18 +161,12 @@ def integrate(
                     for g in range(n_gen):
                         state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
             _extrapolate(grid, carried.recent, 1.0, angle)
-            _step_begins(grid, angle, carried.ahead)
+            for i in range(len(carried.ahead)):
+                carried.ahead[i] = angle[grid.algebraic[i]]
     return n
 
 
-@inlined
-def _set_apart(carried: Carried) -> Carried:
-    """With angles and factors of its own, which a step at the last point may change."""
-    recent, factor, ahead, past, linear, slope = carried
-    return Carried(recent.copy(), factor.copy(), ahead, past, linear, slope)
-
-
-@inlined
+@allocation_free
 def _adams(
     grid: CompiledGrid, inputs: GridInputs, end: tuple[int, float], h: float, carried: Carried, work: Work
 ) -> bool:
@@ -201,22 +208,16 @@ def _adams(
             corrected = work.state[q, g] + h * mean
             off = max(off, abs(corrected - predicted[q, g]))
             predicted[q, g] = corrected
-    if not off < ADAMS_TOLERANCE:
+    if not off < max(ADAMS_TOLERANCE, 3.0 * grid.mismatch):
         return False
     copy_row(predicted[0], work.state[0])
     copy_row(predicted[1], work.state[1])
-    _step_begins(grid, work.angle, carried.ahead)
+    for i in range(len(carried.ahead)):
+        carried.ahead[i] = work.angle[grid.algebraic[i]]
     return True
 
 
-@inlined
-def _step_begins(grid: CompiledGrid, angle: Array, ahead: Array) -> None:
-    """Keep the algebraic angles near which the next step begins."""
-    for i in range(len(ahead)):
-        ahead[i] = angle[grid.algebraic[i]]
-
-
-@inlined
+@allocation_free
 def _bends(inputs: GridInputs, k: int, slope: Array) -> bool:
     """Whether powers or loads change otherwise after a point than before it; `slope` becomes their change."""
     n_gen, bend = inputs.p_gen.shape[1], 0.0
@@ -230,7 +231,7 @@ def _bends(inputs: GridInputs, k: int, slope: Array) -> bool:
     return bend > LINEAR
 
 
-@inlined
+@allocation_free
 def _extrapolate(grid: CompiledGrid, recent: Array, ahead: float, angle: Array) -> None:
     """Guess algebraic angles some steps ahead of the newest by Lagrange's polynomial through the recent."""
     for i in range(recent.shape[1]):
@@ -244,7 +245,7 @@ def _extrapolate(grid: CompiledGrid, recent: Array, ahead: float, angle: Array) 
             angle[grid.algebraic[i]] += weight * recent[j, i]
 
 
-@compiled
+@allocation_free
 def _evaluate(
     grid: CompiledGrid,
     inputs: GridInputs,
@@ -270,17 +271,17 @@ def _evaluate(
     """
     (k, inside), angle = moment, work.angle
     n_gen, n_algebraic, after = state.shape[1], len(grid.algebraic), min(k + 1, len(inputs.p_gen) - 1)
-    recent, wanted = carried.recent, np.empty(n_algebraic)
+    recent, wanted, newton = carried.recent, work.wanted, work.newton
     for g in range(n_gen):
         angle[grid.generators[g]] = state[0, g]
     for i in range(n_algebraic):
         wanted[i] = inputs.injection[k, i]
         wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
-    solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, CONTRACTION)
+    solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, newton)
     if not solved:  # a bad guess? from the angles of the step before, then
         for i in range(n_algebraic):
             angle[grid.algebraic[i]] = recent[0, i]
-        solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, CONTRACTION)
+        solved = solve_algebraic(grid, wanted, carried.factor, angle, work.f, newton)
     if not solved:
         return False
     if s == 0:

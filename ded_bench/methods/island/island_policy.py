@@ -85,8 +85,9 @@ class IslandPolicy(TrainedPolicy):
         if last is not None:
             start = self.grid.within(last.at(self.knots), asked.p_initial, asked.room)
             found = self._improved(asked, self._followed(asked, start, linear=quick), count, rounds=1)
-        if found is None:
-            found = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
+        if found is None or found.excess > 0.0:  # the merit order may lead back within bounds
+            other = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
+            found = min(filter(None, (found, other)), key=lambda one: one.excess, default=None)
         if found is None:  # static dispatch is what every instance can be served by
             case, points = self.scope.case, knot_points(self.knots, instance.dt_s)
             served = within_ramps(case, instance, static_dispatch(case, instance, lead=False), points)

@@ -34,7 +34,7 @@ from ded_bench.problem.schedule import Schedule
 
 #: Penalties of mending, and no price.
 MENDING = np.append(np.log([0.5, 0.5, 1.0, 0.5]), -np.inf)
-#: What is as near a bound as this part of it is mended; quick policies simulate again what was far beyond.
+#: So near a bound, in parts of it, answers are mended; so far beyond simulated again, and warm starts left.
 NEAR, FAR = 0.05, 0.5
 #: How often, at most, and until excess changes no more: in operation plans may begin beyond a bound; how many
 #: times as much is left free the last time, since the mean peaks between knots.
@@ -85,7 +85,7 @@ class IslandPolicy(TrainedPolicy):
         if last is not None:
             start = self.grid.within(last.at(self.knots), asked.p_initial, asked.room)
             found = self._improved(asked, self._followed(asked, start, linear=quick), count, rounds=1)
-        if found is None or found.excess > 0.0:  # the merit order may lead back within bounds
+        if found is None or found.excess > FAR:
             other = self._improved(asked, self._followed(asked, asked.start, linear=quick), count)
             found = min(filter(None, (found, other)), key=lambda one: one.excess, default=None)
         if found is None:  # static dispatch is what every instance can be served by

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,28 @@ def test_plans_in_operation_begin_with_the_plants_own_state(island: Case, instan
     known = made.powers(later, state=true, last=in_force)
     np.testing.assert_allclose(plan.p, known, rtol=0, atol=2 * RESOLUTION)
     assert np.abs(plan.p - made.powers(later, last=in_force)).max() > 100 * RESOLUTION
+
+
+@pytest.mark.parametrize("bad", [False, True])
+def test_warm_starts_take_one_round_unless_they_lead_far_beyond(
+    bad: bool, island: Case, instance: Instance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a good answer, and from one that seems to be beyond a bound by twice as much: then anew."""
+    made, calls = policy(island), []
+    answer, improved = made.powers(instance), made._improved
+
+    def counted(
+        asked: IslandProblem, first: Found | None, count: int, rounds: int | None = None
+    ) -> Found | None:
+        calls.append(rounds)
+        found = improved(asked, first, count, rounds)
+        return replace(found, excess=2.0) if found is not None and bad and rounds else found
+
+    monkeypatch.setattr(IslandPolicy, "_improved", lambda _, *asked, **rounds: counted(*asked, **rounds))
+    found = made.powers(instance, last=Schedule(made.knots, answer))
+    assert calls == ([1, None] if bad else [1])
+    assert np.array_equal(found, answer) == bad
+    assert score(island, instance, Schedule(made.knots, found), "TO").feasible
 
 
 @pytest.mark.parametrize("carried", [0, 3])

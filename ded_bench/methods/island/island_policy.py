@@ -5,6 +5,7 @@ costs lead to a first answer; where its simulation comes too near a bound, itera
 set-points near it that keep away. Limits, ramps and P_0 hold for any settings.
 
 A quick policy simulates less: its first schedule by the linear model alone, and small repairs not again.
+In operation the plan in force is a warm start.
 """
 
 from __future__ import annotations
@@ -76,12 +77,8 @@ class IslandPolicy(TrainedPolicy):
             state: at t = 0; None: what is not measured is stationary.
             last: the plan in force, a warm start from which one round is enough.
         """
-        asked, count, quick = (
-            self.grid.ask(instance, state),
-            self.training["iterations"],
-            self.training.get("quick", False),
-        )
-        found = None
+        asked, count, found = self.grid.ask(instance, state), self.training["iterations"], None
+        quick = self.training.get("quick", False)
         if last is not None:
             start = self.grid.within(last.at(self.knots), asked.p_initial, asked.room)
             found = self._improved(asked, self._followed(asked, start, linear=quick), count, rounds=1)

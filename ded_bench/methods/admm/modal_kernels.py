@@ -15,8 +15,7 @@ Floats = NDArray[np.floating[Any]]
 
 #: Grid points for which C is held: it changes over many seconds.
 HELD = 4
-#: Smallest square of an angular frequency, 1/s² (a period of ten minutes): what is divided by its square has
-#: eight digits left.
+#: Smallest square of an angular frequency, 1/s²: what is divided by squares of it has eight digits left.
 SLOWEST = 1e-4
 #: `modal_change` treats so many modes at once: loops over them are vectorised if all that they need lies in
 #: one array of constant shape.

@@ -81,18 +81,17 @@ class LosslessPlant:
         from ded_bench.plants.lossless import stepper  # and with it Numba: help does without
 
         network, n = self.network, len(p_set)
-        theta, omega = np.empty((n, network.n_bus)), np.empty(p_set.shape)
-        theta[0], omega[0], p_slack = state.theta, state.omega, np.empty(n)
-        inputs = stepper.GridInputs(np.ascontiguousarray(p_set), network.load_injections(p_load), dt_s)
+        found = stepper.GridStates(np.empty((n, network.n_bus)), np.empty(p_set.shape), np.empty(n))
+        found.theta[0], found.omega[0] = state.theta, state.omega
         steps = max(int(np.ceil(state.divisions * dt_s / (1.0 if exact else PLANNING_STEP))), 1)
+        powers = np.ascontiguousarray(p_set), network.load_injections(p_load)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
-        carried = copy.deepcopy(state.carried) or stepper.carried_from(grid, theta[0])
-        last = carried._replace(recent=carried.recent.copy(), factor=carried.factor.copy())
-        work = stepper.work_of(grid, theta[0])
-        if stepper.integrate(grid, inputs, steps, carried, last, work, theta, omega, p_slack) < n:
+        carried = copy.deepcopy(state.carried) or stepper.carried_from(grid, state.theta)
+        work = stepper.work_of(grid, state.theta, carried)
+        if stepper.integrate(grid, stepper.GridInputs(*powers, dt_s, steps), carried, work, found) < n:
             raise SimulationError("the system cannot follow this schedule: the power flow has no solution")
-        end = LosslessState(theta[-1], omega[-1], p_set[-1], state.divisions, carried)
-        return Piece(omega, p_set, p_slack, theta, end)
+        end = LosslessState(found.theta[-1], found.omega[-1], p_set[-1], state.divisions, carried)
+        return Piece(found.omega, p_set, found.p_slack, found.theta, end)
 
     def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
         """See `Plant.linearise_along`.

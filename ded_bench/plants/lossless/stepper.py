@@ -43,6 +43,15 @@ class GridInputs(NamedTuple):
     p_gen: Array  # (n, n_gen), pu
     injection: Array  # (n, n_algebraic), pu
     dt: float  # s
+    steps: int  # of the integrator, from one point to the next
+
+
+class GridStates(NamedTuple):
+    """At the points of time; the first angles and frequencies are given, all else is computed."""
+
+    theta: Array  # of all buses, (n, n_bus), rad
+    omega: Array  # frequency deviations, (n, n_gen), rad/s
+    p_slack: Array  # (n,), pu
 
 
 class Carried(NamedTuple):
@@ -66,6 +75,7 @@ class Work(NamedTuple):
     f: Array  # injections of all buses, (n_bus,), pu
     wanted: Array  # injections of the algebraic buses, (n_algebraic,), pu
     newton: tuple[Array, Array]  # see `solve_algebraic`
+    last: Carried  # as carried, but for angles and factors of its own, which the last point may change
 
 
 def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
@@ -84,86 +94,81 @@ def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
     return carried
 
 
-def work_of(grid: CompiledGrid, theta: Array) -> Work:
+def work_of(grid: CompiledGrid, theta: Array, carried: Carried) -> Work:
     """Arrays to work on, at angles (n_bus,)."""
     both, n_gen = np.empty((2, 2, len(grid.generators))), len(grid.generators)
     rates, f, wanted = np.empty((len(NODES), 2, n_gen)), np.empty(len(theta)), np.empty(len(grid.algebraic))
     newton = np.empty_like(wanted), np.empty(len(grid.coupling))
-    return Work(both[0], both[1], rates, theta.copy(), f, wanted, newton)
+    last = carried._replace(recent=carried.recent.copy(), factor=carried.factor.copy())
+    return Work(both[0], both[1], rates, theta.copy(), f, wanted, newton, last)
 
 
 @allocation_free
-def integrate(
-    grid: CompiledGrid,
-    inputs: GridInputs,
-    steps: int,
-    carried: Carried,
-    last: Carried,
-    work: Work,
-    theta: Array,
-    omega: Array,
-    p_slack: Array,
-) -> int:
+def integrate(grid: CompiledGrid, inputs: GridInputs, carried: Carried, work: Work, found: GridStates) -> int:
     """Integrate from the first point of time to the last.
 
     Args:
         grid: the network.
         inputs: powers at n points of time.
-        steps: steps from one point to the next.
         carried: from the piece before; becomes what the next one needs.
-        last: the same but for angles and factors of its own, which the last point may change.
-        work: of the first point's angles.
-        theta: angles of all buses, (n, n_bus), rad; the first row is given and the others are computed.
-        omega: frequency deviations, (n, n_gen), rad/s; likewise.
-        p_slack: receives the slack's power, (n,), pu.
+        work: of the first point's angles, and of what is carried.
+        found: receives what happens.
 
     Returns:
         The number of points computed: less than n where the algebraic equations have no solution.
     """
-    n: int = len(omega)
-    n_gen, n_stages, h = omega.shape[1], len(NODES), inputs.dt / steps
-    state, stage, rates, angle = work.state, work.stage, work.rates, work.angle
-    for g in range(n_gen):
-        state[0, g], state[1, g] = angle[grid.generators[g]], omega[0, g]
+    n, h, state, angle = len(found.omega), inputs.dt / inputs.steps, work.state, work.angle
+    for g in range(state.shape[1]):
+        state[0, g], state[1, g] = angle[grid.generators[g]], found.omega[0, g]
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
-            copy_row(carried.factor, last.factor)
+            copy_row(carried.factor, work.last.factor)
             for i in range(len(carried.recent)):
-                copy_row(carried.recent[i], last.recent[i])
-            carried = last
+                copy_row(carried.recent[i], work.last.recent[i])
+            carried = work.last
         elif _bends(inputs, k, carried.slope):
             carried.linear[0] = 0
-        for j in range(steps):
+        for j in range(inputs.steps):
             for i in range(len(carried.ahead)):
                 angle[grid.algebraic[i]] = carried.ahead[i]
-            if not _evaluate(grid, inputs, (k, j / steps), carried, 0, state, work):
+            if not _evaluate(grid, inputs, (k, j / inputs.steps), carried, 0, state, work):
                 return k
             if j == 0:
-                copy_row(angle, theta[k])
-                copy_row(state[1], omega[k])
-                p_slack[k] = work.f[grid.slack]
+                copy_row(angle, found.theta[k])
+                copy_row(state[1], found.omega[k])
+                found.p_slack[k] = work.f[grid.slack]
                 if k == n - 1:
                     return n
-            if _adams(grid, inputs, (k, (j + 1) / steps), h, carried, work):
-                continue
-            for s in range(1, n_stages):
-                copy_row(state[0], stage[0])
-                copy_row(state[1], stage[1])
-                for r in range(s):
-                    for q in range(2):
-                        for g in range(n_gen):
-                            stage[q, g] += h * STAGES[s, r] * rates[r, q, g]
-                _extrapolate(grid, carried.recent, NODES[s], angle)
-                if not _evaluate(grid, inputs, (k, (j + NODES[s]) / steps), carried, s, stage, work):
-                    return k
-            for s in range(n_stages):
-                for q in range(2):
-                    for g in range(n_gen):
-                        state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
-            _extrapolate(grid, carried.recent, 1.0, angle)
-            for i in range(len(carried.ahead)):
+            done = _adams(grid, inputs, (k, (j + 1) / inputs.steps), h, carried, work)
+            if not (done or _runge_kutta(grid, inputs, (k, j), h, carried, work)):
+                return k
+            for i in range(len(carried.ahead)):  # near these the next step begins
                 carried.ahead[i] = angle[grid.algebraic[i]]
     return n
+
+
+@allocation_free
+def _runge_kutta(
+    grid: CompiledGrid, inputs: GridInputs, begin: tuple[int, int], h: float, carried: Carried, work: Work
+) -> bool:
+    """Take step j after point k, (k, j), whose first derivatives are known; whether there is a solution."""
+    (k, j), state, stage, rates = begin, work.state, work.stage, work.rates
+    for s in range(1, len(NODES)):
+        copy_row(state[0], stage[0])
+        copy_row(state[1], stage[1])
+        for r in range(s):
+            for q in range(2):
+                for g in range(state.shape[1]):
+                    stage[q, g] += h * STAGES[s, r] * rates[r, q, g]
+        _extrapolate(grid, carried.recent, NODES[s], work.angle)
+        if not _evaluate(grid, inputs, (k, (j + NODES[s]) / inputs.steps), carried, s, stage, work):
+            return False
+    for s in range(len(NODES)):
+        for q in range(2):
+            for g in range(state.shape[1]):
+                state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
+    _extrapolate(grid, carried.recent, 1.0, work.angle)
+    return True
 
 
 @allocation_free
@@ -212,8 +217,6 @@ def _adams(
         return False
     copy_row(predicted[0], work.state[0])
     copy_row(predicted[1], work.state[1])
-    for i in range(len(carried.ahead)):
-        carried.ahead[i] = work.angle[grid.algebraic[i]]
     return True
 
 

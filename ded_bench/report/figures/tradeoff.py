@@ -25,6 +25,7 @@ LINEAR_GAP = 0.01
 SIDES = (
     *(("left", "bottom", (6, 2)), ("left", "top", (6, -2)), ("right", "top", (-6, -2))),
     *(("right", "bottom", (-6, 2)), ("center", "bottom", (0, 6)), ("center", "top", (0, -6))),
+    *(("center", "bottom", (0, 15)), ("center", "top", (0, -15))),
 )
 
 
@@ -111,7 +112,8 @@ def _keep_apart(ax: Axes) -> None:
             word.set(ha=side[0], va=side[1])
             word.xyann = side[2]
             boxes[side] = word.get_window_extent()
-        ha, va, offset = min(SIDES, key=lambda side: sum(map(boxes[side].overlaps, taken)))
+        shared = {side: [Bbox.intersection(box, other) for other in taken] for side, box in boxes.items()}
+        ha, va, offset = min(SIDES, key=lambda side: sum(b.width * b.height for b in shared[side] if b))
         word.set(ha=ha, va=va)
         word.xyann = offset
         taken.append(boxes[ha, va, offset])

@@ -241,6 +241,13 @@ def simulate(
     )
 
 
+def copied(arrays: Any) -> Any:
+    """A named tuple of arrays, perhaps of such tuples, with arrays of its own; None stays."""
+    if isinstance(arrays, np.ndarray):
+        return arrays.copy()
+    return arrays and type(arrays)(*map(copied, arrays))
+
+
 def in_threads(
     function: Callable[[Item], Answer], items: Iterable[Item], threads: int | None = None
 ) -> list[Answer | InputError | SimulationError]:

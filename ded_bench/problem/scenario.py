@@ -137,22 +137,23 @@ class Scenario(Fingerprinted):
 
     @functools.cached_property
     def ramps(self) -> Array:
-        """Start, duration, rate, announced start and rate, (5, n_load, most ramps); unannounced: NaN."""
-        most = max(len(load.ramps) for load in self.load.values())
-        found = np.tile([np.inf, 0.0, 0.0, np.nan, np.nan], (len(self.load), most, 1))
+        """Start, duration, rate, announced start and rate, (5, n_load, most ramps); unannounced: never."""
+        found = np.zeros((len(self.load), max(len(load.ramps) for load in self.load.values()), 5))
         for own, load in zip(found, self.load.values(), strict=True):
             for i, r in enumerate(load.ramps):
-                own[i] = r.start, r.duration, r.rate, r.announced_start, r.announced_rate
+                told = np.inf if r.announced_start is None else r.announced_start
+                own[i] = r.start, r.duration, r.rate, told, r.announced_rate or 0.0
         return np.moveaxis(found, 2, 0)
 
     @functools.cached_property
-    def fluctuations(self) -> tuple[Array, Array, Array]:
-        """Steps and decays, (n_load, 1), s, and values, (n_load, most values), pu; the last stays."""
+    def fluctuations(self) -> tuple[Array, Array, Array, Array]:
+        """Initial loads, pu, steps and decays, s, (n_load, 1); values, (n_load, most), pu: the last stays."""
         given = [load.fluctuation for load in self.load.values()]
         most = max(len(own.values) for own in given)
         values = [np.pad(own.array, (0, most - len(own.values)), mode="edge") for own in given]
+        initial = np.array([load.initial for load in self.load.values()])[:, None]
         step, decay = np.array([(own.step_s, own.decay_s) for own in given]).T[:, :, None]
-        return step, decay, np.array(values)
+        return initial, step, decay, np.array(values)
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """True load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
@@ -219,7 +220,7 @@ class Forecast:
     ) -> Instance:
         """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
         points = (_points(times, values, start, horizon_s) for times, values in self.loads)
-        return Instance(
+        return Instance.model_construct(
             schema_="ded-bench/instance/2",
             id=name,
             case=case.id,
@@ -246,7 +247,7 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
         now: when the forecast is made.
         until: the end of what is asked for; after `now`.
     """
-    loads = [scenario.load[bus] for bus in case.loads]
+    loads = (scenario.load[bus] for bus in case.loads)
     if quality == "persistence":
         return Forecast(tuple((np.array([now, until]), np.full(2, load.at(np.array(now)))) for load in loads))
     if quality == "perfect":
@@ -256,19 +257,21 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
     begun = start <= now
     start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))
     rate = np.where(begun, rate, rate + wrong * (told_rate - rate))
-    start, rate = np.where(np.isnan(rate), np.inf, start), np.nan_to_num(rate)  # nobody told of these
-    step, decay, fluctuations = scenario.fluctuations
+    initial, step, decay, fluctuations = scenario.fluctuations
     steps = now + step * np.arange(math.ceil((until - now) / step.min()) + 1)
     times = np.sort(np.concatenate([np.minimum(steps, until), start, start + duration], axis=1), axis=1)
     times = np.clip(times, now, until)
     gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
     k = np.minimum(now // step, fluctuations.shape[1] - 2).astype(int)
-    before, after = (np.take_along_axis(fluctuations, i, axis=1) for i in (k, k + 1))
+    own = np.arange(len(k))[:, None]
+    before, after = fluctuations[own, k], fluctuations[own, k + 1]
     present = (after - before) / ((k + 1) * step - k * step) * (now - k * step) + before  # as np.interp
-    initial = np.array([[load.initial] for load in scenario.load.values()])
     values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
-    by_bus = dict(zip(scenario.load, zip(times, values, _are_new(times), strict=True), strict=True))
-    return Forecast(tuple((t[new], v[new]) for t, v, new in (by_bus[bus] for bus in case.loads)))
+    new = _are_new(times)
+    t, v, ends = times[new], values[new], np.cumsum(new.sum(axis=1)).tolist()
+    points = [(t[first:end], v[first:end]) for first, end in zip([0, *ends], ends, strict=False)]
+    by_bus = dict(zip(scenario.load, points, strict=True))
+    return Forecast(tuple(by_bus[bus] for bus in case.loads))
 
 
 def _true(load: ScenarioLoad, now: float, until: float) -> tuple[Array, Array]:

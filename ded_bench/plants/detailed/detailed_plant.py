@@ -8,7 +8,6 @@ governors; what turbines deliver follows. Loads draw constant power at any volta
 
 from __future__ import annotations
 
-import copy
 import functools
 import hashlib
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem, linearised
 from ded_bench.plants.detailed.start import corrected, initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
-from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
+from ded_bench.plants.plant import NominalPoint, Piece, SimulationError, copied
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import AgcState, Instance, State
@@ -91,8 +90,7 @@ class DetailedPlant:
         agc, shares = self.case.agc, self.system.shares
         if agc is None:
             return SecondaryControl(shares, 0.0, NEVER, 1)
-        places = np.array([state.next_s, agc.period_s]) / dt_s
-        first, period = np.round(places).astype(int).tolist()
+        first, period = (round(time_s / dt_s) for time_s in (state.next_s, agc.period_s))
         return SecondaryControl(shares, agc.k, first, period)
 
     def advance(
@@ -103,7 +101,8 @@ class DetailedPlant:
 
         n, control = len(p_set), self.control(state, dt_s)
         system, machines = self.system, self.system.scheduled
-        p_ref = np.tile(state.offset, (n, 1))
+        p_ref = np.empty((n, len(state.offset)))
+        p_ref[:] = state.offset
         p_ref[:, machines] += p_set
         drawn = np.ascontiguousarray(system.p_drawn(p_load)[:, : system.network.n_load_port])
         network = system.compiled_network
@@ -115,7 +114,7 @@ class DetailedPlant:
         needed = max(system.fastest * dt_s / STEP_BY_MODE, dt_s / LONGEST_S if exact else 1.0)
         steps = int(np.ceil(needed - 1e-9))
         try:
-            carried = copy.deepcopy(state.carried) or stepper.carried_voltages(network, drawn[0], states.v[0])
+            carried = copied(state.carried) or stepper.carried_voltages(network, drawn[0], states.v[0])
             done = stepper.integrate_plant(system.data, network, inputs, control, steps, carried, states)
         except np.linalg.LinAlgError:
             done = 0

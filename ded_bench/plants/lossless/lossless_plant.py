@@ -6,7 +6,6 @@ is missing. See `network` for the equations.
 
 from __future__ import annotations
 
-import copy
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import numpy as np
 from ded_bench.files.errors import InputError
 from ded_bench.plants.hold import Hold, across_intervals, doubled, series_step
 from ded_bench.plants.lossless.network import Network
-from ded_bench.plants.plant import NominalPoint, Piece, SimulationError
+from ded_bench.plants.plant import NominalPoint, Piece, SimulationError, copied
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.dispatch import merit_order
@@ -86,7 +85,7 @@ class LosslessPlant:
         steps = max(int(np.ceil(state.divisions * dt_s / (1.0 if exact else PLANNING_STEP))), 1)
         powers = np.ascontiguousarray(p_set), network.load_injections(p_load)
         grid = network.grid if exact else network.grid._replace(mismatch=PLANNING_MISMATCH)
-        carried = copy.deepcopy(state.carried) or stepper.carried_from(grid, state.theta)
+        carried = copied(state.carried) or stepper.carried_from(grid, state.theta)
         work = stepper.work_of(grid, state.theta, carried)
         if stepper.integrate(grid, stepper.GridInputs(*powers, dt_s, steps), carried, work, found) < n:
             raise SimulationError("the system cannot follow this schedule: the power flow has no solution")

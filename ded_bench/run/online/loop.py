@@ -299,7 +299,8 @@ class _Loop:
     def _followed(self, until: int) -> Array:
         """Set-points from now to `until` on the way to the plan's, within ramp limits."""
         now = self.history.now
-        power = np.vstack([self.history.p_set[now], self.course.at(now, until)[1:]])
+        power = self.course.at(now, until)
+        power[0] = self.history.p_set[now]
         endless = np.full_like(self.case.ramp, np.inf)
         track(power[None], -endless, endless, self.case.ramp * self.dt)
         return power

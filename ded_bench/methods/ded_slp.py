@@ -20,7 +20,7 @@ from ded_bench.methods.knots import case_knots, is_reachable
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.slp import Attempt, End, Parts, Rows, sequence, solve_with_rows_added
 from ded_bench.methods.solution import Settings, Solution
-from ded_bench.plants.plant import plant_of, simulate
+from ded_bench.plants.plant import PlantState, plant_of, simulate
 from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.limits import Bounds
@@ -131,6 +131,7 @@ class _OnPlant:
     best: Simulated | None = None  # the cheapest strictly feasible one
     steps: list[float] = field(default_factory=list)  # largest move of a set-point by each program, pu
     radius: float = np.inf  # most that a program may move one, pu
+    state: PlantState = None  # of the plant at t = 0
 
     def run(self, start: Schedule) -> End[Simulated, Prediction]:
         """Go on until a simulated schedule confirms its program; P_0 replaces the start's first power."""
@@ -154,7 +155,9 @@ class _OnPlant:
         return Schedule(t=self.instance.grid[self.points], p=p_gen)
 
     def _follow(self, p_gen: Array) -> Simulated:
-        trajectory = simulate(self.case, self.instance, self._schedule(p_gen))
+        if self.state is None:
+            self.state = plant_of(self.case).initial(self.instance)
+        trajectory = simulate(self.case, self.instance, self._schedule(p_gen), state=self.state)
         cost = trajectory.cost(self.instance.cost_gen(self.case), self.instance.cost_slack(self.case))
         # After t_0: x_0 is given, wherever it lies.
         excess = float(self.bounds.beyond(trajectory.omega @ self.bounds.matrix.T)[1:].max())
@@ -169,7 +172,7 @@ class _OnPlant:
         last, self.last = self.last, None  # a chain of all would be kept
         program = KnotProgram(self.case, self.instance, bounds, model, radius=self.radius, before=last)
         self.last = program
-        if self.is_near:
+        if self.is_near or not (number or program.condensed):  # a condensed program's rows are dense
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
         rows = Rows(OPEN, enough)

@@ -199,6 +199,8 @@ class KnotColumns:
     def _transfers(self) -> tuple[sp.csc_matrix, Array]:
         """What the machines of each transfer deliver at all knots but the first, and how far it may go up."""
         by_machine = self._case.transfer_rows[0]
+        if not len(by_machine):
+            return self.matrix(0, []), np.empty(0)
         room = transfer_room(self._case, self._instance, self._model.points)
         row = np.arange(room.size).reshape(room.shape)
         blocks = [(row, self.u, np.broadcast_to(by_machine, (self._n, *by_machine.shape)))]

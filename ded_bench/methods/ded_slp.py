@@ -175,8 +175,7 @@ class _OnPlant:
         if self.is_near or not (number or program.condensed):  # a condensed program's rows are dense
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf
-        rows = Rows(OPEN, enough)
-        attempt = solve_with_rows_added(program, self.limits, rows, self.deadline)
+        attempt = solve_with_rows_added(program, self.limits, Rows(OPEN, enough), self.deadline)
         if attempt.wanted is not None:
             self.steps.append(float(np.abs(attempt.wanted - around.at).max()))
             # Where steps do not shrink, programs jump between vertices of nearly the same cost.

@@ -279,9 +279,8 @@ class KnotProgram:
             paid = np.append(self._columns.u, self._columns.x)
             along = model.delivered.p_gen @ self._instance.cost_gen(self._case)
             generation = float(along.sum() + self._columns.cost[paid] @ columns[paid])
-        return Prediction(
-            p_gen, outputs, p_slack, generation + self._columns.slack_price * float(np.abs(p_slack).sum())
-        )
+        cost = generation + self._columns.slack_price * float(np.abs(p_slack).sum())
+        return Prediction(p_gen, outputs, p_slack, cost)
 
     def divide(self, columns: Array, predicted: Prediction) -> bool:
         """Divide pieces in which P_s changes sign, if what cancels matters to the cost; whether it did."""

@@ -263,8 +263,7 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
     times = np.clip(times, now, until)
     gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
     k = np.minimum(now // step, fluctuations.shape[1] - 2).astype(int)
-    own = np.arange(len(k))[:, None]
-    before, after = fluctuations[own, k], fluctuations[own, k + 1]
+    before, after = (fluctuations[np.arange(len(k))[:, None], i] for i in (k, k + 1))
     present = (after - before) / ((k + 1) * step - k * step) * (now - k * step) + before  # as np.interp
     values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
     new = _are_new(times)

@@ -44,18 +44,8 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = Fals
     solver.settings.eps_duality_gap_rel = GAP
     least = REGULARISATION if staged else SPARSE_REGULARISATION
     solver.settings.reg_lower_limit = solver.settings.reg_finetune_lower_limit = least
-    n = len(form.cost)
-    solver.setup(
-        sp.csc_matrix((n, n)),
-        form.cost,
-        form.equal,
-        form.right,
-        form.between,
-        form.low,
-        form.high,
-        form.lower,
-        form.upper,
-    )
+    quadratic, limits = sp.csc_matrix((len(form.cost),) * 2), (form.low, form.high, form.lower, form.upper)
+    solver.setup(quadratic, form.cost, form.equal, form.right, form.between, *limits)
     if np.isfinite(time_limit_s):
         begun = time.perf_counter()
         solver.settings.max_iter = 1

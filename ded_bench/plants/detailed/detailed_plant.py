@@ -101,8 +101,7 @@ class DetailedPlant:
 
         n, control = len(p_set), self.control(state, dt_s)
         system, machines = self.system, self.system.scheduled
-        p_ref = np.empty((n, len(state.offset)))
-        p_ref[:] = state.offset
+        p_ref = state.offset + np.zeros((n, 1))
         p_ref[:, machines] += p_set
         drawn = np.ascontiguousarray(system.p_drawn(p_load)[:, : system.network.n_load_port])
         network = system.compiled_network

@@ -146,7 +146,7 @@ def test_knots_further_apart_than_the_horizon_are_its_ends(case):
 def test_failures_are_said(case, monkeypatch):
     """A system that loses synchronism under every schedule."""
 
-    def lost(*args):
+    def lost(*args, **named):
         raise SimulationError("lost")
 
     monkeypatch.setattr(ded_slp, "simulate", lost)

@@ -220,7 +220,7 @@ class Forecast:
     ) -> Instance:
         """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
         points = (_points(times, values, start, horizon_s) for times, values in self.loads)
-        return Instance.model_construct(
+        return Instance.model_construct(  # of parts that were checked
             schema_="ded-bench/instance/2",
             id=name,
             case=case.id,

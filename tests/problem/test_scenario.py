@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from ded_bench.files.errors import InputError
-from ded_bench.files.strict import read_record
+from ded_bench.files.strict import parse_record, read_record
 from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import Manifest, scenario_files, write_scenarios
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import FLUCTUATION, LOAD_RANGE, sample_scenario
 from ded_bench.problem.scenario import QUALITIES, Scenario, forecast, load_scenarios
 
@@ -101,7 +102,9 @@ def test_points_of_an_instance_are_the_forecast(known, threebus, quality):
     """Shifted to t = 0 at its start; every forecast begins with the present load."""
     loads = forecast(known, threebus, quality, 5.0, 16.0)
     assert loads.at(np.array([5.0])) == pytest.approx(known.p_load(threebus, np.array([5.0])), abs=1e-15)
-    (points,) = loads.instance(known, threebus, 7.31, 6.0, known.initial, "later").load.values()
+    instance = loads.instance(known, threebus, 7.31, 6.0, known.initial, "later")
+    assert parse_record(Instance, instance.model_dump_json(by_alias=True), "it passes all checks") == instance
+    (points,) = instance.load.values()
     times = np.linspace(0.0, 6.0, 601)
     np.testing.assert_allclose(points.at(times), loads.at(7.31 + times)[:, 0], atol=1e-14)
     assert points.points[-1][0] == 6.0

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
-from pydantic import Field, model_validator
+from pydantic import Field
 from tqdm import tqdm
 
 from ded_bench.files.strict import Record, read_record, write_record
@@ -32,7 +32,6 @@ from ded_bench.plants.score import STRICT_HZ, STRICT_PU, Score
 from ded_bench.problem.case import Case
 from ded_bench.problem.sampling import CERTIFICATE_SEED, sample_instances
 from ded_bench.results.folder import ResultsFolder
-from ded_bench.results.legacy import upgraded
 from ded_bench.results.timing import model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers, WorkersLostError
@@ -92,15 +91,6 @@ class Certificate(Criteria):
     version: str
     host: str
     date: str
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_old_names(cls, data: Any) -> Any:
-        """One that was made before methods had options told the code by hashes."""
-        if not (isinstance(data, dict) and "code" in data):
-            return data
-        dropped = ("code", "reference_code", "score_code", "method_version")
-        return {name: value for name, value in upgraded(data).items() if name not in dropped}
 
     @property
     def key(self) -> tuple[str, str, str, str, str]:

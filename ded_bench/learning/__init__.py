@@ -24,17 +24,12 @@ if TYPE_CHECKING:
     from ded_bench.learning.linear_programs import export_programs as export_programs
 
 _HOMES = {
-    "CasadiModel": "ded_bench.learning.casadi_expressions",
-    "CondensedMap": "ded_bench.learning.as_arrays",
-    "SplitArrays": "ded_bench.learning.as_arrays",
-    "casadi_model": "ded_bench.learning.casadi_expressions",
-    "condense": "ded_bench.learning.as_arrays",
-    "cost_and_excess": "ded_bench.learning.differentiable",
-    "export_programs": "ded_bench.learning.linear_programs",
-    "linearise": "ded_bench.learning.as_arrays",
-    "simulate_many": "ded_bench",
-    "simulated": "ded_bench.learning.differentiable",
-    "split_arrays": "ded_bench.learning.as_arrays",
+    **dict.fromkeys(("CasadiModel", "casadi_model"), "learning.casadi_expressions"),
+    **dict.fromkeys(("cost_and_excess", "simulated"), "learning.differentiable"),
+    "export_programs": "learning.linear_programs",
+    "simulate_many": "",
+    **dict.fromkeys(("condense", "linearise", "split_arrays"), "learning.as_arrays"),
+    **dict.fromkeys(("CondensedMap", "SplitArrays"), "learning.as_arrays"),
 }
 __all__ = [*_HOMES]
 
@@ -42,4 +37,4 @@ __all__ = [*_HOMES]
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    return getattr(importlib.import_module(f"ded_bench.{_HOMES[name]}".rstrip(".")), name)

@@ -168,10 +168,8 @@ class _OnPlant:
 
     def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
-        bounds = self.bounds.tightened(MARGIN)
-        last, self.last = self.last, None  # a chain of all would be kept
-        program = KnotProgram(self.case, self.instance, bounds, model, radius=self.radius, before=last)
-        self.last = program
+        given = self.case, self.instance, self.bounds.tightened(MARGIN), model
+        self.last = program = KnotProgram(*given, radius=self.radius, before=self.last)
         if self.is_near or not (number or program.condensed):  # a condensed program's rows are dense
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf

@@ -20,6 +20,8 @@ ROUND_OFF = 1e-13
 #: Grid points of a piece of Σ |P_s|, about, at first. Within one its sign is taken to be the same: of the
 #: cost that leaves 3e-6 to be gained (9bus, validation draws), a third of what 40 points would.
 PIECE = 20
+#: P_s is taken to keep its sign if along the trajectory |P_s| is never below this part of its largest value.
+STEADY = 0.1
 
 
 class OutputRows:
@@ -73,6 +75,11 @@ class BasisByPlaces(NamedTuple):
         return Basis(self.columns, np.append(self.rows, outputs))
 
 
+def pieces_of(model: TimeVarying) -> Indices:
+    """First grid points of the pieces of Σ |P_s| at first, where its sign may change."""
+    return divided(model.points, -(-model.lengths // PIECE))
+
+
 #: Row numbers, column numbers and values of dense blocks, stacked or single.
 Block = tuple[Indices, Indices, Array]
 
@@ -87,7 +94,7 @@ class KnotColumns:
         instance: costs and P_0.
         model: a linear model along a trajectory that starts at P_0.
         condensed: states are substituted.
-        pieces: first grid points of the pieces; None: such as PIECE says.
+        pieces: first grid points of the pieces; None: one an interval if P_s keeps its sign, else see PIECE.
     """
 
     def __init__(
@@ -98,8 +105,12 @@ class KnotColumns:
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         #: First grid points of the pieces of Σ |P_s|; every interval between knots has its own.
         self.pieces = np.empty(0, dtype=int)
+        #: What s is no less than: P_s, -P_s, or both.
+        self.signs: tuple[float, ...] = 1.0, -1.0
         if case.slack is not None:
-            self.pieces = divided(model.points, -(-model.lengths // PIECE)) if pieces is None else pieces
+            self.pieces, size = pieces_of(model) if pieces is None else pieces, np.abs(model.p_slack)
+            if pieces is None and size.min() > STEADY * size.max():
+                self.pieces, self.signs = model.points[:-1], (float(np.sign(model.p_slack[0])),)
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
@@ -119,7 +130,7 @@ class KnotColumns:
         """The program without limits of outputs, in which no set-point moves by more than the radius, pu."""
         case, model = self._case, self._model
         ramp = np.diff(model.p_gen, axis=0) / self._durations[:, None]
-        slack = np.add.reduceat(model.p_slack, self.pieces)
+        slack = np.outer(self.signs, np.add.reduceat(model.p_slack, self.pieces)).ravel()
         p_min, p_max = power_limits(case, self._instance, model.lengths)
         transfers, room = self._transfers()
         lower, upper = np.full((2, self.count), np.inf) * [[-1.0], [1.0]]
@@ -131,8 +142,8 @@ class KnotColumns:
             equal=self._dynamics,
             right=np.zeros(self.x.size),
             between=sp.csc_matrix(sp.vstack([self._ramps(), self._slack_sums, transfers])),
-            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(2 * len(slack) + room.size, -np.inf)]),
-            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, slack, room]),
+            low=np.concatenate([(-case.ramp - ramp).ravel(), np.full(len(slack) + room.size, -np.inf)]),
+            high=np.concatenate([(case.ramp - ramp).ravel(), -slack, room]),
             lower=lower,
             upper=upper,
         )
@@ -208,12 +219,13 @@ class KnotColumns:
 
     @functools.cached_property
     def _slack_sums(self) -> sp.csc_matrix:
-        """Σ δP_s - s over every piece, then -Σ δP_s - s."""
+        """Σ δP_s - s over every piece, or -Σ δP_s - s."""
         n = len(self.pieces)
         if not n:
             return self.matrix(0, [])
-        rows, place = self._model.slack_rows(self.pieces), np.arange(n)
-        one = np.ones((n, 1, 1))
-        blocks = self.local(rows, place) + self.local(rows, place + n, -1.0)
-        blocks += [(p[:, None], self.s[:, None], -one) for p in (place, place + n)]
-        return self.matrix(2 * n, blocks)
+        rows, blocks = self._model.slack_rows(self.pieces), []
+        for number, sign in enumerate(self.signs):
+            place = np.arange(n) + n * number
+            blocks += self.local(rows, place, sign)
+            blocks += [(place[:, None], self.s[:, None], -np.ones((n, 1, 1)))]
+        return self.matrix(n * len(self.signs), blocks)

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows
+from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows, pieces_of
 from ded_bench.methods.knots import divided, knot_weights
 from ded_bench.methods.reserve import Room
 from ded_bench.plants.plant import PlantState
@@ -47,15 +47,17 @@ LONG = 20
 #: little as possible, and where a program prices every excess from the start: an exact penalty above nearly
 #: all multipliers of the limits.
 LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
-#: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval.
-NEAR, PARTS = 0.9, 8
+#: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval. A
+#: peak beyond the last part moves when it is cut off: the two points on either side of it get rows, too.
+NEAR, PARTS, CUT = 0.9, 6, 0.99
 #: A row of a condensed program is dense: at knots a limit has one if the trajectory exceeds this part of the
 #: bound, or an answer exceeds that part when another row is missing; between knots where the bound is
 #: exceeded, at peaks and at so many points of an interval. Chosen on validation draws of two-area-agc and
 #: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
 HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
 #: What |P_s| may cost beyond what its pieces pay for, as a part of all; validation draws have up to 1.7e-5.
-CANCELLED = 1e-4
+#: Where its sign was taken to stay, what shows that it did not.
+CANCELLED, STAYED = 1e-4, 1e-7
 #: Output, grid point, and the sign of the bound that it comes near, of a limit between knots.
 Limit = tuple[int, int, int]
 
@@ -113,7 +115,9 @@ class KnotProgram:
         self._margin = np.zeros(len(model.omega)) if plan is None or plan.margin is None else plan.margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
-        pieces = None if before is None else before._columns.pieces
+        pieces = None if plan is None else pieces_of(model)
+        if before is not None and len(before._columns.signs) > 1:
+            pieces = before._columns.pieces
         self._columns: KnotColumns = KnotColumns(case, instance, model, self.condensed, pieces)
         self._output_rows = OutputRows(model)
         generation = self._columns.generation[1:]
@@ -243,11 +247,10 @@ class KnotProgram:
         chosen = np.zeros(beyond.shape, dtype=bool)
         peak = (beyond[:, 1:-1] >= beyond[:, :-2]) & (beyond[:, 1:-1] >= beyond[:, 2:])
         chosen[:, 1:-1] = peak
-        # A peak that is cut off moves to the points beside it.
-        over = peak & (beyond[:, 1:-1] > 0.0)
         if not self.condensed:
-            chosen[:, :-2] |= over
-            chosen[:, 2:] |= over
+            of, k = np.nonzero(peak & (beyond[:, 1:-1] > (CUT - 1.0) * self.bounds.limit[:, None]))
+            for beside in (-2, -1, 1, 2):
+                chosen[of, np.clip(k + 1 + beside, 0, points[-1])] = True
         chosen[:, divided(points, np.full(len(points) - 1, parts))] = True
         if widened is not None:  # coming back from beyond a bound, outputs are most where an interval begins
             chosen[:, points[:-1] + 1] |= beyond[:, points[:-1] + 1] > 0.0
@@ -286,15 +289,18 @@ class KnotProgram:
         """Divide pieces in which P_s changes sign, if what cancels matters to the cost; whether it did."""
         old, size = self._columns, np.abs(predicted.p_slack)
         unpaid = old.slack_price * float(size.sum() - columns[old.s].sum())
-        if unpaid <= CANCELLED * abs(predicted.objective):
+        is_steady = len(old.signs) == 1
+        if unpaid <= (STAYED if is_steady else CANCELLED) * abs(predicted.objective):
             return False
-        owner = np.searchsorted(old.pieces, np.arange(len(size) - 1), side="right") - 1
-        sums, sizes = (np.add.reduceat(values, old.pieces) for values in (predicted.p_slack, size))
-        cancels = sizes - np.abs(sums) > 1e-9 * sizes
-        pieces = np.union1d(old.pieces, np.flatnonzero(cancels[owner]))
+        pieces = pieces_of(self.model)
+        if not is_steady:
+            owner = np.searchsorted(old.pieces, np.arange(len(size) - 1), side="right") - 1
+            sums, sizes = (np.add.reduceat(values, old.pieces) for values in (predicted.p_slack, size))
+            cancels = sizes - np.abs(sums) > 1e-9 * sizes
+            pieces = np.union1d(old.pieces, np.flatnonzero(cancels[owner]))
         self._columns = KnotColumns(self._case, self._instance, self.model, self.condensed, pieces)
         self.__dict__.pop("_all_knots", None)  # cached, by columns
-        return len(pieces) > len(old.pieces)
+        return is_steady or len(pieces) > len(old.pieces)
 
     @property
     def _is_sparse(self) -> bool:

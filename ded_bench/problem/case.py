@@ -6,9 +6,10 @@ import abc
 import functools
 import importlib
 import json
+import pickle
 import pkgutil
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -148,6 +149,14 @@ class Case(Fingerprinted, Extended):
         return isinstance(other, Case) and super().__eq__(other) and self._grid == other._grid
 
     __hash__ = Fingerprinted.__hash__
+
+    def __reduce__(self) -> tuple[Callable[[bytes], Case], tuple[bytes]]:
+        """Pickled once, and read once where it arrives: every request to a worker names its case."""
+        return _unpickled, (self._pickled,)
+
+    @functools.cached_property
+    def _pickled(self) -> bytes:
+        return pickle.dumps((type(self), self.__getstate__()))
 
     @property
     def detailed(self) -> GridFiles:
@@ -302,6 +311,14 @@ class Case(Fingerprinted, Extended):
             if regime not in self.regimes:
                 problem = f"unknown regime {regime!r} (known: {', '.join(self.regimes)})"
                 raise InputError(f"case {self.id}", "regime", problem)
+
+
+@functools.lru_cache(maxsize=4)
+def _unpickled(content: bytes) -> Case:
+    kind, state = pickle.loads(content)  # part of a pickle itself
+    case: Case = kind.__new__(kind)
+    case.__setstate__(state)
+    return case
 
 
 def _record_of(text: str, path: Path) -> type[Case]:

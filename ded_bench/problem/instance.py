@@ -137,7 +137,7 @@ class State:
             for name, values in arrays.items()
             if values is not None
         }
-        return Initial(**by_name, agc=self.agc)
+        return Initial.model_construct(None, agc=self.agc, **by_name)
 
 
 class Instance(Fingerprinted):
@@ -246,13 +246,8 @@ class Instance(Fingerprinted):
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
-        times, loads = self.grid if t is None else t, [self.load[bus] for bus in case.loads]
-        ramps = [load for load in loads if isinstance(load, LoadRamp)]
-        if len(ramps) < len(loads):
-            return np.stack([load.at(times) for load in loads], axis=-1)
-        numbers = [(load.initial, load.start, load.duration, load.rate) for load in ramps]
-        initial, start, duration, rate = np.array(numbers).T
-        return np.asarray(initial + rate * np.clip(times[..., None] - start, 0.0, duration))
+        times = self.grid if t is None else t
+        return np.stack([self.load[bus].at(times) for bus in case.loads], axis=-1)
 
     def p_initial(self, case: Case) -> Array:
         """Generator power at t = 0 (the paper's P_0), shape (n_gen,), pu."""

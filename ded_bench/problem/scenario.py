@@ -6,6 +6,7 @@ And forecasts: what is known at an instant of a scenario's loads from then on.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ded_bench.files.errors import InputError
@@ -207,20 +207,32 @@ RESOLUTION = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Loads from an instant on, linear between points."""
+    """Loads from an instant on, linear between points; one at the time of the one before says nothing."""
 
-    loads: tuple[tuple[Array, Array], ...]  # of each load: times in s of the scenario, injections in pu
+    times: Array  # (n_load, n_points), s of the scenario, ascending
+    values: Array  # (n_load, n_points), injections, pu
 
     def at(self, t: Array) -> Array:
         """Forecast injections at times `t` in s of the scenario, shape (n_t, n_load), pu."""
-        return np.stack([np.interp(t, times, values) for times, values in self.loads], axis=-1)
+        return np.stack([np.interp(t, *load) for load in zip(self.times, self.values, strict=True)], axis=-1)
 
     def instance(
         self, scenario: Scenario, case: Case, start: float, horizon_s: float, initial: Initial, name: str
     ) -> Instance:
         """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
-        points = (_points(times, values, start, horizon_s) for times, values in self.loads)
-        return Instance.model_construct(  # of parts that were checked
+        times, values, end = self.times, self.values, start + horizon_s
+        if times[0, 0] < start or times[0, -1] > end:
+            first, last = self.at(np.array([start, end]))[:, :, None]
+            values = np.where(times < start, first, np.where(times > end, last, values))
+            times = times.clip(start, end)
+        new, inner = np.ones(times.shape, dtype=bool), times[:, 1:-1]
+        new[:, 1:-1] = (inner - times[:, :-2] > RESOLUTION) & (inner < times[:, -1:] - RESOLUTION)
+        t, ends = (times - start)[new], [0, *np.cumsum(new.sum(axis=1)).tolist()]
+        t[ends[:-1]], t[np.subtract(ends[1:], 1)] = 0.0, horizon_s
+        points = tuple(zip(t.tolist(), values[new].tolist(), strict=True))
+        # Of parts that were checked: to do it again would take as long as the plant.
+        loads = [LoadPoints.model_construct(points=points[i:j]) for i, j in itertools.pairwise(ends)]
+        return Instance.model_construct(
             schema_="ded-bench/instance/2",
             id=name,
             case=case.id,
@@ -228,7 +240,7 @@ class Forecast:
             horizon_s=horizon_s,
             dt_s=scenario.dt_s,
             cost=scenario.cost,
-            load=dict(zip(case.loads, points, strict=True)),
+            load=dict(zip(case.loads, loads, strict=True)),
             initial=initial,
         )
 
@@ -247,17 +259,21 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
         now: when the forecast is made.
         until: the end of what is asked for; after `now`.
     """
-    loads = (scenario.load[bus] for bus in case.loads)
-    if quality == "persistence":
-        return Forecast(tuple((np.array([now, until]), np.full(2, load.at(np.array(now)))) for load in loads))
-    if quality == "perfect":
-        return Forecast(tuple(_true(load, now, until) for load in loads))
+    order = [*map(list(scenario.load).index, case.loads)]
     start, duration, rate, told_start, told_rate = scenario.ramps
+    initial, step, decay, fluctuations = scenario.fluctuations
+    if quality in ("perfect", "persistence"):
+        ends = np.full((len(order), 2), [now, until])
+        kinks = step * np.arange(fluctuations.shape[1]), start, start + duration
+        times = np.concatenate([ends, *(kinks if quality == "perfect" else ())], axis=1).clip(now, until)
+        times.sort(axis=1)
+        known = times if quality == "perfect" else np.full_like(times, now)
+        values = np.array([load.at(t) for load, t in zip(scenario.load.values(), known, strict=True)])
+        return Forecast(times[order], values[order])
     wrong = WORSE if quality == "worse" else 1.0
     begun = start <= now
     start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))
     rate = np.where(begun, rate, rate + wrong * (told_rate - rate))
-    initial, step, decay, fluctuations = scenario.fluctuations
     steps = now + step * np.arange(math.ceil((until - now) / step.min()) + 1)
     times = np.sort(np.concatenate([np.minimum(steps, until), start, start + duration], axis=1), axis=1)
     times = np.clip(times, now, until)
@@ -266,33 +282,4 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
     before, after = (fluctuations[np.arange(len(k))[:, None], i] for i in (k, k + 1))
     present = (after - before) / ((k + 1) * step - k * step) * (now - k * step) + before  # as np.interp
     values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
-    new = _are_new(times)
-    t, v, ends = times[new], values[new], np.cumsum(new.sum(axis=1)).tolist()
-    points = [(t[first:end], v[first:end]) for first, end in zip([0, *ends], ends, strict=False)]
-    by_bus = dict(zip(scenario.load, points, strict=True))
-    return Forecast(tuple(by_bus[bus] for bus in case.loads))
-
-
-def _true(load: ScenarioLoad, now: float, until: float) -> tuple[Array, Array]:
-    ends = [t for ramp in load.ramps for t in (ramp.start, ramp.end)]
-    times = np.sort(np.concatenate([[now, until], load.fluctuation.times, ends]).clip(now, until))
-    return (new := times[_are_new(times)]), load.at(new)
-
-
-def _are_new(times: Array) -> NDArray[np.bool_]:
-    """All but those at the time of the one before, or of the last; of times in order, (..., n)."""
-    new, inner = np.ones(times.shape, dtype=bool), times[..., 1:-1]
-    new[..., 1:-1] = (inner - times[..., :-2] > RESOLUTION) & (inner < times[..., -1:] - RESOLUTION)
-    return new
-
-
-def _points(times: Array, values: Array, start: float, horizon_s: float) -> LoadPoints:
-    end = start + horizon_s
-    if times[0] < start or times[-1] > end:
-        inside = slice(*np.searchsorted(times, [start + RESOLUTION, end - RESOLUTION]))
-        first, last = np.interp([start, end], times, values)
-        times = np.concatenate([[start], times[inside], [end]])
-        values = np.concatenate([[first], values[inside], [last]])
-    relative = [0.0, *(times[1:-1] - start).tolist(), horizon_s]
-    points = tuple(zip(relative, values.tolist(), strict=True))
-    return LoadPoints.model_construct(points=points)  # times increase; checks would take as long as the plant
+    return Forecast(times[order], values[order])

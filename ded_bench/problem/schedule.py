@@ -40,7 +40,13 @@ class Schedule:
 
     def at(self, times: Array) -> Array:
         """Powers at `times`, shape (n_times, n_gen), pu, by linear interpolation."""
-        return np.stack([np.interp(times, self.t, column) for column in self.p.T], axis=1)
+        row = (self.t.searchsorted(times, side="right") - 1).clip(0)
+        since = (times - self.t.take(row)).clip(0.0)[:, None]
+        rate = np.zeros_like(self.p)  # after the last row there is none
+        with np.errstate(all="ignore"):  # rows may be as near to each other as numbers can
+            np.divide(self.p[1:] - self.p[:-1], (self.t[1:] - self.t[:-1])[:, None], out=rate[:-1])
+            change = np.where(since > 0.0, rate.take(row, axis=0) * since, 0.0)
+        return np.asarray(self.p.take(row, axis=0) + change)
 
     def write(self, path: Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""

@@ -23,7 +23,6 @@ _NUMBERS = (
     (re.compile(r"ded-slp (\d+)ms"), "knot_s={:g}", 1e-3),
     (re.compile(r"ed (\d+)s"), "every={:g}", 1),
 )
-_PLANTS = {"paper": "lossless"}
 
 
 def renamed(method: str, settings: str) -> tuple[str, str, str]:
@@ -51,5 +50,5 @@ def upgraded(cells: Cells) -> Cells:
         cells = cells | {"policy": cells["policy"].replace("ded-dpc-shared@", "ded-admm@")}
     if "truth" in cells:
         truth = cells.pop("truth")
-        cells = cells | {"plant": _PLANTS.get(truth, truth)}
+        cells = cells | {"plant": "lossless" if truth == "paper" else truth}
     return cells

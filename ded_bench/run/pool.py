@@ -108,7 +108,7 @@ class Workers:
 
     def _answer(self, future: Future[Answer]) -> object:
         error = future.exception()
-        return _read(future.result()) if error is None else error
+        return read(future.result()) if error is None else error
 
     def _check(self) -> None:
         """Raise WorkersLostError if nothing will answer; here, processes are replaced."""
@@ -251,7 +251,8 @@ def serve(file_descriptor: int) -> None:
         connection.send_bytes(content)
 
 
-def _read(answer: Answer) -> object:
+def read(answer: Answer) -> object:
+    """What a call returned, or the exception that came instead."""
     if not isinstance(answer, bytes):
         return answer
     try:

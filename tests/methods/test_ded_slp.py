@@ -54,6 +54,18 @@ def test_pieces_within_which_the_slack_s_power_cancels_are_divided(monkeypatch: 
     assert costs[1] == pytest.approx(costs[0], rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_slack_s_power_that_keeps_its_sign_is_priced_alike(seed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without the rows of the other sign; where it changes after all, they are added."""
+    case, answers = Case.load(CASE_FILES["fivemachine"]), []
+    for steady in (0.0, 1.0):
+        monkeypatch.setattr(knot_columns, "STEADY", steady)
+        solution = prepare(case, "NO", Settings())(sample_instance(case, 77, seed))
+        assert solution.status == Status.OPTIMAL
+        answers.append(solution.solver_objective)
+    assert answers[0] == pytest.approx(answers[1], rel=1e-6)
+
+
 @pytest.mark.parametrize("index", range(2))
 def test_program_is_the_model_with_every_point(case, index):
     """HiGHS on the Pyomo model with a state, a limit and |P_s| at every grid point finds the same optimum."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import pickle
 import shlex
 from pathlib import Path
 
@@ -197,6 +198,15 @@ def test_equality_is_about_content_not_about_what_was_computed(case_file: Path) 
     assert instance.grid[0] == 0.0
     assert instance == sample_instance(fresh, 1, 2)
     assert instance != sample_instance(fresh, 1, 3)
+
+
+def test_a_case_that_arrives_again_is_read_once(case_file: Path) -> None:
+    """Requests of one case cost its bytes only; what a worker keeps by case stays with it."""
+    case = Case.load(case_file)
+    first, again = pickle.loads(pickle.dumps(case)), pickle.loads(pickle.dumps([case, 1]))[0]
+    assert first is again
+    assert first == case
+    assert (first.fingerprint, first.folder, first._grid) == (case.fingerprint, case.folder, case._grid)
 
 
 def test_the_place_of_a_case_is_one_word_of_a_shell(threebus: Case, tmp_path: Path) -> None:

@@ -26,6 +26,18 @@ def test_schedules_are_linear_between_rows():
     np.testing.assert_allclose(got, [[0, 5], [0.25, 4.75], [1, 4], [-0.5, 4], [-2, 4]], rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("n", [2, 3, 61])
+def test_schedules_are_what_numpy_interpolates(n):
+    """To the last bit, at rows, between and beyond them, and where two rows are as near as numbers can be."""
+    rng = np.random.default_rng(n)
+    t = np.sort(rng.uniform(0.0, 60.0, n))
+    t[1] = np.nextafter(t[0], 60.0) if n > 2 else t[1]
+    schedule = Schedule(t=t, p=rng.normal(size=(n, 4)) * 10)
+    times = np.concatenate([t, rng.uniform(-5.0, 65.0, 500)])
+    wanted = np.stack([np.interp(times, t, column) for column in schedule.p.T], axis=1)
+    np.testing.assert_array_equal(schedule.at(times), wanted)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz"])
 @pytest.mark.parametrize("n", [2, 50, 6001])
 def test_schedules_round_trip(case, tmp_path, n, suffix):

@@ -8,9 +8,8 @@ process of its own, which is killed if it takes too long.
 
 from __future__ import annotations
 
-import atexit
-import functools
 import math
+import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,11 +26,13 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Forecast, Scenario, forecast
 from ded_bench.problem.schedule import Schedule, Trajectory
-from ded_bench.run.pool import NoAnswerError, WorkerDiedError, Workers
+from ded_bench.run.pool import Children, NoAnswerError, WorkerDiedError, read
 from ded_bench.run.runner import GRACE_S
 from ded_bench.run.tasks import prepared, reason_of, trace_of
 from ded_bench.solvers.status import Status
 
+#: The process that plans; it ends with this one.
+_children = Children()
 #: How long a method may take for one plan unless told otherwise, s of the clock.
 LIMIT_S = 60.0
 
@@ -89,15 +90,7 @@ class Planner:
 
 def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:
     """What a function answers in the other process, or the exception that came instead."""
-    ((_, answer),) = _workers().imap([(function, arguments)], [None], [limit_s])
-    return answer
-
-
-@functools.cache
-def _workers() -> Workers:
-    workers = Workers()
-    atexit.register(workers.close)
-    return workers
+    return read(_children.call(pickle.dumps((function, arguments)), limit_s))
 
 
 def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:

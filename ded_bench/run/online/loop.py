@@ -8,6 +8,7 @@ process of its own, which is killed if it takes too long.
 
 from __future__ import annotations
 
+import atexit
 import math
 import pickle
 import time
@@ -31,8 +32,9 @@ from ded_bench.run.runner import GRACE_S
 from ded_bench.run.tasks import prepared, reason_of, trace_of
 from ded_bench.solvers.status import Status
 
-#: The process that plans; it ends with this one.
+#: The process that plans.
 _children = Children()
+atexit.register(_children.close)
 #: How long a method may take for one plan unless told otherwise, s of the clock.
 LIMIT_S = 60.0
 
@@ -83,8 +85,7 @@ class Planner:
 
     def _none(self, error: object, started: float) -> Planned:
         self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
-        late = isinstance(error, NoAnswerError)
-        seconds = time.perf_counter() - started
+        late, seconds = isinstance(error, NoAnswerError), time.perf_counter() - started
         return Planned(None, late, seconds=seconds, error=reason_of(error), trace=trace_of(error))
 
 

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from ded_bench.learning.linear_programs import export_programs as export_programs
 
 _HOMES = {
-    **dict.fromkeys(("CasadiModel", "casadi_model"), "learning.casadi_expressions"),
-    **dict.fromkeys(("cost_and_excess", "simulated"), "learning.differentiable"),
-    "export_programs": "learning.linear_programs",
-    "simulate_many": "",
-    **dict.fromkeys(("condense", "linearise", "split_arrays"), "learning.as_arrays"),
-    **dict.fromkeys(("CondensedMap", "SplitArrays"), "learning.as_arrays"),
+    **dict.fromkeys(("CasadiModel", "casadi_model"), "ded_bench.learning.casadi_expressions"),
+    **dict.fromkeys(("cost_and_excess", "simulated"), "ded_bench.learning.differentiable"),
+    "export_programs": "ded_bench.learning.linear_programs",
+    "simulate_many": "ded_bench",
+    **dict.fromkeys(("condense", "linearise", "split_arrays"), "ded_bench.learning.as_arrays"),
+    **dict.fromkeys(("CondensedMap", "SplitArrays"), "ded_bench.learning.as_arrays"),
 }
 __all__ = [*_HOMES]
 
@@ -37,4 +37,4 @@ __all__ = [*_HOMES]
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"ded_bench.{_HOMES[name]}".rstrip(".")), name)
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -54,9 +54,8 @@ def read_matpower(path: str | Path) -> dict[str, NDArray[np.float64]]:
             raise InputError(path, repr(said)[1:-1], "only assignments of plain data are read")
         place = statement.end()
         if (content := statement["matrix"] or statement["number"]) is not None:
-            rows = [
-                row.replace(",", " ").split() for row in re.split(r"[;\n]", content) if row.strip(" ,\t\r")
-            ]
+            lines = re.split(r"[;\n]", content)
+            rows = [line.replace(",", " ").split() for line in lines if line.strip(" ,\t\r")]
             found[statement["name"]] = _matrix(path, statement["name"], rows)
     return found
 

@@ -226,10 +226,8 @@ def referee(
     with ThreadPoolExecutor(workers) as pool:
         waiting = [pool.submit(judge, *asked) for asked in todo]
         try:
-            for done in tqdm(
-                as_completed(waiting), total=len(todo), unit="row", disable=None, desc="referee"
-            ):
-                found.append(done.result())
+            for one in tqdm(as_completed(waiting), total=len(todo), unit="row", disable=None, desc="referee"):
+                found.append(one.result())
                 table.add(found[-1:])
         finally:
             pool.shutdown(cancel_futures=True)

@@ -97,9 +97,7 @@ def _bench(a: argparse.Namespace) -> int:
         say(f"{name}: not timed, since {reason}")
     jobs = runs_of(own, Settings(search=search_folders(case, results.folder)), methods)
     if not jobs:
-        raise InputError(
-            results.folder, "", "holds no rows of these methods to time; run `ded-bench solve` first"
-        )
+        raise InputError(results.folder, "", "holds no rows of these methods: run `ded-bench solve` first")
     timed = ", ".join(sorted({job.method for job in jobs}))
     say(f"timing on {counted(min(a.instances, len(chosen.instances)), 'instance')}: {timed}")
     rows = bench(

@@ -31,9 +31,8 @@ def tell_solved(case: Case, results: Results, rows: Sequence[Row], out: TextIO) 
     reference = choose_reference(everything[everything["case"] == case.id], paper, reference_objectives(case))
     found = outcome(gaps(named(ROWS.frame(rows)), reference.objectives))
     print(_text(PageTable(own_first(found), OUTCOME)), file=out)
-    print(
-        f"gaps are to {reference.title}; times are of this run, `ded-bench bench` takes better ones", file=out
-    )
+    better = "`ded-bench bench` takes better ones"
+    print(f"gaps are to {reference.title}; times are of this run, {better}", file=out)
     _tell_failures((row for row in rows if row.objective is None), results.paths)
 
 

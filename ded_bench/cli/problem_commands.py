@@ -144,9 +144,8 @@ def _import(a: argparse.Namespace) -> int:
         return 1
     write_record(case, path)
     assert isinstance(case.source, dict)
-    print(
-        f"case {case.id} in {a.out}: {len(case.machines)} generators, slack {case.slack}, {case.n_bus} buses"
-    )
+    size = f"{len(case.machines)} generators, slack {case.slack}, {case.n_bus} buses"
+    print(f"case {case.id} in {a.out}: {size}")
     print(f"{case.source['conversion'].partition('; ')[2]}; knots {case.knots}")
     print(f"next: ded-bench cases {a.out}")
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
 from pathlib import Path
@@ -163,12 +164,11 @@ def _score_results(a: argparse.Namespace) -> int:
     results, case, instances = _rows_of(a)
     stream = sys.stderr if a.json else sys.stdout
     say(f"simulating the schedules of {counted(len(results.rows), 'row')} in {a.results}")
-
-    def tell(sentence: str) -> None:
-        print(sentence, file=stream, flush=True)
-
+    tell = functools.partial(print, file=stream, flush=True)
     if a.plant:
         return _validate(a, case, instances, results)
+    if a.update:
+        check_writable(results.path)
     from ded_bench.run.scoring import rescore
 
     rows, found = rescore(case, instances, results, a.workers, update=a.update, on_difference=tell)

@@ -141,6 +141,7 @@ class KnotProgram:
         limits = np.unique(limits[:, :2], axis=0)
 
         def once(left_s: float) -> tuple[FormAnswer, Array]:
+            deadline = time.perf_counter() + left_s
             form = self._columns.program(self._radius)
             low, high = self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
@@ -152,9 +153,14 @@ class KnotProgram:
                 held, rows = self._held.ravel(), self._rows_held(limits)
                 low, high = np.append(least[held], low), np.append(most[held], high)
             form, none = form.with_rows(rows, low, high), np.zeros(self._n)
-            if not self.condensed:
-                return solve_form(form, left_s, staged=not self._is_sparse), none
-            return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
+            if self.condensed:
+                return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
+            answer = solve_form(form, left_s, staged=not self._is_sparse)
+            if answer.status == Status.FAILED and len(self._columns.signs) == 1:  # with both it may succeed
+                self._divide_at(pieces_of(self.model))
+                other, _ = once(max(deadline - time.perf_counter(), 0.0))
+                answer = replace(other, iterations=answer.iterations + other.iterations)
+            return answer, none
 
         return self._at_all_knots(once, time_limit_s)[0]
 
@@ -298,9 +304,13 @@ class KnotProgram:
             sums, sizes = (np.add.reduceat(values, old.pieces) for values in (predicted.p_slack, size))
             cancels = sizes - np.abs(sums) > 1e-9 * sizes
             pieces = np.union1d(old.pieces, np.flatnonzero(cancels[owner]))
+        self._divide_at(pieces)
+        return is_steady or len(pieces) > len(old.pieces)
+
+    def _divide_at(self, pieces: Indices) -> None:
+        """Let |P_s| be paid by pieces that begin at these grid points, with rows of both signs."""
         self._columns = KnotColumns(self._case, self._instance, self.model, self.condensed, pieces)
         self.__dict__.pop("_all_knots", None)  # cached, by columns
-        return is_steady or len(pieces) > len(old.pieces)
 
     @property
     def _is_sparse(self) -> bool:

@@ -177,10 +177,8 @@ class Surprises:
         found, stretch, about = [], int(self._stretch(np.array(t))), 2.0 * START_ERROR_S
         for load, (at, rate) in enumerate(self._next):
             if (stretch, load) not in self._known:
-                steepest = float(self._steepest[load])
-                found += [
-                    (knot, load, sign * steepest, kind) for kind in (False, True) for sign in (1.0, -1.0)
-                ]
+                up = float(self._steepest[load])
+                found += [(knot, load, ramp, sudden) for sudden in (False, True) for ramp in (up, -up)]
             elif abs(t - at) <= about:
                 sign = 1.0 if t < at else -1.0  # early: it comes on top; late: the plan has it
                 found.append((knot, load, sign * (1.0 + RATE_ERROR) * rate, True))

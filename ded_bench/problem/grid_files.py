@@ -292,7 +292,5 @@ def load_grid_files(folder: Path, case: str, f0_hz: float) -> GridFiles:
     buses = {bus.id for bus in network.buses}
     for number, machine in enumerate(data.machines):
         if machine.bus not in buses:
-            raise InputError(
-                place, f"machines.{number}.bus", f"there is no bus {machine.bus} in {NETWORK_FILE}"
-            )
+            raise InputError(place, f"machines.{number}.bus", f"{NETWORK_FILE} has no bus {machine.bus}")
     return GridFiles(network=network, data=data)

@@ -113,13 +113,12 @@ class Scenario(Fingerprinted):
     def check_case(self, case: Case, source: str | Path = "") -> None:
         """Raise InputError unless this names exactly the buses of `case` and its loads last long enough."""
         source = source or f"scenario {self.id}"
-        steps = case.sampling.horizon_s / self.dt_s
+        horizon_s = case.sampling.horizon_s
+        steps = horizon_s / self.dt_s
         if abs(steps - round(steps)) > 1e-9 * steps or round(steps) < 1:
-            raise InputError(
-                source, "dt_s", f"must divide the case's horizon of {case.sampling.horizon_s:g} s"
-            )
+            raise InputError(source, "dt_s", f"must divide the case's horizon of {horizon_s:g} s")
         self.snapshot(case, 0.0).check_case(case, source)
-        needed = self.duration_s + case.sampling.horizon_s
+        needed = self.duration_s + horizon_s
         for bus, load in self.load.items():
             if load.fluctuation.times[-1] < needed - 1e-9:
                 problem = f"must last for {needed:g} s, duration and horizon"

@@ -40,13 +40,15 @@ class Schedule:
 
     def at(self, times: Array) -> Array:
         """Powers at `times`, shape (n_times, n_gen), pu, by linear interpolation."""
-        row = (self.t.searchsorted(times, side="right") - 1).clip(0)
-        since = (times - self.t.take(row)).clip(0.0)[:, None]
-        rate = np.zeros_like(self.p)  # after the last row there is none
-        with np.errstate(all="ignore"):  # rows may be as near to each other as numbers can
-            np.divide(self.p[1:] - self.p[:-1], (self.t[1:] - self.t[:-1])[:, None], out=rate[:-1])
-            change = np.where(since > 0.0, rate.take(row, axis=0) * since, 0.0)
-        return np.asarray(self.p.take(row, axis=0) + change)
+        row = self.t[1:].searchsorted(times, side="right")
+        slope = np.zeros(self.p.shape)  # after the last row there is none
+        length = np.maximum(self.t[1:] - self.t[:-1], 1e-200)[:, None]  # rows may be as near as numbers can
+        with np.errstate(all="ignore"):  # powers may be as large
+            np.divide(self.p[1:] - self.p[:-1], length, out=slope[:-1])
+            powers = slope.take(row, axis=0)
+            powers *= np.maximum(times - self.t.take(row), 0.0)[:, None]
+            powers += self.p.take(row, axis=0)
+        return powers
 
     def write(self, path: Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""
@@ -88,11 +90,9 @@ class Schedule:
             raise InputError(source, "t", "at least two rows are needed")
         if not (np.isfinite(self.t).all() and np.isfinite(self.p).all()):
             raise InputError(source, "P", "values must be finite numbers")
-        if not (np.diff(self.t) > 0).all():
-            row = int(np.argmax(np.diff(self.t) <= 0))
-            raise InputError(
-                source, "t", f"must increase strictly, but {self.t[row + 1]} follows {self.t[row]}"
-            )
+        if (back := np.flatnonzero(np.diff(self.t) <= 0)).size:
+            before, after = self.t[back[0] : back[0] + 2]
+            raise InputError(source, "t", f"must increase strictly, but {after} follows {before}")
         if abs(self.t[0]) > HORIZON_TOLERANCE:
             raise InputError(source, "t", f"must start at 0, not {self.t[0]}")
         if abs(self.t[-1] - horizon_s) > HORIZON_TOLERANCE:

@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import locked
+from ded_bench.files.strict import check_writable
 from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, Solution, Solver, named
 from ded_bench.plants.plant import servable
@@ -94,7 +95,7 @@ def bench(
 
     Raises:
         InputError: no instance, no job, an unknown method, regime or options, a missing model or policy,
-            or a table of a run of other jobs.
+            a table of a run of other jobs, or one that cannot be written.
     """
     if not instances or not jobs:
         raise InputError("instances", "", "at least one instance and one method are needed")
@@ -106,6 +107,7 @@ def bench(
     if (there := _complete(path, run, {row.job for row in own.values()})) and not force:
         return there
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+    check_writable(partial)
     kept = [] if force else [row for row in TIMING.existing(partial) if row.run == run]
     rows = {row.key: row for row in kept}
 
@@ -139,9 +141,8 @@ def _complete(path: Path, run: str, jobs: set[tuple[str, str, str, str]]) -> lis
     there = TIMING.existing(path)
     if others := {row.job for row in there} - jobs:
         regime, method, *_ = sorted(others)[0]
-        raise InputError(
-            path, "method", f"holds a run that timed others too ({method} in {regime}); write elsewhere"
-        )
+        problem = f"holds a run that timed others, too ({method} in {regime}); write elsewhere"
+        raise InputError(path, "method", problem)
     return there if {row.run for row in there} == {run} else []
 
 

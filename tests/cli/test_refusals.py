@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ import pytest
 from ded_bench.cli import main
 from ded_bench.problem.benchmark import instance_file as instance_file_of
 from ded_bench.results.rows import Results, Row
+from ded_bench.run.pool import Workers
 from tests.cli.command_line import SOLVE, refused
 from tests.conftest import CASE_FILES
 from tests.detailed_cases import MIXED
@@ -235,6 +237,25 @@ def test_times_are_of_the_case_of_the_rows(problem: Path, tmp_path: Path, capsys
     assert "--method: ded: has no rows" in refused(
         capsys, "reproduce", "--results", tmp_path, "--method", "ded"
     )
+
+
+@pytest.mark.parametrize("command", ["bench", "score", "online"])
+def test_a_folder_that_refuses_says_so_before_the_work(command, problem, tmp_path, monkeypatch, capsys):
+    case = ["--case", str(problem)]
+    assert main(["solve", "--method", "ed", *case, "--regime", "NO", "--out", str(tmp_path)]) == 0
+    drawn = tmp_path / "scenarios"
+    assert main(["scenarios", *case, "--count", "1", "--out", str(drawn)]) == 0
+
+    def refuses(**_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuses)
+    monkeypatch.setattr(Workers, "imap", None)
+    online = ["--method", "ed", "--latency", "0", "--scenario", *map(str, drawn.glob("*-s*.json")), "--out"]
+    words = {"bench": ["--results"], "score": ["--update", "--results"], "online": online}
+    capsys.readouterr()
+    assert main([command, *case, *words[command], str(tmp_path)]) == 2
+    assert "cannot be written (Read-only" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

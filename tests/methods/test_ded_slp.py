@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from ded_bench.files.strict import parse_record
-from ded_bench.methods import ded_slp, ed, knot_columns
+from ded_bench.methods import ded_slp, ed, knot_columns, knot_program
 from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.registry import get_method
@@ -23,6 +24,7 @@ from ded_bench.problem.limits import Bounds
 from ded_bench.problem.sampling import sample_instance
 from ded_bench.problem.schedule import Schedule
 from ded_bench.solvers.compile import OnArrays
+from ded_bench.solvers.linear_program import FormAnswer, FreeForm
 from ded_bench.solvers.status import Status
 from tests.conftest import CASE_FILES
 from tests.methods import on_surrogates
@@ -64,6 +66,24 @@ def test_a_slack_s_power_that_keeps_its_sign_is_priced_alike(seed, monkeypatch: 
         assert solution.status == Status.OPTIMAL
         answers.append(solution.solver_objective)
     assert answers[0] == pytest.approx(answers[1], rel=1e-6)
+
+
+def test_where_rows_of_one_sign_fail_there_are_those_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with one program of the 68-bus grid, in which PIQP makes no progress."""
+    case, tried = Case.load(CASE_FILES["fivemachine"]), []
+    monkeypatch.setattr(knot_columns, "STEADY", 0.0)
+    solve = knot_program.solve_form
+
+    def fails_first(form: FreeForm, *arguments: float, **options: bool) -> FormAnswer:
+        tried.append(form.between.shape[0])
+        answer = solve(form, *arguments, **options)
+        return answer if len(tried) > 1 else dataclasses.replace(answer, status=Status.FAILED)
+
+    monkeypatch.setattr(knot_program, "solve_form", fails_first)
+    answer = program(case, short(case, 0), case.bounds("NO")).solve(np.empty((0, 3), dtype=int), np.inf)
+    assert answer.status == Status.OPTIMAL
+    assert len(tried) == 2
+    assert tried[0] < tried[1]
 
 
 @pytest.mark.parametrize("index", range(2))

@@ -102,7 +102,7 @@ class DetailedPlant:
         n, control = len(p_set), self.control(state, dt_s)
         system, machines = self.system, self.system.scheduled
         p_ref = state.offset + np.zeros((n, 1))
-        p_ref[:, machines] += p_set
+        p_ref[:, machines] = state.offset[machines] + p_set
         drawn = np.ascontiguousarray(system.p_drawn(p_load)[:, : system.network.n_load_port])
         network = system.compiled_network
         network = network if exact else network._replace(change=PLANNING_CHANGE)
@@ -121,8 +121,7 @@ class DetailedPlant:
             problem = "the network has no voltages any more" if done < n else "it loses its stability"
             raise SimulationError(f"the system cannot follow this schedule: {problem}")
         ahead = control.first - (n - 1)
-        if ahead < 0:
-            ahead %= control.period
+        ahead = ahead if ahead >= 0 else ahead % control.period
         end = state._replace(
             x=states.x[-1],
             v=states.v[-1],
@@ -131,8 +130,8 @@ class DetailedPlant:
             p_set=p_set[-1],
             carried=carried,
         )
-        omega = states.x[:, SPEED, machines] * system.data.omega_0[machines]
-        p_gen = system.turbines(states.x)[:, machines]
+        omega = states.x[:, SPEED].take(machines, axis=1) * system.data.omega_0[machines]
+        p_gen = system.turbines(states.x).take(machines, axis=1)
         p_slack = np.zeros(n) if system.island else states.p_e[:, system.network.balancing]
         run = DetailedRun(states, np.arange(control.first, n - 1, control.period), steps)
         return Piece(omega, p_gen, p_slack, run, end, states.held)

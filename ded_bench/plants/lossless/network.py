@@ -185,8 +185,6 @@ class Network:
         rows = theta.reshape(-1, self.n_bus), f.reshape(-1, self.n_bus)
         n = len(grid.algebraic)
         wanted = np.array(np.broadcast_to(wanted, (*theta.shape[:-1], n)).reshape(-1, n), order="C")
-        if not solve_angles(
-            grid._replace(contraction=0.0), wanted, *rows
-        ):  # from far: all steps are Newton's
+        if not solve_angles(grid._replace(contraction=0.0), wanted, *rows):  # from far: Newton steps alone
             raise SimulationError("the power flow has no solution")
         return theta, f

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from ded_bench.files.errors import InputError
 from ded_bench.files.keyed_table import KeyedTable
+from ded_bench.files.strict import check_writable
 from ded_bench.files.table import LARGEST
 from ded_bench.methods.registry import Method, get_method
 from ded_bench.methods.solution import Settings, named
@@ -127,11 +128,13 @@ def operate(
         The rows of all operations, old and new, in their order.
 
     Raises:
+        InputError: the folder cannot be written.
         WorkersLostError: the workers cannot run this package.
         OSError: a trajectory cannot be kept.
     """
     table = results.table
-    todo = [o for o in operations if not _is_there(table, o.row)]
+    if todo := [o for o in operations if not _is_there(table, o.row)]:
+        check_writable(table.path)
     with Workers(workers) as pool:
         if look_back:
             _look_back(case, operations, results, pool)

@@ -156,7 +156,7 @@ class DetailedPlant:
             return State(None, omega, state.p_set)
         agc, mean = None, float(data.inertia @ state.x[DELTA])
         if self.case.agc is not None:
-            agc = AgcState(held_pu=state.held, integral_rad=mean, next_s=state.next_s)
+            agc = AgcState.model_construct(None, held_pu=state.held, integral_rad=mean, next_s=state.next_s)
         theta, p_gen = (state.x[DELTA] - mean)[machines], self.system.turbines(state.x)[machines]
         return State(theta, omega, state.p_set, p_gen, agc)
 

@@ -65,6 +65,7 @@ class Planner:
     method: str
     settings: Settings
     limit_s: float = LIMIT_S
+    starts_warm: bool = True  # whether the method knows how to start from a plan, once it is prepared
     _ready: bool = False
 
     def __call__(self, instance: Instance, last: Schedule | None = None) -> Planned:
@@ -75,7 +76,7 @@ class Planner:
             prepared = _call(_prepare, job, self.limit_s + GRACE_S)
             if not isinstance(prepared, bool):
                 return self._none(prepared, started)
-            self._ready = True
+            self._ready, self.starts_warm = True, prepared
         answer = _call(answered, (*job, instance, last), self.limit_s)
         if not isinstance(answer, tuple):
             return self._none(answer, started)
@@ -95,8 +96,7 @@ def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_
 
 
 def _prepare(case: Case, method: str, regime: str, settings: Settings) -> bool:
-    prepared(case, method, regime, settings)
-    return True
+    return hasattr(prepared(case, method, regime, settings), "solve")
 
 
 def answered(
@@ -236,6 +236,8 @@ class _Loop:
         power = self.history.p_set[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
         self.course, self.held = _Course(stay, 0, self.dt), False
+        endless = np.full_like(case.ramp, np.inf)
+        self.limits = -endless, endless, case.ramp * self.dt
         self.asked: list[Planned] = []
 
     def run(self) -> LoopOutcome:
@@ -264,7 +266,7 @@ class _Loop:
         except SimulationError as error:
             answer = Planned(None, error=f"no prediction: {error}")
         else:
-            warm = self.options.warm and self.held
+            warm = self.options.warm and self.held and getattr(self.ask, "starts_warm", True)
             answer = self.ask(instance, self.course.later(start, self.horizon) if warm else None)
         self.asked.append(answer)
         return answer
@@ -295,6 +297,5 @@ class _Loop:
         now = self.history.now
         power = self.course.at(now, until)
         power[0] = self.history.p_set[now]
-        endless = np.full_like(self.case.ramp, np.inf)
-        track(power[None], -endless, endless, self.case.ramp * self.dt)
+        track(power[None], *self.limits)
         return power

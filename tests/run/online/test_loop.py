@@ -148,6 +148,7 @@ def test_a_faulty_method_is_counted_and_the_loop_goes_on(threebus, name, late, f
     assert np.isfinite(outcome.trajectory.omega).all()
     moved = np.abs(np.diff(outcome.trajectory.p_gen, axis=0)).max()
     assert (moved == 0) == (name == "never")
+    assert not planner.starts_warm  # functions do not: none is given a plan
 
 
 @pytest.mark.parametrize("warm", [True, False])
@@ -158,6 +159,7 @@ def test_plans_that_meet_not_every_limit_are_followed_and_counted(threebus, warm
     assert all(answer.schedule is not None for answer in outcome.answers)
     assert sum(answer.infeasible for answer in outcome.answers) == 2
     assert any(answer.warm for answer in outcome.answers) == warm
+    assert planner.starts_warm
 
 
 def test_another_plant_is_operated_and_plans_are_for_the_own_one(threebus, lagged):

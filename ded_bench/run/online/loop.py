@@ -52,7 +52,7 @@ class Planned:
     trace: str = ""  # of what it raised
 
 
-#: Asks for a plan; the second argument is the last one, on the time of the instance.
+#: Asks for a plan; given the last one, on the instance's time, unless it has a `starts_warm` that is false.
 Ask = Callable[[Instance, Schedule | None], Planned]
 
 

@@ -92,16 +92,13 @@ def groups(frame: pd.DataFrame) -> Iterator[tuple[str, tuple[str, str, str], pd.
         regime, method, settings, model = key
         rank = known.index(method) if method in known else len(known)
         other = model not in ("", usual_model(method))
-        return regime, rank, method, settings != DEFAULT, _natural(settings), other, model
+        # refine=25 before refine=100: words and numbers in turn
+        natural = [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", settings))]
+        return regime, rank, method, settings != DEFAULT, natural, other, model
 
     for key in sorted(parts, key=place):
         regime, method, settings, model = key
         yield regime, (method, settings, model), parts[key]
-
-
-def _natural(text: str) -> list[str | int]:
-    """Sorting key that puts refine=25 before refine=100: words and numbers in turn."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:

@@ -166,16 +166,12 @@ def _report(a: argparse.Namespace) -> int:
     return 0
 
 
-def _default_folders() -> list[Path]:
-    """Of each shipped case its results below the working directory, else its reference run, if any."""
-    cases = [Case.load(path) for path in sorted(SHIPPED_CASES.glob("*/case.json"))]
-    choices = [(default_results(case), reference_run(case)) for case in cases]
-    found = [next((p for p in pair if ResultsFolder(p).results.is_file()), None) for pair in choices]
-    return [path for path in found if path is not None]
-
-
 def _overview(a: argparse.Namespace) -> int:
-    folders = a.results or _default_folders()
+    folders: list[Path] = a.results or []
+    for path in [] if folders else sorted(SHIPPED_CASES.glob("*/case.json")):
+        case = Case.load(path)  # its results below the working directory, else its reference run, if any
+        choices = default_results(case), reference_run(case)
+        folders += [folder for folder in choices if ResultsFolder(folder).results.is_file()][:1]
     if not folders:
         raise InputError("results", "", "holds no results of a shipped case; run `ded-bench solve` first")
     if all(ResultsFolder(folder).results.is_file() for folder in folders):

@@ -51,7 +51,7 @@ class OnlineRow(Judgement, Made):
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
     that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
     method's own word, exceeds limits as little as it can. `method_s` and `loop_s` are wall-clock seconds of
-    the method, and of all else.
+    the plans, from measurements to answers, and of all else.
     """
 
     scenario: PlainName

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -90,8 +91,7 @@ class DetailedPlant:
         agc, shares = self.case.agc, self.system.shares
         if agc is None:
             return SecondaryControl(shares, 0.0, NEVER, 1)
-        first, period = (round(time_s / dt_s) for time_s in (state.next_s, agc.period_s))
-        return SecondaryControl(shares, agc.k, first, period)
+        return SecondaryControl(shares, agc.k, round(state.next_s / dt_s), round(agc.period_s / dt_s))
 
     def advance(
         self, state: DetailedState, p_set: Array, p_load: Array, dt_s: float, exact: bool = True
@@ -99,21 +99,20 @@ class DetailedPlant:
         """See `Plant.advance`; `states` are a DetailedRun. On an island the slack's power is zero."""
         from ded_bench.plants.detailed import detailed_stepper as stepper  # and with it Numba
 
-        n, control = len(p_set), self.control(state, dt_s)
-        system, machines = self.system, self.system.scheduled
-        p_ref = state.offset + np.zeros((n, 1))
-        p_ref[:, machines] = state.offset[machines] + p_set
-        drawn = np.ascontiguousarray(system.p_drawn(p_load)[:, : system.network.n_load_port])
-        network = system.compiled_network
+        n, control, system = len(p_set), self.control(state, dt_s), self.system
+        network, p_drawn = system.compiled_network, system.network.p_drawn[: system.network.n_load_port]
         network = network if exact else network._replace(change=PLANNING_CHANGE)
-        x, v = (np.empty((n, *first.shape)) for first in (state.x, state.v))
-        states = stepper.DetailedStates(x, v, np.empty(n), np.empty((n, len(system.data))))
+        gen, load = system.scheduled, system.load_ports
+        shapes = state.x.shape, state.v.shape, (), state.offset.shape, *(3 * [gen.shape]), load.shape
+        *arrays, given, loads = (np.empty((n, *shape)) for shape in shapes)
+        states = stepper.DetailedStates(*arrays)
         states.x[0], states.v[0], states.held[0] = state.x, state.v, state.held
-        inputs = stepper.PlantInputs(p_ref, drawn, state.v_ref, dt_s)
+        given[:], loads[:] = p_set, p_load
+        inputs = stepper.PlantInputs(given, gen, state.offset, loads, load, p_drawn, state.v_ref, dt_s)
         needed = max(system.fastest * dt_s / STEP_BY_MODE, dt_s / LONGEST_S if exact else 1.0)
-        steps = int(np.ceil(needed - 1e-9))
+        steps = math.ceil(needed - 1e-9)
         try:
-            carried = copied(state.carried) or stepper.carried_voltages(network, drawn[0], states.v[0])
+            carried = copied(state.carried) or stepper.carried_voltages(network, inputs, state.v)
             done = stepper.integrate_plant(system.data, network, inputs, control, steps, carried, states)
         except np.linalg.LinAlgError:
             done = 0
@@ -121,20 +120,12 @@ class DetailedPlant:
             problem = "the network has no voltages any more" if done < n else "it loses its stability"
             raise SimulationError(f"the system cannot follow this schedule: {problem}")
         ahead = control.first - (n - 1)
-        ahead = ahead if ahead >= 0 else ahead % control.period
-        end = state._replace(
-            x=states.x[-1],
-            v=states.v[-1],
-            held=float(states.held[-1]),
-            next_s=ahead * dt_s,
-            p_set=p_set[-1],
-            carried=carried,
-        )
-        omega = states.x[:, SPEED].take(machines, axis=1) * system.data.omega_0[machines]
-        p_gen = system.turbines(states.x).take(machines, axis=1)
+        next_s, held = (ahead if ahead >= 0 else ahead % control.period) * dt_s, float(states.held[-1])
+        x, v, p_set = states.x[-1], states.v[-1], p_set[-1]
+        end = state._replace(x=x, v=v, held=held, next_s=next_s, p_set=p_set, carried=carried)
         p_slack = np.zeros(n) if system.island else states.p_e[:, system.network.balancing]
         run = DetailedRun(states, np.arange(control.first, n - 1, control.period), steps)
-        return Piece(omega, p_gen, p_slack, run, end, states.held)
+        return Piece(states.omega, states.p_gen, p_slack, run, end, states.held)
 
     def linearise_along(self, trajectory: Trajectory, points: Indices) -> TimeVarying:
         """See `Plant.linearise_along` and `linearised`.

@@ -23,7 +23,7 @@ from ded_bench.plants.detailed.equations import (
     solve_voltages,
     sources,
 )
-from ded_bench.plants.detailed.machine_arrays import N_STATES, MachineArrays
+from ded_bench.plants.detailed.machine_arrays import GATE, N_STATES, SPEED, TURBINE, MachineArrays
 from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array, Indices
 
@@ -37,8 +37,12 @@ NEVER = 2**62
 class PlantInputs(NamedTuple):
     """What drives the plant at n points of time, linear between them."""
 
-    p_ref: Array  # governors' references without secondary control, (n, n_machine), pu
-    drawn: Array  # active powers of loads, (n, n_load), pu
+    p_set: Array  # set-points, (n, n_gen), pu
+    machine: Indices  # of each generator, (n_gen,)
+    offset: Array  # governors' references less set-points, (n_machine,), pu
+    p_load: Array  # injections of the case's loads, (n, n_load), pu
+    port: Indices  # of each of them, (n_load,)
+    p_drawn: Array  # nominal active power at the ports with loads, (n_load_port,), pu
     v_ref: Array  # exciters' references, constant, (n_machine,), pu
     dt: float  # s
 
@@ -59,6 +63,8 @@ class DetailedStates(NamedTuple):
     v: Array  # voltages at ports in the frame of the mean angle, (n, 2 n_port), pu
     held: Array  # what AGC asks of all machines from each point on, (n,), pu
     p_e: Array  # (n, n_machine), pu
+    omega: Array  # of the generators, (n, n_gen), rad/s
+    p_gen: Array  # what their turbines deliver, (n, n_gen), pu
 
 
 class CarriedVoltages(NamedTuple):
@@ -69,13 +75,13 @@ class CarriedVoltages(NamedTuple):
     age: Indices  # integrator steps since the slopes are these, (1,)
 
 
-def carried_voltages(network: CompiledNetwork, drawn: Array, v: Array) -> CarriedVoltages:
-    """What a state without a past has, at loads (n_load,) and voltages (2 n_port,), pu."""
-    n_load = len(drawn)
+def carried_voltages(network: CompiledNetwork, inputs: PlantInputs, v: Array) -> CarriedVoltages:
+    """What a state without a past has, at the first loads and voltages (2 n_port,), pu."""
+    drawn, n_load = inputs.p_drawn.copy(), len(inputs.p_drawn)
+    drawn[inputs.port] = -inputs.p_load[0]
     load = LoadSlopes(np.empty((n_load, 4)), np.empty((len(v), len(v))))
     renew(network, drawn, v, load)
-    recent = np.tile(v[: 2 * n_load], (4, 4, 1))
-    return CarriedVoltages(recent, load, np.zeros(1, dtype=np.intp))
+    return CarriedVoltages(np.tile(v[: 2 * n_load], (4, 4, 1)), load, np.zeros(1, dtype=np.intp))
 
 
 @inlined
@@ -106,6 +112,17 @@ def _next_voltages(
     return solved
 
 
+@inlined
+def _set_inputs(inputs: PlantInputs, k: int, p_ref: Array, drawn: Array) -> None:
+    """Governors' references without secondary control, and active powers of loads, at a point."""
+    copy_row(inputs.offset, p_ref)
+    copy_row(inputs.p_drawn, drawn)
+    for g, machine in enumerate(inputs.machine):
+        p_ref[machine] += inputs.p_set[k, g]
+    for i, port in enumerate(inputs.port):
+        drawn[port] = -inputs.p_load[k, i]
+
+
 @compiled
 def integrate_plant(
     data: MachineArrays,
@@ -130,13 +147,12 @@ def integrate_plant(
     Returns:
         The number of points computed: less than n where the network's equations have no solution.
     """
-    n, n_machine, n_load = len(states.x), states.x.shape[2], inputs.drawn.shape[1]
-    h = inputs.dt / steps
+    n, n_machine, n_load, h = len(states.x), states.x.shape[2], len(inputs.p_drawn), inputs.dt / steps
     node, weight = (0.0, 0.5, 0.5, 1.0), (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
     x, v, held = states.x[0].copy(), states.v[0].copy(), states.held[0]
     stage, rates, total = x.copy(), np.zeros_like(x), np.zeros_like(x)
-    p_ref, drawn, p_e = np.empty(n_machine), inputs.drawn[0].copy(), np.empty(n_machine)
-    source = np.empty(len(v))
+    p_ref, drawn, p_e = np.empty(n_machine), np.empty(n_load), np.empty(n_machine)
+    source, p_refs, drawns = np.empty(len(v)), np.empty((2, n_machine)), np.empty((2, n_load))
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
             load = LoadSlopes(carried.load.slopes.copy(), carried.load.answer.copy())
@@ -144,7 +160,8 @@ def integrate_plant(
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
         states.held[k] = held
-        after = min(k + 1, n - 1)
+        _set_inputs(inputs, k, p_refs[0], drawns[0])
+        _set_inputs(inputs, min(k + 1, n - 1), p_refs[1], drawns[1])
         for j in range(steps):
             carried.age[0] += 1
             for s in range(4):
@@ -153,10 +170,10 @@ def integrate_plant(
                     for i in range(n_machine):
                         stage[q, i] = x[q, i] + h * node[s] * rates[q, i]
                 for i in range(n_machine):
-                    p_ref[i] = inputs.p_ref[k, i] + inside * (inputs.p_ref[after, i] - inputs.p_ref[k, i])
+                    p_ref[i] = p_refs[0, i] + inside * (p_refs[1, i] - p_refs[0, i])
                     p_ref[i] += agc.participation[i] * held
                 for i in range(n_load):
-                    drawn[i] = inputs.drawn[k, i] + inside * (inputs.drawn[after, i] - inputs.drawn[k, i])
+                    drawn[i] = drawns[0, i] + inside * (drawns[1, i] - drawns[0, i])
                 sources(data, stage, source)
                 if not _next_voltages(network, drawn, source, carried, s, v):
                     return k
@@ -166,6 +183,9 @@ def integrate_plant(
                         copy_row(x[q], states.x[k, q])
                     copy_row(v, states.v[k])
                     copy_row(p_e, states.p_e[k])
+                    for g, i in enumerate(inputs.machine):
+                        gate, turbine = data.reheat[i] * x[GATE, i], (1.0 - data.reheat[i]) * x[TURBINE, i]
+                        states.omega[k, g], states.p_gen[k, g] = x[SPEED, i] * data.omega_0[i], gate + turbine
                     if k == n - 1:
                         return n
                 for q in range(N_STATES):

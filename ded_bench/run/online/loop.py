@@ -47,7 +47,6 @@ class Planned:
     late: bool = False  # it did not come in time
     warm: bool = False  # the method was given the plan in force
     infeasible: bool = False  # no schedule meets every limit, says the method; this one, if any, comes near
-    seconds: float = 0.0  # of the clock, with the way to the method's process and back
     error: str = ""
     trace: str = ""  # of what it raised
 
@@ -70,24 +69,21 @@ class Planner:
 
     def __call__(self, instance: Instance, last: Schedule | None = None) -> Planned:
         """Ask for a plan; the process prepares the method first, if it has not done so yet."""
-        started = time.perf_counter()
         job = self.case, self.method, self.regime, self.settings
         if not self._ready:
             prepared = _call(_prepare, job, self.limit_s + GRACE_S)
             if not isinstance(prepared, bool):
-                return self._none(prepared, started)
+                return self._none(prepared)
             self._ready, self.starts_warm = True, prepared
         answer = _call(answered, (*job, instance, last), self.limit_s)
         if not isinstance(answer, tuple):
-            return self._none(answer, started)
+            return self._none(answer)
         solution, warm = answer
-        seconds, infeasible = time.perf_counter() - started, solution.status == Status.INFEASIBLE
-        return Planned(solution.schedule, False, warm, infeasible, seconds, solution.error)
+        return Planned(solution.schedule, False, warm, solution.status == Status.INFEASIBLE, solution.error)
 
-    def _none(self, error: object, started: float) -> Planned:
+    def _none(self, error: object) -> Planned:
         self._ready = self._ready and not isinstance(error, NoAnswerError | WorkerDiedError)
-        late, seconds = isinstance(error, NoAnswerError), time.perf_counter() - started
-        return Planned(None, late, seconds=seconds, error=reason_of(error), trace=trace_of(error))
+        return Planned(None, isinstance(error, NoAnswerError), error=reason_of(error), trace=trace_of(error))
 
 
 def _call(function: Callable[..., object], arguments: tuple[object, ...], limit_s: float) -> object:
@@ -140,6 +136,7 @@ class LoopOutcome(NamedTuple):
 
     trajectory: Trajectory
     answers: list[Planned]
+    plans_s: float  # from measurements to answers, all together, s of the clock
 
 
 @dataclass(frozen=True)
@@ -148,18 +145,18 @@ class _Course:
 
     schedule: Schedule
     start: int
-    dt: float
+    grid: Array  # of the scenario, s
 
     def at(self, first: int, last: int) -> Array:
         """Planned powers at the points first..last, shape (last - first + 1, n_gen), pu; its end stays."""
-        return self.schedule.at((np.arange(first, last + 1, dtype=np.float64) - self.start) * self.dt)
+        return self.schedule.at(self.grid[first - self.start : last + 1 - self.start])
 
     def later(self, start: int, horizon_s: float) -> Schedule:
         """The same plan on the time of an instance that starts later and lasts `horizon_s`."""
-        shifted = self.schedule.t - (start - self.start) * self.dt
+        shifted = self.schedule.t - self.grid[start - self.start]
         inside = shifted[(shifted > WHOLE) & (shifted < horizon_s - WHOLE)]
         times = np.concatenate([[0.0], inside, [horizon_s]])
-        return Schedule(times, self.schedule.at(times + (start - self.start) * self.dt))
+        return Schedule(times, self.schedule.at(times + self.grid[start - self.start]))
 
 
 class History:
@@ -235,10 +232,10 @@ class _Loop:
         self.history = History(case, plant, first, scenario.grid, p_load)
         power = self.history.p_set[0]
         stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
-        self.course, self.held = _Course(stay, 0, self.dt), False
+        self.course, self.held = _Course(stay, 0, scenario.grid), False
         endless = np.full_like(case.ramp, np.inf)
         self.limits = -endless, endless, case.ramp * self.dt
-        self.asked: list[Planned] = []
+        self.asked, self.plans_s = list[Planned](), 0.0
 
     def run(self) -> LoopOutcome:
         last = self.scenario.steps
@@ -253,11 +250,11 @@ class _Loop:
             self._take(answer, due if self.options.predict else decision)
             decision = max(decision + period, due)
         self._go_on(last)
-        return LoopOutcome(self.history.trajectory(), self.asked)
+        return LoopOutcome(self.history.trajectory(), self.asked, self.plans_s)
 
     def _decide(self, lag: int) -> Planned:
         """Ask for a plan from `lag` steps after now, or from now on."""
-        now = self.history.now
+        measured, now = time.perf_counter(), self.history.now
         start = now + lag if self.options.predict else now
         until = (now + lag) * self.dt + self.horizon
         loads = forecast(self.scenario, self.case, self.options.forecast, now * self.dt, until)
@@ -268,18 +265,19 @@ class _Loop:
         else:
             warm = self.options.warm and self.held and getattr(self.ask, "starts_warm", True)
             answer = self.ask(instance, self.course.later(start, self.horizon) if warm else None)
+        self.plans_s += time.perf_counter() - measured
         self.asked.append(answer)
         return answer
 
     def _take(self, answer: Planned, start: int) -> None:
         if answer.schedule is not None:
-            self.course, self.held = _Course(answer.schedule, start, self.dt), True
+            self.course, self.held = _Course(answer.schedule, start, self.scenario.grid), True
 
     def _state(self, loads: Forecast, start: int) -> PlantState:
         """The state that a plan from `start` begins with."""
         if start == self.history.now:
             return self.history.state
-        times = np.arange(self.history.now, start + 1, dtype=np.float64) * self.dt
+        times = self.scenario.grid[self.history.now : start + 1]
         return self.history.ahead(self._followed(start), loads.at(times)).end
 
     def _instance(self, state: PlantState, loads: Forecast, start: int) -> Instance:

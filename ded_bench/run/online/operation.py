@@ -160,7 +160,7 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
     o, asked, started = operation, operation.row, time.perf_counter()
     plant = plant_of(case, asked.plant)
     planner = Planner(case, asked.regime, asked.method, o.settings, asked.limit_s or LIMIT_S)
-    trajectory, answers = run_loop(case, o.scenario, planner, o.options, plant)
+    trajectory, answers, method_s = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, trajectory, asked.regime)
     keep_trajectory(files.trajectory(asked.key), trajectory)
     missing = [answer for answer in answers if answer.schedule is None]
@@ -168,11 +168,9 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
         what = f"online {asked.method} {asked.regime} {asked.scenario}"
         files.log_failure(what, answer.trace or answer.error)
     reason = reason_of(missing[0].error) if missing else ""
+    row = _row(o, judgement, reason)
     if answers and len(missing) == len(answers):  # what happened then is no result of the method
         row = _row(o, None, f"every plan failed: {reason}")
-    else:
-        row = _row(o, judgement, reason)
-    method_s = sum(answer.seconds for answer in answers)
     loop_s = time.perf_counter() - started - method_s
     try:
         unforeseen = unforeseen_hz(case, o.scenario, o.options, plant)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
 from ded_bench.problem.scenario import Fluctuation, Scenario, ScenarioRamp
 from ded_bench.problem.schedule import Schedule
+from ded_bench.run.online import loop
 from ded_bench.run.online.judgement import hindsight, judge_operation, unforeseen_hz, whole_instance
 from ded_bench.run.online.loop import LoopOptions, Planned, Planner, run_loop
 from ded_bench.solvers.status import Status
@@ -64,6 +67,14 @@ def test_perfect_knowledge_without_latency_is_the_open_loop(small):
     np.testing.assert_allclose(outcome.trajectory.p_slack, wanted.p_slack, rtol=0, atol=1e-9)
     assert [answer.schedule is None for answer in outcome.answers] == [False, False]
     assert [answer.warm for answer in outcome.answers] == [False, True]
+
+
+def test_a_plan_takes_from_the_measurement_to_the_answer(small, monkeypatch):
+    """The forecast is a part of it."""
+    known = loop.forecast
+    monkeypatch.setattr(loop, "forecast", lambda *given: time.sleep(0.02) or known(*given))
+    outcome = run_loop(small, drawn(small), lambda *_: Planned(None), LoopOptions(period_s=1.0))
+    assert outcome.plans_s > 0.02 * len(outcome.answers)
 
 
 @pytest.mark.parametrize(("quality", "tolerance"), [("perfect", 1e-9), ("announced", 1e-2)])

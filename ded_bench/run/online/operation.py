@@ -157,8 +157,12 @@ def operate(
 
 def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> OnlineRow:
     """Operate one scenario in this process, and keep its trajectory."""
-    o, asked, started = operation, operation.row, time.perf_counter()
-    plant = plant_of(case, asked.plant)
+    o, asked, plant = operation, operation.row, plant_of(case, operation.row.plant)
+    try:  # before the clock starts: it loads what is compiled
+        unforeseen = unforeseen_hz(case, o.scenario, o.options, plant)
+    except SimulationError:  # nobody answers to them there, as plans do
+        unforeseen = None
+    started = time.perf_counter()
     planner = Planner(case, asked.regime, asked.method, o.settings, asked.limit_s or LIMIT_S)
     trajectory, answers, method_s = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, trajectory, asked.regime)
@@ -172,10 +176,6 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
     if answers and len(missing) == len(answers):  # what happened then is no result of the method
         row = _row(o, None, f"every plan failed: {reason}")
     loop_s = time.perf_counter() - started - method_s
-    try:
-        unforeseen = unforeseen_hz(case, o.scenario, o.options, plant)
-    except SimulationError:  # nobody answers to them there, as plans do
-        unforeseen = None
     return dataclasses.replace(
         row,
         unforeseen_hz=unforeseen,

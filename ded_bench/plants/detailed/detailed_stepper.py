@@ -152,7 +152,7 @@ def integrate_plant(
     x, v, held = states.x[0].copy(), states.v[0].copy(), states.held[0]
     stage, rates, total = x.copy(), np.zeros_like(x), np.zeros_like(x)
     p_ref, drawn, p_e = np.empty(n_machine), np.empty(n_load), np.empty(n_machine)
-    source, p_refs, drawns = np.empty(len(v)), np.empty((2, n_machine)), np.empty((2, n_load))
+    source, p_ref_ends, drawn_ends = np.empty(len(v)), np.empty((2, n_machine)), np.empty((2, n_load))
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
             load = LoadSlopes(carried.load.slopes.copy(), carried.load.answer.copy())
@@ -160,8 +160,8 @@ def integrate_plant(
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
         states.held[k] = held
-        _set_inputs(inputs, k, p_refs[0], drawns[0])
-        _set_inputs(inputs, min(k + 1, n - 1), p_refs[1], drawns[1])
+        _set_inputs(inputs, k, p_ref_ends[0], drawn_ends[0])
+        _set_inputs(inputs, min(k + 1, n - 1), p_ref_ends[1], drawn_ends[1])
         for j in range(steps):
             carried.age[0] += 1
             for s in range(4):
@@ -170,10 +170,10 @@ def integrate_plant(
                     for i in range(n_machine):
                         stage[q, i] = x[q, i] + h * node[s] * rates[q, i]
                 for i in range(n_machine):
-                    p_ref[i] = p_refs[0, i] + inside * (p_refs[1, i] - p_refs[0, i])
+                    p_ref[i] = p_ref_ends[0, i] + inside * (p_ref_ends[1, i] - p_ref_ends[0, i])
                     p_ref[i] += agc.participation[i] * held
                 for i in range(n_load):
-                    drawn[i] = drawns[0, i] + inside * (drawns[1, i] - drawns[0, i])
+                    drawn[i] = drawn_ends[0, i] + inside * (drawn_ends[1, i] - drawn_ends[0, i])
                 sources(data, stage, source)
                 if not _next_voltages(network, drawn, source, carried, s, v):
                     return k

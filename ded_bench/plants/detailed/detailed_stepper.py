@@ -114,13 +114,15 @@ def _next_voltages(
 
 @inlined
 def _set_inputs(inputs: PlantInputs, k: int, p_ref: Array, drawn: Array) -> None:
-    """Governors' references without secondary control, and active powers of loads, at a point."""
-    copy_row(inputs.offset, p_ref)
-    copy_row(inputs.p_drawn, drawn)
-    for g, machine in enumerate(inputs.machine):
-        p_ref[machine] += inputs.p_set[k, g]
-    for i, port in enumerate(inputs.port):
-        drawn[port] = -inputs.p_load[k, i]
+    """Governors' references without secondary control, and powers of loads, at a point and the next."""
+    for end in range(2):
+        at = min(k + end, len(inputs.p_set) - 1)
+        copy_row(inputs.offset, p_ref[end])
+        copy_row(inputs.p_drawn, drawn[end])
+        for g, machine in enumerate(inputs.machine):
+            p_ref[end, machine] += inputs.p_set[at, g]
+        for i, port in enumerate(inputs.port):
+            drawn[end, port] = -inputs.p_load[at, i]
 
 
 @compiled
@@ -136,10 +138,8 @@ def integrate_plant(
     """Integrate from the first point of time to the last; a share due at the last point is not applied.
 
     Args:
-        data: the machines.
-        network: between ports.
-        inputs: at the points.
-        agc: secondary control.
+        data, network: the machines, and what is between ports.
+        inputs, agc: what drives them at the points, and secondary control.
         steps: integrator steps from one point to the next.
         carried: from the piece before; becomes what the next one needs.
         states: receives what happens.
@@ -160,8 +160,7 @@ def integrate_plant(
         if k >= agc.first and (k - agc.first) % agc.period == 0 and k < n - 1:
             held = -agc.gain * mean_angle(data, x)
         states.held[k] = held
-        _set_inputs(inputs, k, p_ref_ends[0], drawn_ends[0])
-        _set_inputs(inputs, min(k + 1, n - 1), p_ref_ends[1], drawn_ends[1])
+        _set_inputs(inputs, k, p_ref_ends, drawn_ends)
         for j in range(steps):
             carried.age[0] += 1
             for s in range(4):

@@ -19,7 +19,8 @@ import pandas as pd
 
 from ded_bench import Case, Settings
 from ded_bench.problem.case import SHIPPED_CASES
-from ded_bench.problem.scenario import Forecast, Scenario, ScenarioRamp, forecast, load_scenarios
+from ded_bench.problem.forecast import Forecast, forecast
+from ded_bench.problem.scenario import Scenario, ScenarioRamp, load_scenarios
 from ded_bench.results.folder import search_folders
 from ded_bench.run.online import loop
 from ded_bench.run.online.judgement import Judgement, judge_operation
@@ -35,7 +36,7 @@ class Announcements:
         self.notice_s, self.wait_s = notice_s, wait_s
 
     def __call__(self, scenario: Scenario, case: Case, quality: str, now: float, until: float) -> Forecast:
-        """See `ded_bench.problem.scenario.forecast`."""
+        """See `ded_bench.problem.forecast.forecast`."""
         loads = {
             bus: load.model_copy(update={"ramps": tuple(self._told(ramp, now) for ramp in load.ramps)})
             for bus, load in scenario.load.items()

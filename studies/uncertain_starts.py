@@ -22,9 +22,10 @@ from scipy.special import ndtr, ndtri
 from ded_bench import Case, Schedule, Settings, Solution, Status
 from ded_bench.methods.registry import get_method
 from ded_bench.plants.plant import servable
+from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import sample_scenario
-from ded_bench.problem.scenario import Forecast, Scenario, ScenarioRamp, forecast
+from ded_bench.problem.scenario import Scenario, ScenarioRamp
 from ded_bench.run.online import loop
 from ded_bench.run.online.judgement import judge_operation
 
@@ -54,7 +55,7 @@ def mean(ramp: ScenarioRamp, now: float, deviation_s: float) -> list[ScenarioRam
 def told(
     replaced: Callable[[ScenarioRamp, float], list[ScenarioRamp]], *asked: Scenario | Case | str | float
 ) -> Forecast:
-    """See `ded_bench.problem.scenario.forecast`; ramps that have not begun are replaced."""
+    """See `ded_bench.problem.forecast.forecast`; ramps that have not begun are replaced."""
     scenario, case, quality, now, until = asked
     loads = {}
     for bus, load in scenario.load.items():

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core.event import Listener, register
 from numba.core.types import unliteral
 from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
+Floats = NDArray[np.float64]
 
 
 class _Announced(Listener):
@@ -84,3 +86,17 @@ def sources_stamp(package: Path = _PACKAGE) -> str:
         if b"@compiled" in content or b"@allocation_free" in content:
             digest.update(path.relative_to(package).as_posix().encode() + b"\0" + content)
     return digest.hexdigest()
+
+
+@compiled
+def interpolated(t: Floats, rows: Floats, times: Floats) -> Floats:
+    """Rows (n_times, n) at some times, linear between those at `t`, ascending; the last one stays."""
+    found = np.empty((len(times), rows.shape[1]))
+    for i, time in enumerate(times):
+        k = np.searchsorted(t[1:], time, side="right")
+        copy_row(rows[k], found[i])
+        if k + 1 < len(t):
+            length, passed = max(t[k + 1] - t[k], 1e-200), max(time - t[k], 0.0)  # as near as numbers can be
+            for j in range(rows.shape[1]):
+                found[i, j] += (rows[k + 1, j] - rows[k, j]) / length * passed
+    return found

@@ -1,15 +1,9 @@
-"""Scenario: minutes of operation of a case - costs, what the loads do and what is announced; JSON on disk.
-
-And forecasts: what is known at an instant of a scenario's loads from then on.
-"""
+"""Scenario: minutes of operation of a case - costs, what the loads do and what is announced; JSON on disk."""
 
 from __future__ import annotations
 
 import functools
-import itertools
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,6 +23,10 @@ from ded_bench.problem.quantities import (
     Positive,
     check_whole_steps,
 )
+
+#: Of forecasts. `announced`: ramps as announced; `perfect`: what will be; `worse`: announcements four times
+#: as wrong; `persistence`: loads stay as they are.
+QUALITIES = ("announced", "perfect", "worse", "persistence")
 
 
 class ScenarioRamp(Record):
@@ -194,91 +192,3 @@ def load_scenarios(paths: Sequence[str | Path], case: Case) -> list[Scenario]:
     if not found:
         raise InputError("scenarios", "", "no scenario was given")
     return list(found.values())
-
-
-#: `announced`: ramps as announced; `perfect`: what will be; `worse`: announcements four times as wrong;
-#: `persistence`: loads stay as they are.
-QUALITIES = ("announced", "perfect", "worse", "persistence")
-WORSE = 4.0
-#: Points closer together than this are one, s.
-RESOLUTION = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Forecast:
-    """Loads from an instant on, linear between points; one at the time of the one before says nothing."""
-
-    times: Array  # (n_load, n_points), s of the scenario, ascending
-    values: Array  # (n_load, n_points), injections, pu
-
-    def at(self, t: Array) -> Array:
-        """Forecast injections at times `t` in s of the scenario, shape (n_t, n_load), pu."""
-        return np.stack([np.interp(t, *load) for load in zip(self.times, self.values, strict=True)], axis=-1)
-
-    def instance(
-        self, scenario: Scenario, case: Case, start: float, horizon_s: float, initial: Initial, name: str
-    ) -> Instance:
-        """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
-        times, values, end = self.times, self.values, start + horizon_s
-        if times[0, 0] < start or times[0, -1] > end:
-            first, last = self.at(np.array([start, end]))[:, :, None]
-            values = np.where(times < start, first, np.where(times > end, last, values))
-            times = times.clip(start, end)
-        new, inner = np.ones(times.shape, dtype=bool), times[:, 1:-1]
-        new[:, 1:-1] = (inner - times[:, :-2] > RESOLUTION) & (inner < times[:, -1:] - RESOLUTION)
-        t, ends = (times - start)[new], [0, *np.cumsum(new.sum(axis=1)).tolist()]
-        t[ends[:-1]], t[np.subtract(ends[1:], 1)] = 0.0, horizon_s
-        points = tuple(zip(t.tolist(), values[new].tolist(), strict=True))
-        # Of parts that were checked: to do it again would take as long as the plant.
-        loads = [LoadPoints.model_construct(points=points[i:j]) for i, j in itertools.pairwise(ends)]
-        return Instance.model_construct(
-            schema_="ded-bench/instance/2",
-            id=name,
-            case=case.id,
-            seed=(),  # from which the loads could be drawn again
-            horizon_s=horizon_s,
-            dt_s=scenario.dt_s,
-            cost=scenario.cost,
-            load=dict(zip(case.loads, loads, strict=True)),
-            initial=initial,
-        )
-
-
-def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: float) -> Forecast:
-    """Forecast the loads from `now` until `until`, s.
-
-    Ramps that have begun go on as they are; others come as announced, but not before `now`, and not at all
-    where they are not announced; the fluctuation decays by exp(-(t - now) / decay), linear between points
-    `step_s` apart.
-
-    Args:
-        scenario: what will be, and what is announced of it.
-        case: gives the order of the loads.
-        quality: one of QUALITIES.
-        now: when the forecast is made.
-        until: the end of what is asked for; after `now`.
-    """
-    order = [*map(list(scenario.load).index, case.loads)]
-    start, duration, rate, told_start, told_rate = scenario.ramps
-    initial, step, decay, fluctuations = scenario.fluctuations
-    if quality in ("perfect", "persistence"):
-        ends = np.full((len(order), 2), [now, until])
-        kinks = step * np.arange(fluctuations.shape[1]), start, start + duration
-        times = np.concatenate([ends, *(kinks if quality == "perfect" else ())], axis=1).clip(now, until)
-        times.sort(axis=1)
-        known = times if quality == "perfect" else np.full_like(times, now)
-        values = np.array([load.at(t) for load, t in zip(scenario.load.values(), known, strict=True)])
-        return Forecast(times[order], values[order])
-    wrong = WORSE if quality == "worse" else 1.0
-    begun = start <= now
-    start = np.where(begun, start, np.maximum(start + wrong * (told_start - start), now))
-    rate = np.where(begun, rate, rate + wrong * (told_rate - rate))
-    steps = now + step * np.arange(math.ceil((until - now) / step.min()) + 1)
-    times = np.sort(np.concatenate([np.minimum(steps, until), start, start + duration], axis=1), axis=1)
-    times = np.clip(times, now, until)
-    gone_on = np.clip(times[:, :, None] - start[:, None], 0.0, duration[:, None])
-    k = np.minimum(now // step, fluctuations.shape[1] - 2).astype(int)
-    before, after = (fluctuations[np.arange(len(k))[:, None], i] for i in (k, k + 1))
-    present = (after - before) / ((k + 1) * step - k * step) * (now - k * step) + before  # as np.interp
-    values = initial + (gone_on @ rate[:, :, None])[:, :, 0] + present * np.exp((now - times) / decay)
-    return Forecast(times[order], values[order])

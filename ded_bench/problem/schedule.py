@@ -40,15 +40,9 @@ class Schedule:
 
     def at(self, times: Array) -> Array:
         """Powers at `times`, shape (n_times, n_gen), pu, by linear interpolation."""
-        row = self.t[1:].searchsorted(times, side="right")
-        slope = np.zeros(self.p.shape)  # after the last row there is none
-        length = np.maximum(self.t[1:] - self.t[:-1], 1e-200)[:, None]  # rows may be as near as numbers can
-        with np.errstate(all="ignore"):  # powers may be as large
-            np.divide(self.p[1:] - self.p[:-1], length, out=slope[:-1])
-            powers = slope.take(row, axis=0)
-            powers *= np.maximum(times - self.t.take(row), 0.0)[:, None]
-            powers += self.p.take(row, axis=0)
-        return powers
+        from ded_bench.problem.compiled import interpolated  # and with it Numba
+
+        return interpolated(self.t, np.ascontiguousarray(self.p), times)
 
     def write(self, path: Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""

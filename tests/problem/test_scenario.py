@@ -14,9 +14,10 @@ from ded_bench.plants.lossless.network import Network
 from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import Manifest, scenario_files, write_scenarios
 from ded_bench.problem.case import SHIPPED_CASES, Case
+from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import FLUCTUATION, LOAD_RANGE, sample_scenario
-from ded_bench.problem.scenario import QUALITIES, Scenario, forecast, load_scenarios
+from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
 
 SHIPPED = ("9bus", "two-area", "39bus")
 #: A load of the three-bus chain: a ramp in the past of t = 5, one announced wrongly, one that is not.

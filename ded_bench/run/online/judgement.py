@@ -15,8 +15,9 @@ from ded_bench.methods.solution import Settings
 from ded_bench.plants.plant import Plant, simulate
 from ded_bench.plants.score import STRICT_HZ, judge, mean_hz
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.forecast import forecast
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.scenario import Scenario, forecast
+from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.results.online_results import Judgement
 from ded_bench.results.rows import OfIslands

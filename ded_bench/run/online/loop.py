@@ -24,8 +24,9 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.scenario import Forecast, Scenario, forecast
+from ded_bench.problem.scenario import Scenario
 from ded_bench.problem.schedule import Schedule, Trajectory
 from ded_bench.run.pool import Children, NoAnswerError, WorkerDiedError, read
 from ded_bench.run.runner import GRACE_S

@@ -188,5 +188,5 @@ class _OnPlant:
         outputs = claimed.outputs, found.trajectory.omega @ self.bounds.matrix.T
         said, true = (self.bounds.beyond(one)[1:].max(axis=0) / self.bounds.limit for one in outputs)
         is_held = not ((said > -PESSIMISM) & (said - true > PESSIMISM)).any()  # else there is more to gain
-        error = abs(found.cost - claimed.objective)
+        error = max(abs(found.cost - claimed.objective), self.last.fixed.gap if self.last else 0.0)
         return found.excess <= ACCEPTED and error <= COST_TOLERANCE * abs(found.cost) and is_held

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from ded_bench.methods.knot_columns import BasisByPlaces, KnotColumns, OutputRows, pieces_of
+from ded_bench.methods.knot_columns import BasisByPlaces, FixedSetPoints, KnotColumns, OutputRows, pieces_of
 from ded_bench.methods.knots import divided, knot_weights
 from ded_bench.methods.reserve import Room
 from ded_bench.plants.plant import PlantState
@@ -128,6 +128,9 @@ class KnotProgram:
         if self.condensed:
             self._held = bounded & (np.abs(model.omega[model.points[1:]]) > HELD * bounds.limit)
         self._basis: BasisByPlaces | None = None
+        self.fixed = FixedSetPoints(self._columns.u.shape)
+        if before is not None and np.isinf(radius):
+            self.fixed = before.fixed
         if before is not None and self.condensed:
             self._held, self._basis = self._held | before._held, before._basis
 
@@ -142,7 +145,8 @@ class KnotProgram:
 
         def once(left_s: float) -> tuple[FormAnswer, Array]:
             deadline = time.perf_counter() + left_s
-            form = self._columns.program(self._radius)
+            free = self._columns.program(self._radius)
+            form = self.fixed.in_program(free, self._columns.u)
             low, high = self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
             if self.model.matrix is None and not self.condensed:
@@ -156,10 +160,16 @@ class KnotProgram:
             if self.condensed:
                 return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
             answer = solve_form(form, left_s, staged=not self._is_sparse)
-            if answer.status == Status.FAILED and len(self._columns.signs) == 1:  # with both it may succeed
-                self._divide_at(pieces_of(self.model))
+            is_fixed = self.fixed.at.any()
+            if answer.status == Status.FAILED and (is_fixed or len(self._columns.signs) == 1):
+                if is_fixed:  # with all free, or else with both signs, it may succeed
+                    self.fixed = FixedSetPoints(self._columns.u.shape)
+                else:
+                    self._divide_at(pieces_of(self.model))
                 other, _ = once(max(deadline - time.perf_counter(), 0.0))
                 answer = replace(other, iterations=answer.iterations + other.iterations)
+            elif answer.status == Status.OPTIMAL:
+                self.fixed.choose(free, self._columns.u, answer)
             return answer, none
 
         return self._at_all_knots(once, time_limit_s)[0]

@@ -90,6 +90,7 @@ class FormAnswer:
     version: str
     message: str
     basis: Basis | None = None  # where a simplex method ended
+    reduced_cost: Array | None = None  # of all columns, where an interior-point method ended
 
 
 #: Are told of every program that this process solves, and of the answer.

@@ -22,7 +22,7 @@ REGULARISATION, SPARSE_REGULARISATION = 1e-11, 1e-10
 
 
 def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = False) -> FormAnswer:
-    """Solve a linear program.
+    """Solve a linear program; columns whose bounds are equal are taken out.
 
     PIQP knows no clock: a time limit is turned into a number of iterations that fit into it.
 
@@ -44,8 +44,12 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = Fals
     solver.settings.eps_duality_gap_rel = GAP
     least = REGULARISATION if staged else SPARSE_REGULARISATION
     solver.settings.reg_lower_limit = solver.settings.reg_finetune_lower_limit = least
-    quadratic, limits = sp.csc_matrix((len(form.cost),) * 2), (form.low, form.high, form.lower, form.upper)
-    solver.setup(quadratic, form.cost, form.equal, form.right, form.between, *limits)
+    free = form.lower < form.upper
+    equal, between = form.equal[:, free], form.between[:, free]
+    x = np.where(free, 0.0, form.lower)
+    shift, quadratic = form.between @ x, sp.csc_matrix((np.count_nonzero(free),) * 2)
+    limits = form.low - shift, form.high - shift, form.lower[free], form.upper[free]
+    solver.setup(quadratic, form.cost[free], equal, form.right - form.equal @ x, between, *limits)
     if np.isfinite(time_limit_s):
         begun = time.perf_counter()
         solver.settings.max_iter = 1
@@ -54,11 +58,13 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, staged: bool = Fals
         rest = (time_limit_s - (now - started)) / (now - begun)  # the start takes as long as an iteration
         solver.settings.max_iter = min(MAX_ITERATIONS, max(int(2 * rest), 1))
     found = solver.solve()
-    x, iterations = np.array(solver.result.x), int(solver.result.info.iter)
+    result, version = solver.result, f"piqp {piqp.__version__}"
+    x[free] = result.x
+    price = form.cost + form.equal.T @ result.y + form.between.T @ (result.z_u - result.z_l)
     if found == piqp.PIQP_SOLVED:
         status = Status.OPTIMAL
     elif found == piqp.PIQP_MAX_ITER_REACHED and solver.settings.max_iter < MAX_ITERATIONS:
         status = Status.TIME_LIMIT
     else:
         status = Status.FAILED
-    return told(form, FormAnswer(status, x, iterations, f"piqp {piqp.__version__}", found.name))
+    return told(form, FormAnswer(status, x, result.info.iter, version, found.name, reduced_cost=price))

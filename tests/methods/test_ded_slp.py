@@ -12,6 +12,7 @@ import pytest
 from ded_bench.files.strict import parse_record
 from ded_bench.methods import ded_slp, ed, knot_columns, knot_program
 from ded_bench.methods.ded_slp import prepare
+from ded_bench.methods.knot_columns import FixedSetPoints
 from ded_bench.methods.knot_program import KnotProgram
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.slp import Attempt, Parts
@@ -29,6 +30,7 @@ from ded_bench.solvers.status import Status
 from tests.conftest import CASE_FILES
 from tests.methods import on_surrogates
 from tests.methods.pyomo_models import build_ded_slp
+from tests.solvers.test_solvers import FORM
 
 HORIZON = 4.0
 POINTS = np.array([0, 60, 121, 130, 205, 300, 400])
@@ -84,6 +86,39 @@ def test_where_rows_of_one_sign_fail_there_are_those_of_both(monkeypatch: pytest
     assert answer.status == Status.OPTIMAL
     assert len(tried) == 2
     assert tried[0] < tried[1]
+
+
+def test_what_is_fixed_wrongly_is_told_and_set_free() -> None:
+    """2 x + 3 y is least at (2, 1); with y at its limit of 0.8 a unit more of it would save 1."""
+    form, u, fixed = (
+        dataclasses.replace(FORM, lower=np.array([0.0, 0.8])),
+        np.array([[1]]),
+        FixedSetPoints((1, 1)),
+    )
+    fixed.at[0] = True
+    answer = knot_program.solve_form(fixed.in_program(form, u))
+    assert answer.x == pytest.approx([2.4, 0.8], abs=1e-6)
+    assert answer.reduced_cost == pytest.approx([0.0, -1.0], abs=1e-6)
+    fixed.choose(form, u, answer)
+    assert fixed.gap == pytest.approx(3.0 - 0.8)
+    assert not fixed.at.any()
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_set_points_fixed_at_limits_change_no_optimum(
+    everywhere: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that the last program had there; where that leaves no solution, all are free again."""
+    monkeypatch.setattr(knot_columns, "AROUND", 0)
+    case, none = Case.load(CASE_FILES["fivemachine"]), np.empty((0, 3), dtype=int)
+    made = program(case, short(case, 0), case.bounds("TO"))
+    whole = made.solve(none, np.inf)
+    assert made.fixed.at.any()
+    made.fixed.at[0] |= everywhere
+    smaller = made.solve(none, np.inf)
+    assert (whole.status, smaller.status) == (Status.OPTIMAL, Status.OPTIMAL)
+    assert made.predict(smaller.x).objective == pytest.approx(made.predict(whole.x).objective, rel=1e-6)
+    assert made.fixed.gap <= 1e-6 * made.predict(whole.x).objective
 
 
 @pytest.mark.parametrize("index", range(2))

@@ -7,6 +7,7 @@ rotor angles there. The program stands for itself: it knows no linearisation.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from ded_bench.methods.radau_program import POINTS, element_points, interpolated
 from ded_bench.plants.detailed.detailed_plant import DetailedPlant
 from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
 from ded_bench.plants.detailed.power_system import DetailedState
-from ded_bench.plants.detailed.symbolic import Equations, Functions, plant_equations
+from ded_bench.plants.detailed.symbolic import Equations, plant_equations
 from ded_bench.plants.plant import SimulationError, simulate
 from ded_bench.problem.case import Array, Indices
 from ded_bench.problem.instance import Instance
@@ -30,7 +31,7 @@ from ded_bench.solvers.linear_program import assign
 #: Where else in an element frequencies are bounded, as fractions of it.
 BETWEEN = tuple(i / 10 for i in range(1, 10))
 #: The equations' elementary functions for arrays of Pyomo's expressions.
-PYOMO = Functions(*(np.frompyfunc(function, 1, 1) for function in (pyo.sin, pyo.cos, pyo.sqrt)))
+PYOMO = SimpleNamespace(**{name: np.frompyfunc(getattr(pyo, name), 1, 1) for name in ("sin", "cos", "sqrt")})
 
 
 class Mesh(NamedTuple):

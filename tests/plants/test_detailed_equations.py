@@ -9,7 +9,7 @@ import pytest
 
 from ded_bench.files.strict import parse_record
 from ded_bench.plants.detailed.equations import LoadSlopes, machine_rates, solve_afresh, sources
-from ded_bench.plants.detailed.machine_arrays import DELTA, E2D, E2Q, N_STATES, SPEED, machine_arrays, moving
+from ded_bench.plants.detailed.machine_arrays import DELTA, E2D, E2Q, N_STATES, SPEED, machine_arrays
 from ded_bench.plants.detailed.power_system import PowerSystem, interleaved
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Case
@@ -218,4 +218,4 @@ def test_the_states_that_move():
     count = {grid: len(system_of(grid, island=True).moving) for grid in GRIDS}
     assert count == {"two-area": 4 * 13, "39bus": 10 * 13, "68bus": 12 * 13 + 4 * 10, "140bus": 372}
     infinite = system_of("39bus", island=False)
-    assert len(moving(infinite.data)) == 128
+    assert len(infinite.moving) == 128

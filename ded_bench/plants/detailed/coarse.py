@@ -195,9 +195,8 @@ class CoarsePlant:
         system, maps = self.system, self.maps
         state = start(system, instance) if state is None else state
         n = round(instance.horizon_s / self.spacing_s)
-        drawn = system.p_drawn(
-            instance.p_load(system.case, np.linspace(0.0, instance.horizon_s, n * PARTS + 1))
-        )
+        times = np.linspace(0.0, instance.horizon_s, n * PARTS + 1)
+        drawn = system.p_drawn(instance.p_load(system.case, times))
         drawn = np.ascontiguousarray(drawn[:, : len(maps.drawn)])
         change = (drawn - maps.drawn).astype(self._number)
         windows = np.lib.stride_tricks.sliding_window_view(change, PARTS + 1, axis=0)[::PARTS]

@@ -23,7 +23,7 @@ from ded_bench.plants.detailed.equations import (
     solve_voltages,
     sources,
 )
-from ded_bench.plants.detailed.machine_arrays import GATE, N_STATES, SPEED, TURBINE, MachineArrays
+from ded_bench.plants.detailed.machine_arrays import GATE, SPEED, TURBINE, MachineArrays
 from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array, Indices
 
@@ -150,7 +150,8 @@ def integrate_plant(
     n, n_machine, n_load, h = len(states.x), states.x.shape[2], len(inputs.p_drawn), inputs.dt / steps
     node, weight = (0.0, 0.5, 0.5, 1.0), (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
     x, v, held = states.x[0].copy(), states.v[0].copy(), states.held[0]
-    stage, rates, total = x.copy(), np.zeros_like(x), np.zeros_like(x)
+    stage, rates, total = x.copy(), np.zeros_like(x), np.zeros(x.size)
+    all_x, all_stage, all_rates = x.ravel(), stage.ravel(), rates.ravel()  # the same numbers, in a row
     p_ref, drawn, p_e = np.empty(n_machine), np.empty(n_load), np.empty(n_machine)
     source, p_ref_ends, drawn_ends = np.empty(len(v)), np.empty((2, n_machine)), np.empty((2, n_load))
     for k in range(n):
@@ -165,9 +166,8 @@ def integrate_plant(
             carried.age[0] += 1
             for s in range(4):
                 inside = (j + node[s]) / steps
-                for q in range(N_STATES):
-                    for i in range(n_machine):
-                        stage[q, i] = x[q, i] + h * node[s] * rates[q, i]
+                for i in range(len(total)):
+                    all_stage[i] = all_x[i] + h * node[s] * all_rates[i]
                 for i in range(n_machine):
                     p_ref[i] = p_ref_ends[0, i] + inside * (p_ref_ends[1, i] - p_ref_ends[0, i])
                     p_ref[i] += agc.participation[i] * held
@@ -178,8 +178,7 @@ def integrate_plant(
                     return k
                 machine_rates(data, stage, v, p_ref, inputs.v_ref, rates, p_e)
                 if s == 0 and j == 0:
-                    for q in range(N_STATES):
-                        copy_row(x[q], states.x[k, q])
+                    copy_row(all_x, states.x[k].ravel())
                     copy_row(v, states.v[k])
                     copy_row(p_e, states.p_e[k])
                     for g, i in enumerate(inputs.machine):
@@ -187,11 +186,9 @@ def integrate_plant(
                         states.omega[k, g], states.p_gen[k, g] = x[SPEED, i] * data.omega_0[i], gate + turbine
                     if k == n - 1:
                         return n
-                for q in range(N_STATES):
-                    for i in range(n_machine):
-                        total[q, i] += h * weight[s] * rates[q, i]
-            for q in range(N_STATES):
-                for i in range(n_machine):
-                    x[q, i] += total[q, i]
-                    total[q, i] = 0.0
+                for i in range(len(total)):
+                    total[i] += h * weight[s] * all_rates[i]
+            for i in range(len(total)):
+                all_x[i] += total[i]
+                total[i] = 0.0
     return n

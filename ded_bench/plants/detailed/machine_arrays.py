@@ -120,16 +120,3 @@ def _stabiliser(pss: Any) -> dict[str, float]:
         "lead_b": pss.t3 / pss.t4,
         "rate_b": 1.0 / pss.t4,
     }
-
-
-def moving(data: MachineArrays) -> Indices:
-    """Places in a flat state array (N_STATES × n) of the states that can change, in ascending order."""
-    rates = np.ones((N_STATES, len(data.port)))
-    for state, rate in (
-        *((E1Q, data.rate_d1), (E1D, data.rate_q1), (E2D, data.rate_d2), (E2Q, data.rate_q2)),
-        *((EXCITER, data.rate_x), (FIELD, data.rate_f), (FEEDBACK, data.rate_fb)),
-        *((WASHOUT, data.rate_w), (LEAD_A, data.rate_a), (LEAD_B, data.rate_b)),
-    ):
-        rates[state] = rate
-    rates[DELTA] = rates[SPEED] = data.inverse_m
-    return np.flatnonzero(rates)

@@ -128,8 +128,17 @@ class PowerSystem:
 
     @functools.cached_property
     def moving(self) -> Indices:
-        """See `machine_arrays.moving`."""
-        return at.moving(self.data)
+        """Places in a flat state array (N_STATES × n) of the states that can change, in ascending order."""
+        data = self.data
+        rates = np.ones((at.N_STATES, len(data)))
+        for state, rate in (
+            *((at.E1Q, data.rate_d1), (at.E1D, data.rate_q1), (at.E2D, data.rate_d2), (at.E2Q, data.rate_q2)),
+            *((at.EXCITER, data.rate_x), (at.FIELD, data.rate_f), (at.FEEDBACK, data.rate_fb)),
+            *((at.WASHOUT, data.rate_w), (at.LEAD_A, data.rate_a), (at.LEAD_B, data.rate_b)),
+        ):
+            rates[state] = rate
+        rates[at.DELTA] = rates[at.SPEED] = data.inverse_m
+        return np.flatnonzero(rates)
 
     @functools.cached_property
     def symbolic(self) -> SymbolicPlant:

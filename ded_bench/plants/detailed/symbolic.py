@@ -7,7 +7,7 @@ Sources: the models GENROU, GENCLS, SEXS, IEEEX1, ST2CUT and TGOV1 as power-syst
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi
@@ -16,14 +16,6 @@ import numpy as np
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.equations import set_rates
 from ded_bench.plants.detailed.power_flow import PortNetwork
-
-
-class Functions(NamedTuple):
-    """Elementary functions of what equations are written in: CasADi's, or Pyomo's element by element."""
-
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
-    sqrt: Callable[[Any], Any]
 
 
 class Equations(NamedTuple):
@@ -54,8 +46,7 @@ def symbolic_plant(data: at.MachineArrays, network: PortNetwork) -> SymbolicPlan
     p_ref, drawn, v_ref = (casadi.SX.sym(name, size) for name, size in (("p", n), ("l", n_port), ("r", n)))
     states = casadi.reshape(x, n, at.N_STATES)
     s = [states[:, i] for i in range(at.N_STATES)]
-    functions = Functions(casadi.sin, casadi.cos, casadi.sqrt)
-    found = plant_equations(data, network, s, (v[0::2], v[1::2]), (p_ref, drawn, v_ref), functions)
+    found = plant_equations(data, network, s, (v[0::2], v[1::2]), (p_ref, drawn, v_ref), casadi)
     balance = casadi.reshape(casadi.horzcat(*found.balance).T, 2 * n_port, 1)
     inputs = [x, v, p_ref, drawn, v_ref]
     outputs = [casadi.vertcat(*found.rates), balance, found.p_e, found.p_m]
@@ -71,7 +62,7 @@ def plant_equations(
     s: Sequence[Any],
     voltage: tuple[Any, Any],
     inputs: tuple[Any, Any, Any],
-    functions: Functions,
+    functions: Any,
 ) -> Equations:
     """Write the equations of all machines and the network at one state.
 
@@ -82,7 +73,7 @@ def plant_equations(
         voltage: real and imaginary parts at the ports, (n_port,), pu.
         inputs: references of governors, (n,), powers drawn at the ports, (n_port,), and references of
             exciters, (n,), pu.
-        functions: of the algebra that all these are written in.
+        functions: has `sin`, `cos` and `sqrt` of the algebra that all these are written in.
     """
     (v_re, v_im), (p_ref, drawn, v_ref) = voltage, inputs
     ports = data.port.tolist()

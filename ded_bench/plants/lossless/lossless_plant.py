@@ -126,9 +126,8 @@ class LosslessPlant:
 
     def columns(self, states: Array) -> Mapping[str, Array]:
         """Angles of all buses, `theta_<bus>`, rad, relative to the slack."""
-        return {
-            f"theta_{bus.id}": column for bus, column in zip(lossless(self.case).buses, states.T, strict=True)
-        }
+        columns = zip(lossless(self.case).buses, states.T, strict=True)
+        return {f"theta_{bus.id}": column for bus, column in columns}
 
     def nominal(self) -> NominalPoint:
         """See `Plant.nominal`."""

@@ -60,7 +60,7 @@ class Carried(NamedTuple):
     recent: Array  # algebraic angles at the last steps, newest first, (RECENT, n_algebraic), rad
     factor: Array  # of the Jacobian of the algebraic equations, (n_factor,), see `eliminate`
     ahead: Array  # the algebraic angles where the next step begins, nearly, (n_algebraic,), rad
-    past: Array  # derivatives of angles and frequencies at the last steps, newest first, (6, 2, n_gen)
+    past: Array  # derivatives of angles and frequencies at the last steps, newest first, (6, 2 n_gen)
     linear: Indices  # steps that powers and loads have been linear for, (1,)
     slope: Array  # change of powers and injections in the last interval, (n_gen + n_algebraic,), pu
 
@@ -68,9 +68,9 @@ class Carried(NamedTuple):
 class Work(NamedTuple):
     """Of one step."""
 
-    state: Array  # angles and frequencies of the generators where it begins, (2, n_gen), rad and rad/s
+    state: Array  # angles and frequencies of the generators where it begins, (2 n_gen,), rad and rad/s
     stage: Array  # at one of its stages, likewise
-    rates: Array  # their derivatives at all of them, (n_stages, 2, n_gen)
+    rates: Array  # their derivatives at all of them, (n_stages, 2 n_gen)
     angle: Array  # of all buses, (n_bus,), rad
     f: Array  # injections of all buses, (n_bus,), pu
     wanted: Array  # injections of the algebraic buses, (n_algebraic,), pu
@@ -85,7 +85,7 @@ def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
         recent=np.empty((RECENT, n)),
         factor=np.empty(n + len(grid.elimination.met)),
         ahead=np.empty(n),
-        past=np.zeros((len(BASHFORTH), 2, n_gen)),
+        past=np.zeros((len(BASHFORTH), 2 * n_gen)),
         linear=np.zeros(1, np.int_),
         slope=np.zeros(n_gen + n),
     )
@@ -96,11 +96,11 @@ def carried_from(grid: CompiledGrid, theta: Array) -> Carried:
 
 def work_of(grid: CompiledGrid, theta: Array, carried: Carried) -> Work:
     """Arrays to work on, at angles (n_bus,)."""
-    both, n_gen = np.empty((2, 2, len(grid.generators))), len(grid.generators)
-    rates, f, wanted = np.empty((len(NODES), 2, n_gen)), np.empty(len(theta)), np.empty(len(grid.algebraic))
-    newton = np.empty_like(wanted), np.empty(len(grid.coupling))
+    n, n_state = len(grid.algebraic), 2 * len(grid.generators)
+    step = np.empty(n_state), np.empty(n_state), np.empty((len(NODES), n_state))
+    newton = np.empty(n), np.empty(len(grid.coupling))
     last = carried._replace(recent=carried.recent.copy(), factor=carried.factor.copy())
-    return Work(both[0], both[1], rates, theta.copy(), f, wanted, newton, last)
+    return Work(*step, theta.copy(), np.empty(len(theta)), np.empty(n), newton, last)
 
 
 @allocation_free
@@ -118,8 +118,9 @@ def integrate(grid: CompiledGrid, inputs: GridInputs, carried: Carried, work: Wo
         The number of points computed: less than n where the algebraic equations have no solution.
     """
     n, h, state, angle = len(found.omega), inputs.dt / inputs.steps, work.state, work.angle
-    for g in range(state.shape[1]):
-        state[0, g], state[1, g] = angle[grid.generators[g]], found.omega[0, g]
+    n_gen = len(grid.generators)
+    for g in range(n_gen):
+        state[g], state[n_gen + g] = angle[grid.generators[g]], found.omega[0, g]
     for k in range(n):
         if k == n - 1:  # the next piece does this point once more
             copy_row(carried.factor, work.last.factor)
@@ -135,7 +136,7 @@ def integrate(grid: CompiledGrid, inputs: GridInputs, carried: Carried, work: Wo
                 return k
             if j == 0:
                 copy_row(angle, found.theta[k])
-                copy_row(state[1], found.omega[k])
+                copy_row(state[n_gen:], found.omega[k])
                 found.p_slack[k] = work.f[grid.slack]
                 if k == n - 1:
                     return n
@@ -154,19 +155,16 @@ def _runge_kutta(
     """Take step j after point k, (k, j), whose first derivatives are known; whether there is a solution."""
     (k, j), state, stage, rates = begin, work.state, work.stage, work.rates
     for s in range(1, len(NODES)):
-        copy_row(state[0], stage[0])
-        copy_row(state[1], stage[1])
+        copy_row(state, stage)
         for r in range(s):
-            for q in range(2):
-                for g in range(state.shape[1]):
-                    stage[q, g] += h * STAGES[s, r] * rates[r, q, g]
+            for i in range(len(state)):
+                stage[i] += h * STAGES[s, r] * rates[r, i]
         _extrapolate(grid, carried.recent, NODES[s], work.angle)
         if not _evaluate(grid, inputs, (k, (j + NODES[s]) / inputs.steps), carried, s, stage, work):
             return False
     for s in range(len(NODES)):
-        for q in range(2):
-            for g in range(state.shape[1]):
-                state[q, g] += h * WEIGHTS[s] * rates[s, q, g]
+        for i in range(len(state)):
+            state[i] += h * WEIGHTS[s] * rates[s, i]
     _extrapolate(grid, carried.recent, 1.0, work.angle)
     return True
 
@@ -189,34 +187,30 @@ def _adams(
         Whether it is.
     """
     past, predicted, rates = carried.past, work.stage, work.rates[-1]
-    for q in range(2):
-        for i in range(len(past) - 1, 0, -1):
-            copy_row(past[i - 1, q], past[i, q])
-        copy_row(work.rates[0, q], past[0, q])
-        copy_row(work.state[q], predicted[q])
+    for j in range(len(past) - 1, 0, -1):
+        copy_row(past[j - 1], past[j])
+    copy_row(work.rates[0], past[0])
+    copy_row(work.state, predicted)
     carried.linear[0] += 1
     if carried.linear[0] < len(past):
         return False
-    for i in range(len(past)):
-        for q in range(2):
-            for g in range(predicted.shape[1]):
-                predicted[q, g] += h * BASHFORTH[i] * past[i, q, g]
+    for j in range(len(past)):
+        for i in range(len(predicted)):
+            predicted[i] += h * BASHFORTH[j] * past[j, i]
     _extrapolate(grid, carried.recent, 1.0, work.angle)
     if not _evaluate(grid, inputs, end, carried, -1, predicted, work):
         return False
     off = 0.0
-    for q in range(2):
-        for g in range(predicted.shape[1]):
-            mean = MOULTON[0] * rates[q, g]
-            for i in range(1, len(MOULTON)):
-                mean += MOULTON[i] * past[i - 1, q, g]
-            corrected = work.state[q, g] + h * mean
-            off = max(off, abs(corrected - predicted[q, g]))
-            predicted[q, g] = corrected
+    for i in range(len(predicted)):
+        mean = MOULTON[0] * rates[i]
+        for j in range(1, len(MOULTON)):
+            mean += MOULTON[j] * past[j - 1, i]
+        corrected = work.state[i] + h * mean
+        off = max(off, abs(corrected - predicted[i]))
+        predicted[i] = corrected
     if not off < max(ADAMS_TOLERANCE, 3.0 * grid.mismatch):
         return False
-    copy_row(predicted[0], work.state[0])
-    copy_row(predicted[1], work.state[1])
+    copy_row(predicted, work.state)
     return True
 
 
@@ -258,7 +252,7 @@ def _evaluate(
     state: Array,
     work: Work,
 ) -> bool:
-    """Derivatives of a state, (2, n_gen).
+    """Derivatives of a state, (2 n_gen,).
 
     Args:
         grid: the network.
@@ -273,10 +267,10 @@ def _evaluate(
         Whether the algebraic equations have a solution.
     """
     (k, inside), angle = moment, work.angle
-    n_gen, n_algebraic, after = state.shape[1], len(grid.algebraic), min(k + 1, len(inputs.p_gen) - 1)
+    n_gen, n_algebraic, after = len(grid.generators), len(grid.algebraic), min(k + 1, len(inputs.p_gen) - 1)
     recent, wanted, newton = carried.recent, work.wanted, work.newton
     for g in range(n_gen):
-        angle[grid.generators[g]] = state[0, g]
+        angle[grid.generators[g]] = state[g]
     for i in range(n_algebraic):
         wanted[i] = inputs.injection[k, i]
         wanted[i] += inside * (inputs.injection[after, i] - inputs.injection[k, i])
@@ -294,6 +288,6 @@ def _evaluate(
             recent[0, i] = angle[grid.algebraic[i]]
     for g in range(n_gen):
         power = inputs.p_gen[k, g] + inside * (inputs.p_gen[after, g] - inputs.p_gen[k, g])
-        force = power - work.f[grid.generators[g]] - grid.d[g] * state[1, g]
-        work.rates[s, 0, g], work.rates[s, 1, g] = state[1, g], force / grid.m[g]
+        force = power - work.f[grid.generators[g]] - grid.d[g] * state[n_gen + g]
+        work.rates[s, g], work.rates[s, n_gen + g] = state[n_gen + g], force / grid.m[g]
     return True

@@ -15,7 +15,14 @@ import cma
 import numpy as np
 
 from ded_bench import Case
-from ded_bench.methods.admm.admm_inference import DOUBLING, PRICE, STRAIGHT, CompiledIterations, weight_shapes
+from ded_bench.methods.admm.admm_inference import (
+    DOUBLING,
+    NODES,
+    PRICE,
+    SETTINGS,
+    STRAIGHT,
+    CompiledIterations,
+)
 from ded_bench.methods.admm.admm_policy import AdmmPolicy
 from ded_bench.methods.admm.admm_training import HELD_OUT, HOPELESS, MARGIN
 from ded_bench.methods.admm.modal_grid import ModalGrid
@@ -28,7 +35,7 @@ from ded_bench.problem.case import Array
 from ded_bench.problem.sampling import POLICY_SEED
 from ded_bench.results.folder import reference_run
 
-SHAPE = weight_shapes()["nodes"]
+SHAPE = NODES, len(SETTINGS)
 #: Problems of a generation, candidates, first standard deviation, generations between looks.
 BATCH, CANDIDATES, SIGMA, LOOK = 16, 14, 0.5, 10
 #: Of the running mean, once there are ten generations.

@@ -71,9 +71,8 @@ def check_case(case: Case, count: int) -> CaseCheck:
 
 def implausible(case: Case, found: CaseCheck) -> Iterator[str]:
     """What to look at again: data that few grids have, knots that are too few, bounds that tell nothing."""
-    if feeding := [
-        f"{bus} {power:g}" for bus, power in zip(case.loads, case.load_nominal, strict=True) if power > 0
-    ]:
+    loads = zip(case.loads, case.load_nominal, strict=True)
+    if feeding := [f"{bus} {power:g}" for bus, power in loads if power > 0]:
         yield f"loads that feed in, pu (a load that draws is negative): {', '.join(feeding)}"
     powers = zip(case.generators, case.p_nominal, case.p_min, case.p_max, strict=True)
     if beyond := [f"{name} {power:g}" for name, power, low, high in powers if not low <= power <= high]:

@@ -84,21 +84,18 @@ def groups(frame: pd.DataFrame) -> Iterator[tuple[str, tuple[str, str, str], pd.
     Methods stand as registered, others after them; a method's usual line first.
     """
     known = list(METHODS)
-    parts: dict[tuple[str, ...], pd.DataFrame] = {
-        tuple(map(str, key)): rows for key, rows in frame.groupby(GROUP, sort=False)
-    }
 
-    def place(key: tuple[str, ...]) -> tuple[object, ...]:
-        regime, method, settings, model = key
+    def place(part: tuple[Any, pd.DataFrame]) -> tuple[object, ...]:
+        regime, method, settings, model = part[0]
         rank = known.index(method) if method in known else len(known)
         other = model not in ("", usual_model(method))
         # refine=25 before refine=100: words and numbers in turn
         natural = [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", settings))]
         return regime, rank, method, settings != DEFAULT, natural, other, model
 
-    for key in sorted(parts, key=place):
-        regime, method, settings, model = key
-        yield regime, (method, settings, model), parts[key]
+    parts: list[tuple[Any, pd.DataFrame]] = sorted(frame.groupby(GROUP, sort=False), key=place)
+    for (regime, method, settings, model), rows in parts:
+        yield regime, (method, settings, model), rows
 
 
 def judged_rows(frame: pd.DataFrame) -> pd.DataFrame:

@@ -105,14 +105,13 @@ def _solve(a: argparse.Namespace) -> int:
             _print_row(results, row)
 
     waiting = {task.key for task in todo}
-    finished = [task.key for task in tasks if task.key not in waiting]
-    for key in finished:
-        print_row(results.rows[key])
+    rows = finished = [results.rows[task.key] for task in tasks if task.key not in waiting]
+    for row in finished:
+        print_row(row)
     if todo:
         check_writable(results.path)
     there = f", {len(finished)} there already" if finished else ""
     say(f"{counted(len(todo), 'row')} to solve{there}")
-    rows = [results.rows[key] for key in finished]
     if todo:  # else nothing is written: the folder may refuse that
         rows = run(case, tasks, results, a.workers or 1, chosen.version, print_row, a.scheduler)
     tell_solved(case, results, rows, sys.stderr if a.instance else sys.stdout)

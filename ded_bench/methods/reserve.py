@@ -106,23 +106,19 @@ class Room:
         response, shortage = np.split(new.reshape(count, n_gen + 1), [n_gen], axis=1)
 
         def rows(columns: Indices, values: Array) -> sp.csc_matrix:
-            """One row for each response and generator; columns and values are (count, n_gen, any)."""
-            row = np.broadcast_to(np.arange(count * n_gen).reshape(count, n_gen, 1), columns.shape)
-            entries = np.broadcast_to(values, columns.shape).ravel()
-            return sp.csc_matrix((entries, (row.ravel(), columns.ravel())), (count * n_gen, len(form.cost)))
+            """One row for each response and generator; columns and values are like (count, n_gen, any)."""
+            number = np.arange(count * n_gen).reshape(count, n_gen, 1)
+            row, column, value = (part.ravel() for part in np.broadcast_arrays(number, columns, values))
+            return sp.csc_matrix((value, (row, column)), (count * n_gen, len(form.cost)))
 
-        every, one = (count, n_gen, n_gen), (count, n_gen, 1)
         power, omega = (place[c][knot][:, :, None] for c in columns)
         swing, is_sudden = self.swing[:, None, None], (self.swing > 1.0)[:, None]
-        speed = rows(np.broadcast_to(response[:, None, :], every), swing * self.compliance)
+        speed = rows(response[:, None, :], swing * self.compliance)
         if is_sudden.any():
-            speed = speed + rows(omega, np.broadcast_to(1.0 * is_sudden[:, :, None], one))
-        short = rows(np.broadcast_to(shortage[:, :, None], one), np.ones(1))
-        lasts = np.broadcast_to(self.lasts_s[:, None, None], one)
-        room = rows(
-            np.concatenate([power, response[:, :, None]], axis=2),
-            np.concatenate([np.ones(one), lasts], axis=2),
-        )
+            speed = speed + rows(omega, is_sudden[:, :, None].astype(float))
+        short = rows(shortage[:, :, None], np.ones(1))
+        lasts = np.array([np.ones(count), self.lasts_s]).T[:, None]
+        room = rows(np.concatenate([power, response[:, :, None]], axis=2), lasts)
         alone = (self.swing[:, None] * self.speeds + is_sudden * at[1][knot]).ravel()
         planned = at[0][knot]
         free = np.full(alone.shape, np.inf)

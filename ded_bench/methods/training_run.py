@@ -161,6 +161,12 @@ class TrainingRun(abc.ABC):
             raise InputError(path, "", problem) from None
 
 
+def looked(value: Tensor | float, cost: Tensor, excess_hz: Tensor) -> dict[str, float]:
+    """What a look at held-out instances found: the loss, costs, (batch,), and what each exceeds, Hz."""
+    mean, most = float(excess_hz.mean()), float(excess_hz.max())
+    return {"held out": float(value), "cost": float(cost.mean()), "mean excess": mean, "max excess": most}
+
+
 @contextlib.contextmanager
 def repeatable() -> Iterator[None]:
     """Train so that results repeat: on one thread, from which these networks lose nothing."""

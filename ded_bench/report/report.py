@@ -295,12 +295,9 @@ def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     made.append("## Certificate")
     if not sources.certificates:
         return [*made, "No certificate was made for these results; `ded-bench certify` makes one."]
-    told = [{"model": ""} | c.model_dump() for c in sources.certificates]
-    certificates = titled(pd.DataFrame([one | {"model": model_name(one["model"])} for one in told]))
-    return [
-        *made,
-        PageTable(certificates, columns.CERTIFICATE, "All that makes them up stands in certificate.json"),
-    ]
+    told = [c.model_dump() | {"model": model_name(c.model)} for c in sources.certificates]
+    caption = "All that makes them up stands in certificate.json"
+    return [*made, PageTable(titled(pd.DataFrame(told)), columns.CERTIFICATE, caption)]
 
 
 def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
@@ -325,7 +322,6 @@ def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     masters = sorted({seed.split(" ")[0] for seed in rows["seed"] if seed})
     counts = rows["split"].replace({"train": "training", "none": "other"}).value_counts()
     dates = sorted(date for date in rows["date"] if date) or ["–"]
-    here = "; ".join(f"{name} {value}" for name, value in environment().items())
     items = (
         f"Rows: {', '.join(f'{count} on {name} instances' for name, count in counts.items()) or 'none'}.",
         f"Rows made: {dates[0]} to {dates[-1]}; problem version: {distinct('problems_version')}.",
@@ -334,6 +330,6 @@ def made_by(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
         f"solvers: {distinct('solver_version')}.",
         f"Surrogates and policies: {distinct('made_with')}.",
         f"Master seeds of the instances: {', '.join(masters) or '–'}.",
-        f"This report was written {now()} with: {here}.",
+        f"This report was written {now()} with: {environment()}.",
     )
     return ["## What made the rows", bullets(items)]

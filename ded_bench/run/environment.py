@@ -43,11 +43,11 @@ def now() -> str:
     return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def environment() -> dict[str, str]:
+def environment() -> str:
     """Versions and hardware for the report."""
     facts = {"ded-bench": version(), "python": platform.python_version()}
-    facts |= {name: _version(name) for name in PACKAGES}
-    return facts | {"host": host(), "memory": _memory()}
+    facts |= {name: _version(name) for name in PACKAGES} | {"host": host(), "memory": _memory()}
+    return "; ".join(f"{name} {value}" for name, value in facts.items())
 
 
 def _git(*arguments: str) -> str:

@@ -100,9 +100,7 @@ def unscored_row(
 ) -> Row:
     """The row of a task with what the solver claims; `where` is the host that solved it."""
     seed, objective = task.instance.seed, solution.solver_objective
-    claimed = {
-        f.name: getattr(solution, f.name) for f in dataclasses.fields(Solution) if f.name != "schedule"
-    }
+    claimed = {name: value for name, value in vars(solution).items() if name != "schedule"}
     claimed["solver_objective"] = objective if objective is not None and abs(objective) <= LARGEST else None
     return Row(
         **task.key._asdict(),

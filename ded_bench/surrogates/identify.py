@@ -167,7 +167,7 @@ EVALUATIONS = 10
 
 
 def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
-    """Identify the model of a case from `count` trajectories (default: `n_training`).
+    """Identify the model of a case from `count` trajectories (default: see `training_trajectories`).
 
     Their instances come from masters that no benchmark uses (3,000,000 + seed), under
     schedules that need no optimisation.
@@ -175,8 +175,7 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     start = energy_form(case)
     if not _is_small(case):
         return make_model(case, start, {"seed": seed, "trajectories": 0})
-    count = n_training(case) if count is None else count
-    data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
+    data = training_trajectories(case, seed, count)
     training: dict[str, int | float] = {"seed": seed, "trajectories": data.inputs.shape[1]}
 
     def residuals(x: Array) -> Array:
@@ -188,9 +187,10 @@ def identify(case: Case, seed: int = 0, count: int | None = None) -> Koopman:
     return make_model(case, unpack(start, result.x), training | {"cost": float(result.cost)})
 
 
-def n_training(case: Case) -> int:
-    """Trajectories that both kinds of models are identified from."""
-    return TRAIN if _is_small(case) else LARGE_GRID_TRAIN
+def training_trajectories(case: Case, seed: int, count: int | None) -> Trajectories:
+    """What both kinds of models are identified from; `count` is by the case's size if None."""
+    usual = TRAIN if _is_small(case) else LARGE_GRID_TRAIN
+    return sample_trajectories(case, seed, usual if count is None else count, mix=TRAIN_MIX)
 
 
 def held_out(case: Case, seed: int = 0, count: int = HELD_OUT) -> Trajectories:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
-from ded_bench.surrogates.identify import TRAIN_MIX, n_training, sample_trajectories
+from ded_bench.surrogates.identify import training_trajectories
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import EPSILON
 
@@ -68,8 +68,7 @@ class PaperKoopman(nn.Module):
 
 def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: int = STEPS) -> Koopman:
     """Identify a model as the paper does, from the trajectories that `identify.identify` uses."""
-    count = n_training(case) if count is None else count
-    data = sample_trajectories(case, seed, count, mix=TRAIN_MIX)
+    data = training_trajectories(case, seed, count)
     n_gen, n_in = len(case.generators), data.inputs.shape[-1]
     # x = (θ_gen, P_s, ω) shifted and scaled, (n_points, batch, 2 n_gen + 1); ω and P_s are not shifted.
     x = np.concatenate([data.theta, data.p_slack[..., None], data.omega], axis=-1)

@@ -90,11 +90,6 @@ class AdmmProblems(NamedTuple):
     mean: MeanModes
 
 
-def weight_shapes() -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the weights: the same on every grid."""
-    return {"nodes": (NODES, len(SETTINGS))}
-
-
 def starting_settings(iterations: int) -> Array:
     """Settings where training starts, (iterations, 8)."""
     return np.stack([np.geomspace(*ends, iterations) for ends in SETTINGS.values()], axis=1)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.admm.admm_inference import CompiledIterations, weight_shapes
+from ded_bench.methods.admm.admm_inference import NODES, SETTINGS, CompiledIterations
 from ded_bench.methods.admm.modal_grid import ModalGrid
 from ded_bench.methods.admm.problems import problems_of
 from ded_bench.methods.island.island_policy import IslandPolicy, IslandSolver
@@ -100,7 +100,7 @@ class AdmmPolicy(TrainedPolicy):
             raise ValueError("number of iterations is missing or mistyped")
         if not (isinstance(margin, int | float) and 0.0 <= margin < 1.0):
             raise ValueError("margin is no fraction")
-        return weight_shapes()
+        return {"nodes": (NODES, len(SETTINGS))}  # the same on every grid
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:

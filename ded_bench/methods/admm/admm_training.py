@@ -21,7 +21,7 @@ from ded_bench.methods.admm.torch_iterations import TorchIterations, judged
 from ded_bench.methods.island.island_training import train as train_on_island
 from ded_bench.methods.trained_policy import Scope, TrainedPolicy, weights_of
 from ded_bench.methods.training_record import TrainingOptions
-from ded_bench.methods.training_run import TrainingRun, repeatable
+from ded_bench.methods.training_run import TrainingRun, looked, repeatable
 from ded_bench.plants.plant import SimulationError
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
@@ -119,12 +119,7 @@ class _AdmmTraining(TrainingRun):
         answer = self.average(self.check)
         cost, penalty, _ = judged(self.grid, self.check, answer, MARGIN)
         hertz = judged(self.grid, self.check, answer)[2] * self.grid.bound / (2 * math.pi)
-        return {
-            "held out": float((cost + PRICE * penalty).mean()),
-            "cost": float(cost.mean()),
-            "mean excess": float(hertz.mean()),
-            "max excess": float(hertz.max()),
-        }
+        return looked((cost + PRICE * penalty).mean(), cost, hertz)
 
 
 def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ded_bench.methods.admm.admm_inference import (
     DOUBLING,
     MOST,
+    NODES,
     PENALTIES,
     SETTINGS,
     STRAIGHT,
@@ -18,7 +19,6 @@ from ded_bench.methods.admm.admm_inference import (
     limits_of,
     mean_modes_of,
     starting_settings,
-    weight_shapes,
 )
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start, linear_between
 from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, swing, swing_adjoint
@@ -38,7 +38,7 @@ class TorchIterations(nn.Module):
     def __init__(self, grid: ModalGrid, iterations: int) -> None:
         super().__init__()
         self.grid = grid
-        self.nodes = nn.Parameter(torch.zeros(weight_shapes()["nodes"]))
+        self.nodes = nn.Parameter(torch.zeros(NODES, len(SETTINGS)))
         self.start, self.between = _single(starting_settings(iterations)), _single(between_nodes(iterations))
 
     def settings(self) -> Tensor:
@@ -67,12 +67,8 @@ class TorchIterations(nn.Module):
         for setting in self.settings() * torch.tensor([limits.price] * PENALTIES + [1.0] * 4):
             omega, p_slack = Respond.apply(p, grid, start, linear)  # type: ignore[no-untyped-call]
             heavy = setting[3] / (limits.unit**2 * POINTS)
-            weights = (
-                setting[0] * by_mass,
-                setting[1] * by_mass,
-                setting[2] / (limits.bound**2 * POINTS),
-                heavy,
-            )
+            steady = setting[2] / (limits.bound**2 * POINTS)
+            weights = setting[0] * by_mass, setting[1] * by_mass, steady, heavy
             now = [p[:, 1:], p.diff(dim=1), omega, p_slack]
             if not copies:
                 copies = [values.detach() for values in now]

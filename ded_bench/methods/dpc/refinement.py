@@ -97,12 +97,10 @@ class Refiner:
         batch, n_knots, n_gen = p_gen.shape
         n, n_rows = self.n_slack, len(self.rows)
         free = coarse_free_response(self.model, inputs, self.grid, self.stride)
-        slack_unit = math.sqrt(WEIGHTS["p_slack"])
+        slack_unit, omega_unit = math.sqrt(WEIGHTS["p_slack"]), math.sqrt(WEIGHTS["omega"])
         fixed = np.zeros((batch, n_rows), dtype=np.float32)
         fixed[:, :n] = free[:, n_gen] * slack_unit
-        fixed[:, n : n * (1 + n_gen)] = free[:, :n_gen].reshape(batch, -1) * (
-            math.sqrt(WEIGHTS["omega"]) / self.omega_bound
-        )
+        fixed[:, n : n * (1 + n_gen)] = free[:, :n_gen].reshape(batch, -1) * (omega_unit / self.omega_bound)
         fixed += p_gen[:, 0].astype(np.float32) @ self.rows[:, :n_gen].T
         rows = self.rows[:, n_gen:]
         # costs per grid point, relative to the instance's own: the scale the weights are chosen for

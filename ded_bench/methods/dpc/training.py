@@ -28,7 +28,7 @@ from ded_bench.methods.dpc.refinement import coarse_free_response
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.methods.trained_policy import Scope, weights_of
 from ded_bench.methods.training_record import TrainingOptions
-from ded_bench.methods.training_run import TrainingRun, follow_within, repeatable
+from ded_bench.methods.training_run import TrainingRun, follow_within, looked, repeatable
 from ded_bench.plants.plant import servable
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
@@ -74,9 +74,8 @@ class StagedNetwork(nn.Module):
         #: As `Response.of_power`, powers and outputs knot by knot.
         self.of_power = torch.tensor(by_knot.reshape(n_knots * n_gen, -1), dtype=torch.float32)
         #: Bounds, and the largest change between two knots, (n_gen,), pu.
-        self.low, self.high, self.step = (
-            torch.tensor(limit, dtype=torch.float32) for limit in (case.p_min, case.p_max, step)
-        )
+        limits = case.p_min, case.p_max, step
+        self.low, self.high, self.step = (torch.tensor(limit, dtype=torch.float32) for limit in limits)
 
     def normalise(self, channels: Channels) -> None:
         """Set the affine input normalisation of all stages from training data."""
@@ -260,14 +259,8 @@ class _DispatchTraining(TrainingRun):
         powers = self.average(*self.check[:4])
         cost, excess = self.judge(powers, self.check)
         _, tight = self.judge(powers, self.check, MARGIN)
-        value = float(cost.mean() + PRICE[1] * self.judge.spacing_s * _penalty(tight).mean())
-        worst = excess.amax(dim=(1, 2)) * self.judge.omega_bound / (2 * math.pi)
-        return {
-            "held out": value,
-            "cost": float(cost.mean()),
-            "mean excess": float(worst.mean()),
-            "max excess": float(worst.max()),
-        }
+        value = cost.mean() + PRICE[1] * self.judge.spacing_s * _penalty(tight).mean()
+        return looked(value, cost, excess.amax(dim=(1, 2)) * self.judge.omega_bound / (2 * math.pi))
 
 
 def _penalty(excess: Tensor) -> Tensor:

@@ -86,13 +86,11 @@ class DispatchEnv(gymnasium.Env[Observed, NDArray[np.floating]]):
         ranges = self.case.sampling
         drawn = float(np.abs(self.case.load_nominal).sum())
         step_cost = max(round(STEP_S / ranges.dt_s), 1) * float(np.mean(ranges.cost)) * drawn
-        largest_hz = self.case.regimes[regime].largest_hz
-        self.price = step_cost / largest_hz if price is None else price
+        self.price = step_cost / self.case.regimes[regime].largest_hz if price is None else price
         if not np.isfinite(self.price):
             raise InputError("price", "", "must be finite")
         self.action_space = Box(-1.0, 1.0, (len(self.case.generators),), np.float32)
-        seen = self.plant.observed(self._drawn(POLICY_SEED)[1].state)
-        ends = _ends(self.case, seen)
+        ends = _ends(self.case, self.plant.observed(self._drawn(POLICY_SEED)[1].state))
         self._spaces: dict[str, Any] = {
             name: Box(low.astype(np.float32), high.astype(np.float32)) for name, (low, high) in ends.items()
         }

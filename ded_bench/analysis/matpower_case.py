@@ -248,8 +248,7 @@ def _power_flow(grid: MatpowerGrid) -> tuple[Complex, Complex]:
         ports = port_network(network, SimpleNamespace(machines=stations))
         point = ports.nominal()
     except (SimulationError, np.linalg.LinAlgError):
-        problem = "the AC power flow has no solution from the voltages given"
-        raise InputError(path, "mpc", problem) from None
+        raise InputError(path, "mpc", "the AC power flow has no solution from the voltages given") from None
     generated[held] = point.power
     return ports.spread @ point.voltage, generated
 

@@ -211,8 +211,7 @@ def referee(
     for row in (row for row in kept if row.instance in first):
         schedule = results.schedule(row, case, instances[row.instance])
         facts = f"{row.fingerprint} {case.detailed.fingerprint}".encode()
-        judged_on = facts + schedule.t.tobytes() + schedule.p.tobytes()
-        name = hashlib.sha256(judged_on).hexdigest()[:12]
+        name = hashlib.sha256(facts + schedule.t.tobytes() + schedule.p.tobytes()).hexdigest()[:12]
         if table.made_from(row.key, name) and not table.rows[row.key].error:
             found.append(table.rows[row.key])
         else:

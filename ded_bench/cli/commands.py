@@ -31,8 +31,7 @@ def parser() -> argparse.ArgumentParser:
     shown = f"%(prog)s {version()}"
     top.add_argument("--version", action="version", version=shown, help="show the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    groups = problem_commands, training_commands, solve_commands, evaluation_commands, online_commands
-    for group in groups:
+    for group in (problem_commands, training_commands, solve_commands, evaluation_commands, online_commands):
         group.add_commands(commands)
     return top
 

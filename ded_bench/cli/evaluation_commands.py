@@ -145,8 +145,7 @@ def _compare(a: argparse.Namespace) -> int:
         say(f"comparing {a.a} with {a.b}")
     from ded_bench.analysis.compare import compare, limits, to_json, to_text
 
-    largest = limits(a.tolerance, a.tolerance_hz, a.tolerance_pu)
-    found = compare(a.a, a.b, largest, common_only=a.common)
+    found = compare(a.a, a.b, limits(a.tolerance, a.tolerance_hz, a.tolerance_pu), common_only=a.common)
     print(to_json(found) if a.json else to_text(found), end="\n" if a.json else "")
     return 0 if found.same else 1
 

@@ -75,8 +75,7 @@ def _online(a: argparse.Namespace) -> int:
 
     case = Case.load(a.case)
     folder = a.out or default_results(case)
-    files = a.scenario or scenario_files(case.folder / "scenarios", a.scenarios)
-    scenarios = load_scenarios(files, case)
+    scenarios = load_scenarios(a.scenario or scenario_files(case.folder / "scenarios", a.scenarios), case)
     for file, scenario in zip(a.scenario or (), scenarios, strict=False):  # the tests check those shipped
         check_plausible(case, first := scenario.snapshot(case, 0.0), file)
         plant_of(case, a.plant).check_servable(first, str(file))

@@ -161,9 +161,8 @@ def _score_one(a: argparse.Namespace) -> int:
 def _score_results(a: argparse.Namespace) -> int:
     """The schedules kept in a results folder, against its rows."""
     results, case, instances = _rows_of(a)
-    stream = sys.stderr if a.json else sys.stdout
     say(f"simulating the schedules of {counted(len(results.rows), 'row')} in {a.results}")
-    tell = functools.partial(print, file=stream, flush=True)
+    tell = functools.partial(print, file=sys.stderr if a.json else sys.stdout, flush=True)
     if a.plant:
         return _validate(a, case, instances, results)
     if a.update:
@@ -196,11 +195,10 @@ def _validate(a: argparse.Namespace, case: Case, instances: dict[str, Instance],
             print(json.dumps(dataclasses.asdict(row)), flush=True)
     bad = [row for row in rows if row.objective is None]
     own = [row for row in rows if results.rows[row.key[0]].feasible]
-    stream = sys.stderr if a.json else sys.stdout
     print(
         f"{counted(len(rows), 'row')} in {results.paths.validated}, {len(bad)} without a score; "
         f"{sum(bool(row.feasible) for row in own)} of {len(own)} feasible rows are so on {a.plant}",
-        file=stream,
+        file=sys.stderr if a.json else sys.stdout,
     )
     return 1 if bad else 0
 

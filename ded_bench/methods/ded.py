@@ -50,8 +50,7 @@ class Options:
 
 def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     """Return a solver of single instances; one compiled model per process serves them all."""
-    options = read_options(Options, settings.options)
-    solve = _accelerated if options.accelerated else _solve
+    solve = _accelerated if read_options(Options, settings.options).accelerated else _solve
     return functools.partial(solve, case, regime, settings.time_limit_s)
 
 
@@ -64,8 +63,7 @@ def _solve(case: Case, regime: str, time_limit_s: float | None, instance: Instan
     model = _built(case, instance.steps, instance.dt_s)
     set_instance(model, case, instance, regime)
     build_s = time.perf_counter() - started
-    outcome = _compiled(model).solve(time_limit_s)
-    return answer(outcome, build_s, lambda: schedule_of(model, instance))
+    return answer(_compiled(model).solve(time_limit_s), build_s, lambda: schedule_of(model, instance))
 
 
 def _accelerated(case: Case, regime: str, time_limit_s: float | None, instance: Instance) -> Solution:

@@ -111,8 +111,7 @@ def _solve_model(
     model = _built(case, koopman, instance.steps)
     set_instance(model, case, koopman, instance, regime)
     build_s = time.perf_counter() - started
-    outcome = _compiled(model, solver).solve(time_limit_s)
-    return answer(outcome, build_s, lambda: schedule_of(model, instance))
+    return answer(_compiled(model, solver).solve(time_limit_s), build_s, lambda: schedule_of(model, instance))
 
 
 def build_ded_ko(case: Case, koopman: Koopman, steps: int) -> pyo.ConcreteModel:

@@ -97,8 +97,7 @@ def _on_detailed(
     build_s = time.perf_counter() - started
     close = CLOSE * (abs(pyo.value(program.model.cost_total)) or 1.0)
     options = {"tol": close, "compl_inf_tol": close, "constr_viol_tol": 1e-6}
-    outcome = CasadiIpopt(program.model, options).solve(time_limit_s)
-    return answer(outcome, build_s, program.schedule)
+    return answer(CasadiIpopt(program.model, options).solve(time_limit_s), build_s, program.schedule)
 
 
 _program = functools.lru_cache(maxsize=1)(RadauProgram)

@@ -182,5 +182,4 @@ class RadauProgram:
 
         IPOPT relaxes bounds by 1e-8 of their size; powers are put back, which makes no ramp steeper.
         """
-        p_gen = np.clip(x[self.p_gen], self.case.p_min, self.case.p_max)
-        return Schedule(t=instance.grid[ends], p=p_gen)
+        return Schedule(instance.grid[ends], np.clip(x[self.p_gen], self.case.p_min, self.case.p_max))

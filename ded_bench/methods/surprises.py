@@ -56,8 +56,7 @@ class Surprises:
         #: How far the steepest ramps move machines until each of REACTION_S, rad/s.
         self._moved = np.full(len(REACTION_S), np.inf)
         if isinstance(case, LosslessCase):
-            speeds = sudden_speeds(case, REACTION_S) * self._steepest[:, None]
-            self._moved = speeds.max(axis=(1, 2))
+            self._moved = (sudden_speeds(case, REACTION_S) * self._steepest[:, None]).max(axis=(1, 2))
         #: Slower changes are no ramps, pu/s.
         self._slow = 0.5 * float(np.abs(case.load_rate).min())
         self._schedule: Schedule | None = None
@@ -132,9 +131,8 @@ class Surprises:
 
     def margin(self, t: Array) -> Array:
         """By how much bounds are tighter at times ahead, (n_t,), rad/s."""
-        about = 2.0 * START_ERROR_S
         starts = np.array([at for at, _ in self._next])
-        unsure = (np.abs(t[:, None] - np.maximum(starts, 0.0)) <= about).any(axis=1)
+        unsure = (np.abs(t[:, None] - np.maximum(starts, 0.0)) <= 2.0 * START_ERROR_S).any(axis=1)
         return np.minimum(np.where(unsure, UNCERTAIN, ALWAYS) * self._bound, self._until_a_plan())
 
     def _until_a_plan(self) -> float:
@@ -190,5 +188,4 @@ def _delayed(load: LoadRamp | LoadPoints, at: float, by: float, last: float) -> 
     times = sorted({0.0, *(t for t in load.kinks if t < last), at, last})
     values = load.at(np.array(times)).tolist()
     later = zip(((t + by if t >= at else t) for t in times), values, strict=True)
-    here = (at, float(load.at(np.array(at))))
-    return LoadPoints(points=tuple(sorted({*later, here})))
+    return LoadPoints(points=tuple(sorted({*later, (at, float(load.at(np.array(at))))})))

@@ -195,8 +195,7 @@ class TimeVarying:
         """Rows in x, u and Δu so many steps after the start of their intervals, in these ones' variables."""
         for bit in range(len(self.doubled)):
             here = np.flatnonzero(steps >> bit & 1)
-            moved = self._earlier(rows.take(here), interval[here], bit)
-            for whole, part in zip(rows, moved, strict=True):
+            for whole, part in zip(rows, self._earlier(rows.take(here), interval[here], bit), strict=True):
                 whole[here] = part
         end = rows.slope / np.append(self.lengths, 1)[interval, None]
         x = rows.x

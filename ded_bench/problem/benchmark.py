@@ -62,8 +62,7 @@ def scenario_files(folder: Path, limit: int | None = None) -> list[Path]:
     """The first `limit` scenarios of a folder, in the order of its manifest; InputError without one."""
     if (manifest := load_manifest(folder)) is None:
         case = folder.parent.name if SHIPPED_CASES in folder.parents else folder.parent
-        problem = f"holds no scenarios; `ded-bench scenarios --case {case}` draws some"
-        raise InputError(folder, "", problem)
+        raise InputError(folder, "", f"holds no scenarios; `ded-bench scenarios --case {case}` draws some")
     return [folder / name for name in list(manifest.files)[:limit]]
 
 

@@ -129,8 +129,7 @@ class Case(Fingerprinted, Extended):
         named = {self.machine_of(name) for name in self.priced}
         if differing := named ^ set(grid.machines):
             where = "case.json" if differing & named else MACHINES_FILE
-            problem = f"machine {min(differing)} stands here only"
-            raise InputError(folder / where, "machines", problem)
+            raise InputError(folder / where, "machines", f"machine {min(differing)} stands here only")
         if unknown := set(self.loads) - {bus.id for bus in grid.network.buses}:
             raise InputError(folder / NETWORK_FILE, "buses", f"there is no bus {min(unknown)} of a load")
 

@@ -86,8 +86,7 @@ def timing_summary(rows: Sequence[TimingRow]) -> pd.DataFrame:
     calls, good, failed = (part.groupby(_JOB) for part in (warm, warm[is_good], warm[~is_good]))
     counts = {"instances": calls["instance"].nunique(), "repeats": calls["round"].max()}
     counts |= {"failures": failed.size()}
-    whole = {name: values.reindex(last.index, fill_value=0) for name, values in counts.items()}
-    found = last.assign(**whole)
+    found = last.assign(**{name: values.reindex(last.index, fill_value=0) for name, values in counts.items()})
     found["load_average"] = calls["load_average"].median()
     found["peak_memory_mib"] = calls["peak_memory_mib"].max()
     for end, part in (("", 0.5), ("_q1", 0.25), ("_q3", 0.75)):

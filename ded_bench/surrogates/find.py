@@ -87,8 +87,7 @@ class AtNominalPoint(AlongTrajectory):
         p_set = Schedule(instance.grid[points], p_gen).at(instance.grid)
         omega, delivered = coarse.follow(coarse.begin(instance, start), p_set, linear=True)
         assert model.delivered is not None
-        told = model.delivered._replace(p_gen=delivered)
-        return replace(model, omega=omega, p_gen=p_gen, delivered=told)
+        return replace(model, omega=omega, p_gen=p_gen, delivered=model.delivered._replace(p_gen=delivered))
 
     def _at_rest(self, instance: Instance, points: Indices, next_s: float) -> TimeVarying:
         """Maps of set-points along the nominal equilibrium."""

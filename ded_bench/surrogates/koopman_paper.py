@@ -55,8 +55,7 @@ class PaperKoopman(nn.Module):
 
     def observables(self, x: Tensor) -> Tensor:
         """ψ(x), shape (batch, n_psi), from the scaled state x = (θ_gen, P_s, ω)."""
-        omega, p_slack = x[:, self.n_gen + 1 :], x[:, [self.n_gen]]
-        return torch.cat([omega, p_slack, self.last(self.first(x).tanh())], dim=1)
+        return torch.cat([x[:, self.n_gen + 1 :], x[:, [self.n_gen]], self.last(self.first(x).tanh())], dim=1)
 
     def forward(self, x: Tensor, following: Tensor, inputs: Tensor) -> Tensor:
         """The paper's normalised one-step error, shape (batch,)."""

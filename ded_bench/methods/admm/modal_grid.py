@@ -201,8 +201,7 @@ class ModalGrid:
         for b in range(len(v)):
             swing(self.modes, linear.change[b], v[b], q[b], speed[b])
         x, omega = q @ self.shape, speed @ self.shape
-        p_slack = linear.slack - (self.slack_stiffness(linear) * x).sum(axis=2)
-        return x, omega, p_slack
+        return x, omega, linear.slack - (self.slack_stiffness(linear) * x).sum(axis=2)
 
     def slack_stiffness(self, linear: ModalLinearisation) -> Array:
         """Σ_g of S + ΔS on the time grid, (batch, n_points, n_gen), pu/rad."""

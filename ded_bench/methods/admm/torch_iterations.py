@@ -43,8 +43,7 @@ class TorchIterations(nn.Module):
 
     def settings(self) -> Tensor:
         """See `admm_inference.settings_of`."""
-        found = self.start * (self.between @ self.nodes).exp()
-        columns = list(found.unbind(dim=1))
+        columns = list((self.start * (self.between @ self.nodes).exp()).unbind(dim=1))
         for name, most in MOST.items():
             i = list(SETTINGS).index(name)
             columns[i] = columns[i] * most / (most - self.start[:, i] + columns[i])
@@ -85,8 +84,7 @@ class TorchIterations(nn.Module):
             ]
             duals = [w * (a - z) for w, a, z in zip(weights, wanted, copies, strict=True)]
             forces = [y + w * (a - z) for y, w, a, z in zip(duals, weights, now, copies, strict=True)]
-            gradient = own + forces[0] + forces[1]
-            gradient = gradient - nn.functional.pad(forces[1][:, 1:], (0, 0, 0, 1))
+            gradient = own + forces[0] + forces[1] - nn.functional.pad(forces[1][:, 1:], (0, 0, 0, 1))
             gradient = nn.functional.pad(gradient, (0, 0, 1, 0))
             gradient = gradient + Transposed.apply(forces[2], forces[3], grid, linear)  # type: ignore[no-untyped-call]
             quadratic = torch.stack(

@@ -59,8 +59,7 @@ class DispatchPolicy(TrainedPolicy):
 
     def powers(self, inputs: StackedInstances) -> Array:
         """Generator powers at the knots, shape (batch, n_knots, n_gen), pu, from stacked arrays."""
-        alone = self._compiled(Channels.of(self.scope.case, inputs, self.response))
-        return self._keeper(inputs, alone)
+        return self._keeper(inputs, self._compiled(Channels.of(self.scope.case, inputs, self.response)))
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

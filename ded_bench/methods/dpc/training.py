@@ -69,12 +69,11 @@ class StagedNetwork(nn.Module):
         n_seen = n_gen + response.n_outputs + n_sequence
         self.stages = nn.ModuleList(ResidualNetwork(n_seen, n_constants, n_gen) for _ in range(STAGES))
         self.response = response
-        step = case.ramp * (response.knots[1] - response.knots[0])
         by_knot = response.of_power.reshape(n_gen, n_knots, -1, n_knots).transpose(1, 0, 3, 2)
         #: As `Response.of_power`, powers and outputs knot by knot.
         self.of_power = torch.tensor(by_knot.reshape(n_knots * n_gen, -1), dtype=torch.float32)
         #: Bounds, and the largest change between two knots, (n_gen,), pu.
-        limits = case.p_min, case.p_max, step
+        limits = case.p_min, case.p_max, case.ramp * (response.knots[1] - response.knots[0])
         self.low, self.high, self.step = (torch.tensor(limit, dtype=torch.float32) for limit in limits)
 
     def normalise(self, channels: Channels) -> None:
@@ -89,8 +88,7 @@ class StagedNetwork(nn.Module):
         p_gen, half = start, 0.5 * (self.high - self.low)
         for stage in self.stages:
             seen = free + (p_gen.flatten(1) @ self.of_power).view_as(free)
-            corrections = stage(torch.cat([p_gen, seen, sequence], dim=2), constants)
-            targets = (p_gen + half * corrections)[:, 1:]
+            targets = (p_gen + half * stage(torch.cat([p_gen, seen, sequence], dim=2), constants))[:, 1:]
             p_gen = follow_within(targets, start[:, 0], self.low, self.high, self.step)
         return p_gen
 

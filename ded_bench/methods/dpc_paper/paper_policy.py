@@ -128,8 +128,7 @@ class NumpyPaperNetwork:
             h += bias
         np.tanh(h, out=h)
         h += 1.0
-        power = self._low + self._half * h
-        return np.asarray(power.swapaxes(1, 2), dtype=np.float64)
+        return np.asarray((self._low + self._half * h).swapaxes(1, 2), dtype=np.float64)
 
 
 def _windows(x: NDArray[np.float32], window: int) -> NDArray[np.float32]:

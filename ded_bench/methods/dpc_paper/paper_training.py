@@ -69,10 +69,9 @@ class Batch(NamedTuple):
     @staticmethod
     def of(case: Case, model: Koopman, instances: Sequence[Instance]) -> Batch:
         """Features and free responses of instances with one time grid."""
-        network, p_load = Network(case), np.stack([i.p_load(case) for i in instances])
         arrays = (
-            channels(network, instances, case.knot_times(instances[0].horizon_s)),
-            free_response(model, model.initial(instances), p_load),
+            channels(Network(case), instances, case.knot_times(instances[0].horizon_s)),
+            free_response(model, model.initial(instances), np.stack([i.p_load(case) for i in instances])),
             np.stack([i.cost_gen(case) for i in instances]),
             np.array([i.cost_slack(case) for i in instances]),
             np.stack([i.p_initial(case) for i in instances]),

@@ -160,10 +160,9 @@ class IslandGrid:
 
     def within(self, powers: Array, p_initial: Array, room: Array) -> Array:
         """Schedules that keep limits and ramps, and transfers as far as these let them; (n_knots, n_gen)."""
-        by_machine = self.case.transfer_rows[0]
         kept = np.clip(powers, self.case.p_min, self.case.p_max)
         kept[0] = p_initial
-        for group, most in zip(by_machine, room.T, strict=True):
+        for group, most in zip(self.case.transfer_rows[0], room.T, strict=True):
             beyond = np.maximum(kept[1:] @ group - most - TRANSFER_MARGIN / 2.0, 0.0)
             above = np.maximum(kept[1:] - self.case.p_min, 0.0) * group
             kept[1:] -= above * (beyond / np.maximum(above.sum(axis=1), 1e-12))[:, None]

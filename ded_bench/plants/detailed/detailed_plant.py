@@ -221,8 +221,7 @@ class DetailedPlant:
         """
         system = self.system
         try:
-            point = initial_point(system, instance)
-            if not system.stable(point):
+            if not system.stable(initial_point(system, instance)):
                 raise SimulationError("their equilibrium is not stable")
         except InputError as error:
             raise InputError(source, error.field, error.problem) from None

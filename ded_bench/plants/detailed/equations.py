@@ -164,10 +164,8 @@ def set_rates(
         rates: receives the rates, (N_STATES,), 1/s.
     """
     (i_d, i_q), (p_ref, v_ref), w = current, references, s[at.SPEED]
-    i_fd = m.gd1 * i_d + m.gd2 * (s[at.E1Q] - s[at.E2D])
-    i_fd = s[at.E1Q] + (m.xd - m.xd1) * i_fd
-    i_1q = m.gq2 * (s[at.E1D] - s[at.E2Q]) - m.gq1 * i_q
-    i_1q = s[at.E1D] + (m.xq - m.xq1) * i_1q
+    i_fd = s[at.E1Q] + (m.xd - m.xd1) * (m.gd1 * i_d + m.gd2 * (s[at.E1Q] - s[at.E2D]))
+    i_1q = s[at.E1D] + (m.xq - m.xq1) * (m.gq2 * (s[at.E1D] - s[at.E2Q]) - m.gq1 * i_q)
     after = m.ks * w - s[at.WASHOUT]
     between = m.lead_a * (after - s[at.LEAD_A]) + s[at.LEAD_A]
     v_s = m.lead_b * (between - s[at.LEAD_B]) + s[at.LEAD_B]

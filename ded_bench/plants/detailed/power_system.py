@@ -251,8 +251,7 @@ def linearised(system: PowerSystem, trajectory: Trajectory, points: Indices) -> 
         f[-1] = 0.0
         f[-1, :-1] = np.where(kinds == at.DELTA, -agc.k * system.data.inertia[machines], 0.0)
         reset = Reset(np.flatnonzero(np.isin(points[:-1], run.agc_points)), f)
-    dt_s = float(trajectory.t[1] - trajectory.t[0])
-    step = _one_step(rates, into, dt_s, run.steps)
+    step = _one_step(rates, into, float(trajectory.t[1] - trajectory.t[0]), run.steps)
     powers = doubled(step, np.diff(points))
     across = across_intervals(powers, np.diff(points))
     if reset is not None:

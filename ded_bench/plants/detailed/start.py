@@ -98,8 +98,7 @@ def corrected(system: PowerSystem, instance: Instance, estimate: DetailedState) 
         x[at.DELTA] += agc.integral_rad
     if (mechanical := instance.mechanical_initial(case)) is not None:
         x[at.TURBINE, machines] = _turbine(system, x, mechanical, machines)
-    p_set = instance.p_initial(case)
-    return estimate._replace(x=x, held=held, next_s=next_s, p_set=p_set, carried=None)
+    return estimate._replace(x=x, held=held, next_s=next_s, p_set=instance.p_initial(case), carried=None)
 
 
 def _turbine(

@@ -177,8 +177,7 @@ class StaticDispatch:
             found = self.weigh(power, p_load, voltage)
             if abs(found.short) < 1e-3 * BALANCED:
                 return found
-            room = (case.p_max if found.short > 0 else case.p_min) - power
-            room = np.where(free, room, 0.0)
+            room = np.where(free, (case.p_max if found.short > 0 else case.p_min) - power, 0.0)
             part = found.short / max(-found.slopes @ room * np.sign(found.short), 1e-300)
             if not abs(part) <= 1.0:
                 break

@@ -190,8 +190,7 @@ def _one_step(stiffness: Array, damping: Array, gain: Array, dt_s: float) -> Hol
 
     def derivative(value: Array) -> Array:
         angle, speed = value[:, :n], value[:, n:]
-        rate = -(stiffness @ angle) - damping[:, None] * speed
-        return np.concatenate([speed, rate], axis=1) * dt_s
+        return np.concatenate([speed, -(stiffness @ angle) - damping[:, None] * speed], axis=1) * dt_s
 
     # |A dt| of (θ, ω / ω_fastest), in which the matrix is balanced.
     size = dt_s * (np.sqrt(np.abs(stiffness).sum(axis=2).max()) + damping.max())

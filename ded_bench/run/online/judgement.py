@@ -118,8 +118,7 @@ def _in_windows(case: Case, scenario: Scenario, regime: str) -> tuple[str, Judge
             raise RuntimeError(f"no schedule for {instance.id}: {solution.error}")
         return Planned(solution.schedule)
 
-    is_whole = scenario.duration_s <= WINDOW_S
-    period_s = scenario.duration_s if is_whole else WINDOW_S / 2
+    period_s = scenario.duration_s if scenario.duration_s <= WINDOW_S else WINDOW_S / 2
     options = LoopOptions(period_s, forecast="perfect", horizon_s=WINDOW_S, to_end=True)
     trajectory = run_loop(case, scenario, ask, options).trajectory
     return "ded-slp", judge_operation(case, scenario, trajectory, regime), trajectory

@@ -81,8 +81,7 @@ def make_operations(
     for regime in regimes:
         artifacts = method.artifacts(case, regime, settings)
         model, policy = named(artifacts, "model"), named(artifacts, "policy")
-        timed = functools.partial(timed_latency, case, method, regime, settings)
-        seconds, source = _latency(latency, timed)
+        seconds, source = _latency(latency, functools.partial(timed_latency, case, method, regime, settings))
         longest = max(options.horizon_s, method.interval_s(settings) or 0.0)
         own = dataclasses.replace(options, latency_s=seconds, horizon_s=longest)
         for scenario in scenarios:

@@ -34,9 +34,8 @@ def online_rows(results: OnlineResults, case: str) -> pd.DataFrame:
     frame["latency_s"] = frame["latency_s"].mask(close, typical)
     frame = frame.drop_duplicates([*LOOP, "scenario"], keep="last").reset_index(drop=True)
     is_static = (frame["method"] == STATIC[0]) & (frame["settings"] == STATIC[1])
-    static = frame[is_static & (frame["period_s"] == 1)]
     place = ["regime", "scenario", "plant"]
-    found = static.drop_duplicates(place, keep="last").set_index(place)
+    found = frame[is_static & (frame["period_s"] == 1)].drop_duplicates(place, keep="last").set_index(place)
     names = {"objective": "static_objective", "max_excess_hz": "static_excess_hz"}
     return frame.join(found[list(names)].rename(columns=names), on=place)
 

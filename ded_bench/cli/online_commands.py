@@ -133,6 +133,5 @@ def _print_row(row: OnlineRow) -> None:
     over = "no hindsight" if row.increase_percent is None else f"{row.increase_percent:.4f} % over hindsight"
     if (row.increase_percent or 0.0) < 0 < row.max_excess_hz:
         over += " (less than it, since the bound is exceeded)"
-    excess = f"largest excess {1e3 * row.max_excess_hz:.4f} mHz"
     plans = f"{row.late} late, {row.failed} failed, {row.infeasible} infeasible of {row.plans}"
-    print(f"{name} {over}, {excess}, {plans}", flush=True)
+    print(f"{name} {over}, largest excess {1e3 * row.max_excess_hz:.4f} mHz, {plans}", flush=True)

@@ -245,8 +245,6 @@ def _scenarios(a: argparse.Namespace) -> int:
         return write_scenarios(case, a.count, a.seed, folder, servable, hours=hours)
 
     manifest = draw(folder) if a.force else _unless_changed(folder, draw)
-    print(
-        f"{counted(a.count + hours, 'scenario')} of {case.id} (seed {a.seed}) in {folder}, "
-        f"version {manifest.version}"
-    )
+    drawn = counted(a.count + hours, "scenario")
+    print(f"{drawn} of {case.id} (seed {a.seed}) in {folder}, version {manifest.version}")
     return 0

@@ -67,9 +67,8 @@ class DetailedProgram:
         self._state, self._mesh, self._places = state, mesh, element_points(mesh.ends)
         data = self.system.data
         self._moving = self.system.moving
-        self._scale = np.where(
-            self._moving // len(data) == SPEED, data.omega_0[self._moving % len(data)], 1.0
-        )
+        kinds, machines = np.divmod(self._moving, len(data))
+        self._scale = np.where(kinds == SPEED, data.omega_0[machines], 1.0)
         self.model = m = pyo.ConcreteModel()
         m.t = dae.ContinuousSet(initialize=[float(t) for t in instance.grid[mesh.ends]])
         m.state, m.voltage = pyo.Set(initialize=self._moving.tolist()), pyo.RangeSet(0, len(state.v) - 1)

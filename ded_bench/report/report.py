@@ -245,10 +245,8 @@ def _makers(sources: Sources) -> Iterator[str]:
     """Rows that today's methods would not make."""
     made = sources.judged[sources.judged["objective"].notna()]
     today = {str(name): METHODS[str(name)].version for name in set(made["method"]) & set(METHODS)}
-    old = sorted(
-        {m for m, v in zip(made["method"], made["method_version"], strict=True) if v != today.get(m, v)}
-    )
-    if old:
+    versions = zip(made["method"], made["method_version"], strict=True)
+    if old := sorted({method for method, version in versions if version != today.get(method, version)}):
         names = ", ".join(title(method) for method in old)
         yield f"Rows come from other versions of their methods than those installed here: {names}."
 
@@ -281,10 +279,8 @@ def solve_times(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]
 
 def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
     """How policies and models were trained, and certificates."""
-    paths = sources.results.paths
-    frame = trainings(
-        path for kind in (paths.policies, paths.koopman) for path in sorted(kind.glob("*.safetensors"))
-    )
+    folders = sources.results.paths.policies, sources.results.paths.koopman
+    frame = trainings(path for folder in folders for path in sorted(folder.glob("*.safetensors")))
     made: list[Block] = ["## Training"]
     if len(frame):
         filled = frame.map(lambda value: value not in ("", None)).any()

@@ -185,9 +185,8 @@ class ModalGrid:
         for s, shares in enumerate(self.between[::points].T):
             rest -= shares[:, None] * (slow @ change[:, s])
         whole = start.taken + linear_between(rest - start.taken[:, ::points], points)
-        modal = self.gain.T @ change @ self.shape.T
         slack = -(whole.sum(axis=2) + problems.load.sum(axis=2))
-        return ModalLinearisation(-(whole @ self.gain), modal, slack, change)
+        return ModalLinearisation(-(whole @ self.gain), self.gain.T @ change @ self.shape.T, slack, change)
 
     def respond(self, powers: Array, start: Start, linear: ModalLinearisation) -> tuple[Array, Array, Array]:
         """What the linearised grid does under powers at the knots, (batch, n_knots, n_gen), pu.

@@ -110,12 +110,10 @@ def swing(modes: Modes, change: Floats, v: Floats, q: Floats, speed: Floats) -> 
 @inlined
 def _hold(modes: Modes, change: Floats, k: int, shares: Floats, held: Floats) -> None:
     """Half a kick by C, for the grid points from k on: C in the middle of them."""
-    middle, part = k + 0.5 * (HELD - 1), 0
-    while part + 2 < len(modes.stiffness_points) and middle > modes.stiffness_points[part + 1]:
+    middle, part, points = k + 0.5 * (HELD - 1), 0, modes.stiffness_points
+    while part + 2 < len(points) and middle > points[part + 1]:
         part += 1
-    later = (middle - modes.stiffness_points[part]) / (
-        modes.stiffness_points[part + 1] - modes.stiffness_points[part]
-    )
+    later = (middle - points[part]) / (points[part + 1] - points[part])
     shares[1] = modes.half * min(later, 1.0)
     shares[0] = modes.half - shares[1]
     for j in range(len(held)):

@@ -92,9 +92,8 @@ class IslandGrid:
         #: The mean frequency and swings in parts of their bounds, by frequencies, (1 + n_relative, n_gen).
         self.outputs = bounds.matrix[rows] / bounds.limit[rows, None]
         #: The bound on the mean at the end, as a part of that before.
-        self.last = float(
-            bounds.limit[bounds.at_end].min(initial=bounds.limit[rows[0]]) / bounds.limit[rows[0]]
-        )
+        before = bounds.limit[rows[0]]
+        self.last = float(bounds.limit[bounds.at_end].min(initial=before) / before)
         self.maps = self._maps()
 
     def _maps(self) -> Maps:
@@ -108,9 +107,8 @@ class IslandGrid:
         #: Swings while machines ramp by 1 pu/s, (n_relative, n_gen), s/pu.
         self.ramping = self.outputs[1:] @ omega[-1]
         omega, _ = self.coarse.response(self.hat[:, 1][:, None, None] * each, agc=False)
-        swings = np.einsum("og,tgi->ito", self.outputs[1:], omega[self.substeps :: self.substeps]).reshape(
-            n_gen, n, -1
-        )
+        at_rows = omega[self.substeps :: self.substeps]
+        swings = np.einsum("og,tgi->ito", self.outputs[1:], at_rows).reshape(n_gen, n, -1)
         size = np.linalg.norm(swings, axis=(0, 2)) ** 2
         memory = int(np.count_nonzero(np.cumsum(size[::-1])[::-1] > FORGOTTEN**2 * size.sum()))
         swings = swings[:, : min(memory, round(REMEMBERED_S / float(self.knots[1])))]

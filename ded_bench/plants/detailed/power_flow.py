@@ -168,7 +168,8 @@ def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> Po
     spread = np.zeros((len(index), len(ports)), dtype=complex)
     spread[ports] = np.eye(len(ports))
     spread[inner] = -np.linalg.solve(full[np.ix_(inner, inner)], full[np.ix_(inner, ports)])
-    place = {network.buses[bus].id: port for port, bus in enumerate(ports)}
+    at_ports = [network.buses[i] for i in ports]
+    place = {bus.id: port for port, bus in enumerate(at_ports)}
     generated = {bus.id: bus.pg for bus in network.buses}
     return PortNetwork(
         buses=tuple(index),
@@ -181,8 +182,6 @@ def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> Po
         machine_port=np.array([place[m.bus] for m in machines.machines]),
         share=np.array([m.share for m in machines.machines]),
         p_nominal=np.array([m.share * generated[m.bus] for m in machines.machines]),
-        guess=np.array(
-            [network.buses[i].v * np.exp(1j * np.radians(network.buses[i].angle_deg)) for i in ports]
-        ),
+        guess=np.array([bus.v * np.exp(1j * np.radians(bus.angle_deg)) for bus in at_ports]),
         balancing=stations.index(network.slack_machine_bus),
     )

@@ -51,9 +51,8 @@ def symbolic_plant(data: at.MachineArrays, network: PortNetwork) -> SymbolicPlan
     inputs = [x, v, p_ref, drawn, v_ref]
     outputs = [casadi.vertcat(*found.rates), balance, found.p_e, found.p_m]
     jacobian = casadi.jacobian(casadi.vertcat(*outputs), casadi.vertcat(x, v))
-    return SymbolicPlant(
-        casadi.Function("equations", inputs, outputs), casadi.Function("jacobian", inputs, [jacobian])
-    )
+    equations = casadi.Function("equations", inputs, outputs)
+    return SymbolicPlant(equations, casadi.Function("jacobian", inputs, [jacobian]))
 
 
 def plant_equations(

@@ -267,18 +267,8 @@ def test_a_checkpoint_is_not_unpickled_either(folder: Path, tmp_path: Path) -> N
     """Resuming from a file that is no checkpoint of this training is refused; nothing runs."""
     out, trace = tmp_path / "p.safetensors", tmp_path / "trace"
     path = out.with_suffix(".checkpoint")
-    arguments = [
-        "train-dpc",
-        "--method",
-        "ded-dpc-paper",
-        "--regime",
-        "TO",
-        "--case",
-        folder,
-        "--model",
-        "linear",
-    ]
-    arguments += ["--resume", "--out", out, "--epochs", "1", "--limit", "1"]
+    options = "--method ded-dpc-paper --regime TO --model linear --resume --epochs 1 --limit 1"
+    arguments = ["train-dpc", *options.split(), "--case", folder, "--out", out]
     torch.save(Payload(trace), path)
     for data in (path.read_bytes(), b"", b"text", pickle.dumps(Payload(trace))):
         assert ending(arguments, path, Mutant(data)) == (2, "")

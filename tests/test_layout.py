@@ -23,16 +23,8 @@ FLOORS = (
 #: Twelve hexadecimal digits or more.
 FINGERPRINT = re.compile(r"\b[0-9a-f]{12,}\b")
 #: What the ground floors may use besides Python's own library: no solver, no model builder, no torch.
-GROUND_LIBRARIES = {
-    "ded_bench",
-    "numpy",
-    "scipy",
-    "pandas",
-    "pydantic",
-    "safetensors",
-    "numba",
-    "threadpoolctl",
-}
+GROUND_LIBRARIES = {"ded_bench", "numpy", "scipy", "pandas", "pydantic", "safetensors", "numba"}
+GROUND_LIBRARIES |= {"threadpoolctl"}
 #: May differentiate with CasADi, which brings solvers, too: nothing that simulates or scores imports it.
 SYMBOLIC = "ded_bench.plants.detailed.symbolic"
 

@@ -18,20 +18,8 @@ from ded_bench.methods.registry import METHODS
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import REPOSITORY
 
-STEPS = (
-    *(
-        "train-ko",
-        "solve-baselines",
-        "train-dpc",
-        "solve-dpc",
-        "bench",
-        "report",
-        "online",
-        "radau",
-        "models",
-    ),
-    "certify",
-)
+STEPS = ("train-ko", "solve-baselines", "train-dpc", "solve-dpc", "bench", "report", "online", "radau")
+STEPS += ("models", "certify")
 PARSER = functools.cache(cli.parser)
 GRIDS = ("9bus", "two-area", "39bus", "68bus", "140bus", "39bus-agc", "elsewhere/mine")
 

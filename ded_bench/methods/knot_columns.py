@@ -25,9 +25,9 @@ PIECE = 20
 #: P_s is taken to keep its sign if along the trajectory |P_s| is never below this part of its largest value.
 STEADY = 0.1
 
-#: A set-point that was at a limit, within this part of its range, at a reduced cost of this part of the highest
-#: price or more, as were those so many knots around it, is fixed there in the next program. On validation
-#: draws of 140bus and 39bus half as many knots make more programs, and twice as many take longer.
+#: A set-point that was at a limit, within this part of its range, at a reduced cost of this part of the
+#: highest price or more, as were those so many knots around it, is fixed there in the next program. On
+#: validation draws of 140bus and 39bus half as many knots make more programs, and twice as many take longer.
 AT_LIMIT, PRICED, AROUND = 1e-6, 1e-3, 4
 
 

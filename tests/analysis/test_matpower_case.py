@@ -60,18 +60,8 @@ def as_matpower(case: Case) -> tuple[str, str]:
     machines = {machine.bus: machine for machine in network.machines}
     for b in network.buses:
         kind = 3 if b.id == slack else 2 if b.id in machines else 1
-        row = (
-            b.id,
-            kind,
-            b.pd * 100,
-            b.qd * 100,
-            b.gs * 100,
-            b.bs * 100,
-            1,
-            1,
-            b.angle_deg if kind == 3 else 0,
-        )
-        bus.append(" ".join(map(str, row)))
+        drawn, angle = (b.pd * 100, b.qd * 100, b.gs * 100, b.bs * 100), b.angle_deg if kind == 3 else 0
+        bus.append(" ".join(map(str, (b.id, kind, *drawn, 1, 1, angle))))
         if kind > 1:
             m = machines[b.id]
             gen.append(f"{b.id} {b.pg * 100} 0 0 0 {b.v} {m.mva} 1 {b.pg * 150} {b.pg * 50}")

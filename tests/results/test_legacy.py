@@ -36,11 +36,7 @@ def test_an_old_table_is_read_and_added_to(tmp_path: Path) -> None:
     (tmp_path / "results.csv").write_text(header + line)
     results = Results(tmp_path)
     (row,) = results.rows.values()
-    assert (row.method, row.policy, row.plant, row.method_version) == (
-        "ded-admm",
-        "ded-admm@f00",
-        "lossless",
-        1,
-    )
+    found = row.method, row.policy, row.plant, row.method_version
+    assert found == ("ded-admm", "ded-admm@f00", "lossless", 1)
     results.add([row])
     assert list(Results(tmp_path).rows.values()) == [row]

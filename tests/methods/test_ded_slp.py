@@ -88,13 +88,14 @@ def test_where_rows_of_one_sign_fail_there_are_those_of_both(monkeypatch: pytest
     assert tried[0] < tried[1]
 
 
-def test_what_is_fixed_wrongly_is_told_and_set_free() -> None:
+def test_what_is_fixed_wrongly_is_told_and_set_free(monkeypatch: pytest.MonkeyPatch) -> None:
     """2 x + 3 y is least at (2, 1); with y at its limit of 0.8 a unit more of it would save 1."""
     form, u, fixed = (
         dataclasses.replace(FORM, lower=np.array([0.0, 0.8])),
         np.array([[1]]),
         FixedSetPoints((1, 1)),
     )
+    monkeypatch.setattr(knot_columns, "LEAST_GENERATORS", 1)
     fixed.at[0] = True
     answer = knot_program.solve_form(fixed.in_program(form, u))
     assert answer.x == pytest.approx([2.4, 0.8], abs=1e-6)
@@ -110,6 +111,7 @@ def test_set_points_fixed_at_limits_change_no_optimum(
 ) -> None:
     """Those that the last program had there; where that leaves no solution, all are free again."""
     monkeypatch.setattr(knot_columns, "AROUND", 0)
+    monkeypatch.setattr(knot_columns, "LEAST_GENERATORS", 1)
     case, none = Case.load(CASE_FILES["fivemachine"]), np.empty((0, 3), dtype=int)
     made = program(case, short(case, 0), case.bounds("TO"))
     whole = made.solve(none, np.inf)

@@ -52,9 +52,8 @@ class FixedSetPoints:
 
     def choose(self, form: FreeForm, u: Indices, answer: FormAnswer) -> None:
         """Find `gap`, and what to fix next, from an answer and the program with all set-points free."""
-        if u.shape[1] < LEAST_GENERATORS:
+        if answer.reduced_cost is None or u.shape[1] < LEAST_GENERATORS:
             return
-        assert answer.reduced_cost is not None  # of an interior-point method
         price, x, low, high = (
             values[u] for values in (answer.reduced_cost, answer.x, form.lower, form.upper)
         )

@@ -73,9 +73,7 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
     order = np.array([*map(list(scenario.load).index, case.loads)])
     if quality in ("announced", "worse"):
         wrong = WORSE if quality == "worse" else 1.0
-        initial, *others = scenario.fluctuations
-        times, lasted, rates, rest = _announced(now, until, wrong, order, scenario.ramps, tuple(others))
-        return Forecast(times, initial[order] + (lasted @ rates)[:, :, 0] + rest)
+        return Forecast(*_announced(now, until, wrong, order, scenario.ramps, scenario.fluctuations))
     start, duration, *_ = scenario.ramps
     _, step, _, fluctuations = scenario.fluctuations
     ends = np.full((len(order), 2), [now, until])
@@ -90,17 +88,15 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
 @compiled
 def _announced(
     now: float, until: float, wrong: float, order: Indices, ramps: Array, others: tuple[Array, ...]
-) -> tuple[Array, Array, Array, Array]:
-    """A forecast whose announcements are so many times as wrong: times, and what fluctuations add at them,
-    (n_load, n_points); how long ramps have lasted, (..., n_ramps), s, and rates, (n_load, n_ramps, 1), pu/s.
-    """
-    (step, decay, fluctuations), n_ramps = others, ramps.shape[2]
-    n_steps = math.ceil((until - now) / step.min()) + 1
+) -> tuple[Array, Array]:
+    """Times and values of a forecast whose announcements are so many times as wrong as those given."""
+    initial, step, decay, fluctuations = others
+    n_ramps, n_steps = ramps.shape[2], math.ceil((until - now) / step.min()) + 1
     times = np.empty((len(order), n_steps + 2 * n_ramps))
-    rest, lasted, rates = np.empty(times.shape), np.empty((*times.shape, n_ramps)), ramps[2].copy()[order]
+    values = np.empty(times.shape)
     for row, load in enumerate(order):
         own, own_step, known = times[row], step[load, 0], ramps[:, load].copy()
-        start, duration, rate = known[0], known[1], rates[row]
+        start, duration, rate = known[0], known[1], known[2]
         for k in range(n_steps):
             own[k] = min(now + own_step * k, until)
         for r in range(n_ramps):
@@ -114,10 +110,11 @@ def _announced(
         before, after = fluctuations[load, k], fluctuations[load, k + 1]
         present = (after - before) / ((k + 1) * own_step - k * own_step) * (now - k * own_step) + before
         for j in range(len(own)):
-            rest[row, j] = present * math.exp((now - own[j]) / decay[load, 0])
+            ramped = 0.0
             for r in range(n_ramps):
-                lasted[row, j, r] = min(max(own[j] - start[r], 0.0), duration[r])
-    return times, lasted, rates[:, :, None], rest
+                ramped += min(max(own[j] - start[r], 0.0), duration[r]) * rate[r]
+            values[row, j] = initial[load, 0] + ramped + present * math.exp((now - own[j]) / decay[load, 0])
+    return times, values
 
 
 @compiled

@@ -154,8 +154,13 @@ class Scenario(Fingerprinted):
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """True load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""
-        times = self.grid if t is None else t
-        return np.stack([self.load[bus].at(times) for bus in case.loads], axis=-1)
+        if t is None:
+            return self._on_grid.take([*map(list(self.load).index, case.loads)], axis=1)
+        return np.stack([self.load[bus].at(t) for bus in case.loads], axis=-1)
+
+    @functools.cached_property
+    def _on_grid(self) -> Array:
+        return np.stack([load.at(self.grid) for load in self.load.values()], axis=-1)
 
     def snapshot(self, case: Case, t: float) -> Instance:
         """An instance whose loads stay as they are at time `t`: the initial power is the scenario's."""

@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -28,26 +28,17 @@ from ded_bench.methods.solution import Settings
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.results.folder import search_folders
-from ded_bench.results.rows import Results, Row, differences
+from ded_bench.results.rows import Key, Results, Row, differences
 from ded_bench.results.timing import model_name
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import Task, make_tasks
 from ded_bench.solvers.status import Status
 from ded_bench.surrogates.find import MODELS, TRAINED
 
+#: What rows of two folders are compared by; the model by its name alone.
+ASKED = Key._fields[: Key._fields.index("model") + 1]
 #: Rows that a section of the printed comparison names; the rest are counted.
 SHOWN = 10
-
-
-class Asked(NamedTuple):
-    """What rows of two folders are compared by."""
-
-    case: str
-    instance: str
-    regime: str
-    method: str
-    settings: str
-    model: str
 
 
 def limits(objective: float = 1e-6, hz: float = 1e-6, pu: float = 1e-8) -> dict[str, float]:
@@ -60,7 +51,7 @@ def limits(objective: float = 1e-6, hz: float = 1e-6, pu: float = 1e-8) -> dict[
 class Change(NamedTuple):
     """One value of one row, before (in A) and after (in B); None is an empty cell."""
 
-    key: Asked
+    key: Key
     column: str
     before: str | float | bool | None
     after: str | float | bool | None
@@ -76,8 +67,8 @@ class Comparison:
     heads: tuple[str, str]
     common: int
     incomparable: str  # why nothing was compared; else empty
-    only_a: tuple[Asked, ...]
-    only_b: tuple[Asked, ...]
+    only_a: tuple[Key, ...]
+    only_b: tuple[Key, ...]
     changes: tuple[Change, ...]
 
     @property
@@ -117,21 +108,21 @@ def compare(
     return Comparison(*facts, "", only_a, only_b, tuple(changes))
 
 
-def _read(folder: Path) -> dict[Asked, Row]:
+def _read(folder: Path) -> dict[Key, Row]:
     results = Results(folder)
     if not results.path.is_file():
         raise InputError(results.path, "", "is missing: this is no results folder")
     rows = sorted(results.rows.values(), key=lambda row: row.date)
-    return {Asked(*row.key[:5], model_name(row.model)): row for row in rows}
+    return {Key(*row.key[:5], model_name(row.model)): row for row in rows}
 
 
-def _head(rows: Mapping[Asked, Row]) -> str:
+def _head(rows: Mapping[Key, Row]) -> str:
     versions = ", ".join(sorted({row.version for row in rows.values()})) or "–"
     problems = ", ".join(sorted({row.problems_version or "(none)" for row in rows.values()})) or "–"
     return f"{len(rows)} rows, ded-bench {versions}, problems {problems}"
 
 
-def _incomparable(before: Mapping[Asked, Row], after: Mapping[Asked, Row], shared: Sequence[Asked]) -> str:
+def _incomparable(before: Mapping[Key, Row], after: Mapping[Key, Row], shared: Sequence[Key]) -> str:
     """Why the two tables are not about the same problems; empty if they are."""
     other = [key for key in shared if before[key].problems_version != after[key].problems_version]
     if other:
@@ -143,7 +134,7 @@ def _incomparable(before: Mapping[Asked, Row], after: Mapping[Asked, Row], share
     return "no row is in both" if before and after and not shared else ""
 
 
-def name_of(key: Asked) -> str:
+def name_of(key: Key) -> str:
     """What a row answers as a reader sees it; the usual settings and surrogate go without saying."""
     unusual = title(key.method, key.settings, key.model).removeprefix(title(key.method))
     return f"{key.instance} {key.regime} {key.method}{unusual}"
@@ -173,14 +164,18 @@ def to_json(comparison: Comparison) -> str:
     """The comparison as one JSON object; infinite sizes and missing numbers are null."""
     c = comparison
     changes = [
-        change.key._asdict()
+        _asked(change.key)
         | {"column": change.column, "before": change.before, "after": change.after}
         | {"size": change.size if math.isfinite(change.size) else None}
         for change in c.changes
     ]
     made = {name: getattr(c, name) for name in ("a", "b", "same", "incomparable", "common")}
-    made |= {name: [key._asdict() for key in getattr(c, name)] for name in ("only_a", "only_b")}
+    made |= {name: [_asked(key) for key in getattr(c, name)] for name in ("only_a", "only_b")}
     return json.dumps(made | {"changes": changes}, default=str)
+
+
+def _asked(key: Key) -> dict[str, Any]:
+    return dict(zip(ASKED, key, strict=False))
 
 
 def _section(heading: str, items: Iterable[str]) -> list[str]:

@@ -78,7 +78,7 @@ def _segments(load: LoadRamp | LoadPoints) -> list[float]:
         initial, start, duration, rate = load.initial, load.start, load.duration, load.rate
         return [0.0, initial, 0.0, start, initial, rate, start + duration, initial + rate * duration, 0.0]
     path: list[float] = []
-    for (t, p), (t_next, p_next) in itertools.pairwise(load.points):
+    for (t, p), (t_next, p_next) in itertools.pairwise(load.points.tolist()):
         path += [t, p, (p_next - p) / (t_next - t)]
     return path
 

@@ -188,4 +188,4 @@ def _delayed(load: LoadRamp | LoadPoints, at: float, by: float, last: float) -> 
     times = sorted({0.0, *(t for t in load.kinks if t < last), at, last})
     values = load.at(np.array(times)).tolist()
     later = zip(((t + by if t >= at else t) for t in times), values, strict=True)
-    return LoadPoints(points=tuple(sorted({*later, (at, float(load.at(np.array(at))))})))
+    return LoadPoints(points=np.array(sorted({*later, (at, float(load.at(np.array(at))))})))

@@ -115,7 +115,7 @@ class TimeVarying:
         Args:
             u: δP at the knots, shape (n_knots, n_gen), pu.
         """
-        from ded_bench.plants.march import march  # and with it Numba
+        from ded_bench.problem.compiled import march  # and with it Numba
 
         x, length = self.states(u), self.lengths
         slope = np.diff(u, axis=0) / length[:, None]

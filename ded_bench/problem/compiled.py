@@ -15,8 +15,9 @@ from numba.core.event import Listener, register
 from numba.core.types import unliteral
 from numpy.typing import NDArray
 
+from ded_bench.problem.quantities import Array, Indices
+
 Function = TypeVar("Function", bound=Callable[..., object])
-Floats = NDArray[np.float64]
 
 
 class _Announced(Listener):
@@ -89,7 +90,7 @@ def sources_stamp(package: Path = _PACKAGE) -> str:
 
 
 @compiled
-def interpolated(t: Floats, rows: Floats, times: Floats) -> Floats:
+def interpolated(t: Array, rows: Array, times: Array) -> Array:
     """Rows (n_times, n) at some times, linear between those at `t`, ascending; the last one stays."""
     found = np.empty((len(times), rows.shape[1]))
     for i, time in enumerate(times):
@@ -100,3 +101,28 @@ def interpolated(t: Floats, rows: Floats, times: Floats) -> Floats:
             for j in range(rows.shape[1]):
                 found[i, j] += (rows[k + 1, j] - rows[k, j]) / length * passed
     return found
+
+
+@compiled
+def march(
+    f: Array, which: Indices, state: Array, force: Array, growth: Array, points: Indices, found: Array
+) -> None:
+    """March a linear model through its intervals, one after another, so that a map stays in the cache.
+
+    Args:
+        f: maps of states from grid point to grid point, (n_maps, n_state, n_state), contiguous.
+        which: the map of each interval, (n_intervals,).
+        state: at its start, (n_intervals, n_state).
+        force: what inputs add over its first step, (n_intervals, n_state).
+        growth: by how much that grows from step to step, (n_intervals, n_state).
+        points: grid points of the knots, (n_intervals + 1,).
+        found: receives the states between knots, (n_points, n_state).
+    """
+    for j in range(len(which)):
+        now, push = state[j], force[j].copy()
+        for k in range(points[j] + 1, points[j + 1]):
+            np.dot(f[which[j]], now, found[k])
+            for i in range(len(push)):
+                found[k, i] += push[i]
+                push[i] += growth[j, i]
+            now = found[k]

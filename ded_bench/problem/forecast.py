@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.problem.case import Array, Case, Indices
-from ded_bench.problem.compiled import compiled
+from ded_bench.problem.compiled import compiled, interpolated
 from ded_bench.problem.instance import Initial, Instance, LoadPoints
 from ded_bench.problem.scenario import Scenario
 
@@ -23,35 +23,30 @@ RESOLUTION = 1e-9
 class Forecast:
     """Loads from an instant on, linear between points; one at the time of the one before says nothing."""
 
-    times: Array  # (n_load, n_points), s of the scenario, ascending
+    scenario: Scenario
+    case: Case
+    times: Array  # (n_load, n_points), s of the scenario, ascending; loads in the scenario's order
     values: Array  # (n_load, n_points), injections, pu
 
     def at(self, t: Array) -> Array:
         """Forecast injections at times `t` in s of the scenario, shape (n_t, n_load), pu."""
-        return np.stack([np.interp(t, *load) for load in zip(self.times, self.values, strict=True)], axis=-1)
+        points = dict(zip(self.scenario.load, zip(self.times, self.values, strict=True), strict=True))
+        return np.stack([np.interp(t, *points[bus]) for bus in self.case.loads], axis=-1)
 
-    def instance(
-        self, scenario: Scenario, case: Case, start: float, horizon_s: float, initial: Initial, name: str
-    ) -> Instance:
+    def instance(self, start: float, horizon_s: float, initial: Initial, name: str) -> Instance:
         """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
-        times, values, end = self.times, self.values, start + horizon_s
-        if times[0, 0] < start or times[0, -1] > end:
-            first, last = self.at(np.array([start, end]))[:, :, None]
-            values = np.where(times < start, first, np.where(times > end, last, values))
-            times = times.clip(start, end)
-        t, values, ends = _distinct(times, values, start, horizon_s)
-        points = tuple(zip(t.tolist(), values.tolist(), strict=True))
+        points, ends = _distinct(self.times, self.values, start, horizon_s)
         # Of parts that were checked: to do it again would take as long as the plant.
         loads = [LoadPoints.model_construct(points=points[i:j]) for i, j in itertools.pairwise(ends.tolist())]
         return Instance.model_construct(
             schema_="ded-bench/instance/2",
             id=name,
-            case=case.id,
+            case=self.case.id,
             seed=(),  # from which the loads could be drawn again
             horizon_s=horizon_s,
-            dt_s=scenario.dt_s,
-            cost=scenario.cost,
-            load=dict(zip(case.loads, loads, strict=True)),
+            dt_s=self.scenario.dt_s,
+            cost=self.scenario.cost,
+            load=dict(zip(self.scenario.load, loads, strict=True)),
             initial=initial,
         )
 
@@ -65,37 +60,36 @@ def forecast(scenario: Scenario, case: Case, quality: str, now: float, until: fl
 
     Args:
         scenario: what will be, and what is announced of it.
-        case: gives the order of the loads.
+        case: the scenario's.
         quality: one of QUALITIES.
         now: when the forecast is made.
         until: the end of what is asked for; after `now`.
     """
-    order = np.array([*map(list(scenario.load).index, case.loads)])
     if quality in ("announced", "worse"):
         wrong = WORSE if quality == "worse" else 1.0
-        return Forecast(*_announced(now, until, wrong, order, scenario.ramps, scenario.fluctuations))
+        return Forecast(scenario, case, *_announced(now, until, wrong, scenario.ramps, scenario.fluctuations))
     start, duration, *_ = scenario.ramps
     _, step, _, fluctuations = scenario.fluctuations
-    ends = np.full((len(order), 2), [now, until])
+    ends = np.full((len(start), 2), [now, until])
     kinks = step * np.arange(fluctuations.shape[1]), start, start + duration
     times = np.concatenate([ends, *(kinks if quality == "perfect" else ())], axis=1).clip(now, until)
     times.sort(axis=1)
     known = times if quality == "perfect" else np.full_like(times, now)
     values = np.array([load.at(t) for load, t in zip(scenario.load.values(), known, strict=True)])
-    return Forecast(times[order], values[order])
+    return Forecast(scenario, case, times, values)
 
 
 @compiled
 def _announced(
-    now: float, until: float, wrong: float, order: Indices, ramps: Array, others: tuple[Array, ...]
+    now: float, until: float, wrong: float, ramps: Array, others: tuple[Array, ...]
 ) -> tuple[Array, Array]:
     """Times and values of a forecast whose announcements are so many times as wrong as those given."""
     initial, step, decay, fluctuations = others
     n_ramps, n_steps = ramps.shape[2], math.ceil((until - now) / step.min()) + 1
-    times = np.empty((len(order), n_steps + 2 * n_ramps))
+    times = np.empty((len(step), n_steps + 2 * n_ramps))
     values = np.empty(times.shape)
-    for row, load in enumerate(order):
-        own, own_step, known = times[row], step[load, 0], ramps[:, load].copy()
+    for load, own in enumerate(times):
+        own_step, known = step[load, 0], ramps[:, load].copy()
         start, duration, rate = known[0], known[1], known[2]
         for k in range(n_steps):
             own[k] = min(now + own_step * k, until)
@@ -113,19 +107,23 @@ def _announced(
             ramped = 0.0
             for r in range(n_ramps):
                 ramped += min(max(own[j] - start[r], 0.0), duration[r]) * rate[r]
-            values[row, j] = initial[load, 0] + ramped + present * math.exp((now - own[j]) / decay[load, 0])
+            values[load, j] = initial[load, 0] + ramped + present * math.exp((now - own[j]) / decay[load, 0])
     return times, values
 
 
 @compiled
-def _distinct(times: Array, values: Array, start: float, horizon_s: float) -> tuple[Array, Array, Indices]:
-    """Distinct points of all loads, from `start` on: times, values, and where each load's begin and end."""
-    t, found, ends, count = np.empty(times.size), np.empty(times.size), np.zeros(len(times) + 1, np.int64), 0
+def _distinct(times: Array, values: Array, start: float, horizon_s: float) -> tuple[Array, Indices]:
+    """Distinct points of all loads from `start` on, (n, 2), and where each load's begin and end."""
+    found, ends = np.empty((times.size + 2 * len(times), 2)), np.zeros(len(times) + 1, np.int64)
+    count, limits = 0, np.array([start, start + horizon_s])
     for load, own in enumerate(times):
-        for j in range(len(own)):
-            is_end = j in (0, len(own) - 1)
-            if is_end or (own[j] - own[j - 1] > RESOLUTION and own[j] < own[-1] - RESOLUTION):
-                t[count], found[count] = own[j] - start, values[load, j]
+        first, last = interpolated(own, values[load].copy().reshape((-1, 1)), limits)
+        found[count, 0], found[count, 1] = 0.0, first[0]
+        for t, value in zip(own, values[load]):  # noqa: B905  (Numba's has no `strict`)
+            if t - start > found[count, 0] + RESOLUTION and t < limits[1] - RESOLUTION:
                 count += 1
-        t[ends[load]], t[count - 1], ends[load + 1] = 0.0, horizon_s, count
-    return t[:count], found[:count], ends
+                found[count, 0], found[count, 1] = t - start, value
+        found[count + 1, 0], found[count + 1, 1] = horizon_s, last[0]
+        count += 2
+        ends[load + 1] = count
+    return found[:count], ends

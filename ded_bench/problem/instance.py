@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from ded_bench.problem.quantities import (
     NonNegative,
     Number,
     Positive,
+    as_array,
     check_whole_steps,
 )
 
@@ -50,32 +50,33 @@ class LoadRamp(Record):
         return (self.start, self.start + self.duration) if self.rate and self.duration else ()
 
 
-class LoadPoints(Record):
+_Points = Annotated[
+    tuple[Annotated[tuple[NonNegative, Number], Field(strict=False)], ...],
+    Field(strict=False, min_length=2, max_length=MAX_POINTS),
+]
+
+
+class LoadPoints(Fingerprinted):
     """A load by its injections in pu at times in s, linear between them (instance/2)."""
 
-    points: Annotated[
-        tuple[Annotated[tuple[NonNegative, Number], Field(strict=False)], ...],
-        Field(strict=False, min_length=2, max_length=MAX_POINTS),
-    ]
+    points: Annotated[Array, as_array(_Points)]  # (n, 2)
 
     @model_validator(mode="after")
     def _increasing(self) -> LoadPoints:
-        times = [t for t, _ in self.points]
-        if times[0] != 0:
+        if self.points[0, 0] != 0:
             raise ValueError("points: must start at t = 0")
-        if not all(map(operator.lt, times, times[1:])):
+        if not (np.diff(self.points[:, 0]) > 0).all():
             raise ValueError("points: times must increase strictly")
         return self
 
     def at(self, t: Array) -> Array:
         """Injection in pu at times `t` in s (any shape), up to the last point."""
-        times, values = zip(*self.points, strict=True)
-        return np.asarray(np.interp(t, times, values))
+        return np.asarray(np.interp(t, *self.points.T))
 
     @property
     def kinks(self) -> tuple[float, ...]:
         """Times in s at which the injection may change its slope."""
-        return tuple(t for t, _ in self.points[1:-1])
+        return tuple(self.points[1:-1, 0].tolist())
 
 
 Load = Annotated[
@@ -171,7 +172,7 @@ class Instance(Fingerprinted):
             if isinstance(load, LoadPoints):
                 if not second:
                     raise ValueError(f"load.{bus}.points: needs schema ded-bench/instance/2")
-                if load.points[-1][0] < self.horizon_s:
+                if load.points[-1, 0] < self.horizon_s:
                     raise ValueError(f"load.{bus}.points: must reach the horizon")
         return self
 

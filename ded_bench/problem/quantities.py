@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    Field,
+    GetPydanticSchema,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    WrapValidator,
+    model_serializer,
+)
 
 from ded_bench.files.strict import Record
 
@@ -27,6 +35,18 @@ Range = tuple[Number, Number]
 MAX_STEPS = 1_000_000
 #: Of a load in one file.
 MAX_POINTS = 100_000
+
+
+def as_array(kind: Any) -> GetPydanticSchema:
+    """What is checked as rows of this kind and kept as an array that nobody changes."""
+
+    def kept(rows: object, checked: Callable[[object], object]) -> Array:
+        array = np.array(checked(rows.tolist() if isinstance(rows, np.ndarray) else rows))
+        array.flags.writeable = False
+        return array
+
+    stored = Annotated[kind, WrapValidator(kept), PlainSerializer(np.ndarray.tolist)]
+    return GetPydanticSchema(lambda _, handler: handler(stored))
 
 
 class Extended(Record):

@@ -207,8 +207,7 @@ def _throughout(case: Case, scenario: Scenario) -> Instance:
     last = scenario.duration_s + case.sampling.horizon_s
     times = np.append(np.arange(0.0, last - ISLAND_STEP_S / 2, ISLAND_STEP_S), last)
     load = {
-        bus: LoadPoints(points=tuple(zip(times.tolist(), one.at(times).tolist(), strict=True)))
-        for bus, one in scenario.load.items()
+        bus: LoadPoints(points=np.stack([times, one.at(times)], axis=1)) for bus, one in scenario.load.items()
     }
     changes = {"schema_": "ded-bench/instance/2", "horizon_s": last, "load": load}
     return scenario.snapshot(case, 0.0).model_copy(update=changes)
@@ -292,7 +291,7 @@ def _draw_fluctuation(
         values[k + 1] = b * values[k] + (1 - b) * x
     deviation = np.sqrt((1 - b) * (1 + a * b) / ((1 + b) * (1 - a * b)))
     values = np.round(values * (FLUCTUATION * nominal / deviation), FLUCTUATION_DECIMALS) + 0.0
-    return Fluctuation(step_s=step_s, values=tuple(values.tolist()), decay_s=DECAY_S)
+    return Fluctuation(step_s=step_s, values=values, decay_s=DECAY_S)
 
 
 def _draw_drift(nominal: float, last: float, generator: np.random.Generator) -> Fluctuation:
@@ -303,7 +302,7 @@ def _draw_drift(nominal: float, last: float, generator: np.random.Generator) -> 
         step = np.sqrt(1 - a**2) * DRIFT / 2 * _normal(uniform)
         values[k + 1] = np.clip(a * values[k] + step, -DRIFT, DRIFT)
     drift = np.round(values * nominal, 6) + 0.0
-    return Fluctuation(step_s=DRIFT_STEP_S, values=tuple(drift.tolist()), decay_s=DRIFT_DECAY_S)
+    return Fluctuation(step_s=DRIFT_STEP_S, values=drift, decay_s=DRIFT_DECAY_S)
 
 
 def _by_bus(buses: tuple[str, ...], values: Array) -> dict[str, float]:

@@ -21,6 +21,7 @@ from ded_bench.problem.quantities import (
     NonNegative,
     Number,
     Positive,
+    as_array,
     check_whole_steps,
 )
 
@@ -50,25 +51,23 @@ class ScenarioRamp(Record):
         return self.start + self.duration
 
 
-class Fluctuation(Record):
+_Values = Annotated[tuple[Number, ...], Field(strict=False, min_length=2, max_length=MAX_POINTS)]
+
+
+class Fluctuation(Fingerprinted):
     """What a load does beside its ramps: pu every `step_s` from t = 0, linear between.
 
     Forecasts let its present value decay by exp(-t / decay_s).
     """
 
     step_s: Positive
-    values: Annotated[tuple[Number, ...], Field(min_length=2, max_length=MAX_POINTS)]
+    values: Annotated[Array, as_array(_Values)]
     decay_s: Positive
 
     @functools.cached_property
     def times(self) -> Array:
         """Times of the values, s."""
         return np.arange(len(self.values), dtype=np.float64) * self.step_s
-
-    @functools.cached_property
-    def array(self) -> Array:
-        """The values, pu."""
-        return np.array(self.values)
 
 
 class ScenarioLoad(Record):
@@ -85,7 +84,7 @@ class ScenarioLoad(Record):
 
     def fluctuation_at(self, t: Array) -> Array:
         """Fluctuation in pu at times `t` in s (any shape)."""
-        return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.array))
+        return np.asarray(np.interp(t, self.fluctuation.times, self.fluctuation.values))
 
 
 class Scenario(Fingerprinted):
@@ -147,7 +146,7 @@ class Scenario(Fingerprinted):
         """Initial loads, pu, steps and decays, s, (n_load, 1); values, (n_load, most), pu: the last stays."""
         given = [load.fluctuation for load in self.load.values()]
         most = max(len(own.values) for own in given)
-        values = [np.pad(own.array, (0, most - len(own.values)), mode="edge") for own in given]
+        values = [np.pad(own.values, (0, most - len(own.values)), mode="edge") for own in given]
         initial = np.array([load.initial for load in self.load.values()])[:, None]
         step, decay = np.array([(own.step_s, own.decay_s) for own in given]).T[:, :, None]
         return initial, step, decay, np.array(values)

@@ -94,7 +94,7 @@ class AtNominalPoint(AlongTrajectory):
         case, system = self.plant.case, self.plant.system
         power = system.network.nominal().power.real[system.scheduled]
         nominal = zip(case.loads, (-system.network.p_drawn[system.load_ports]).tolist(), strict=True)
-        load = {bus: LoadPoints(points=((0.0, p), (instance.horizon_s, p))) for bus, p in nominal}
+        load = {bus: LoadPoints(points=np.array([[0.0, p], [instance.horizon_s, p]])) for bus, p in nominal}
         initial = State(None, np.zeros(len(power)), power).initial(case)
         rest = instance.model_copy(update={"initial": initial, "load": load})
         state = self.plant.initial(rest)._replace(next_s=next_s)

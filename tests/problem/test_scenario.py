@@ -103,7 +103,7 @@ def test_points_of_an_instance_are_the_forecast(known, threebus, quality):
     """Shifted to t = 0 at its start; every forecast begins with the present load."""
     loads = forecast(known, threebus, quality, 5.0, 16.0)
     assert loads.at(np.array([5.0])) == pytest.approx(known.p_load(threebus, np.array([5.0])), abs=1e-15)
-    instance = loads.instance(known, threebus, 7.31, 6.0, known.initial, "later")
+    instance = loads.instance(7.31, 6.0, known.initial, "later")
     assert parse_record(Instance, instance.model_dump_json(by_alias=True), "it passes all checks") == instance
     (points,) = instance.load.values()
     times = np.linspace(0.0, 6.0, 601)
@@ -172,7 +172,7 @@ def test_shipped_scenarios_are_what_the_contract_says(name):
         relative = scenario.p_load(case, np.arange(0.0, 360.0, 0.5)) / case.load_nominal
         assert np.abs(relative - 1).max() < LOAD_RANGE + 10 * FLUCTUATION
     spread = [
-        np.std(load.fluctuation.array) / abs(nominal)
+        np.std(load.fluctuation.values) / abs(nominal)
         for s in scenarios
         for load, nominal in zip((s.load[b] for b in case.loads), case.load_nominal, strict=True)
     ]

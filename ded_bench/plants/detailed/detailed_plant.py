@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ded_bench.files.errors import InputError
-from ded_bench.plants.detailed.machine_arrays import DELTA, SPEED
+from ded_bench.plants.detailed.machine_arrays import DELTA
 from ded_bench.plants.detailed.power_system import DetailedRun, DetailedState, PowerSystem, linearised
 from ded_bench.plants.detailed.start import corrected, initial_point, start
 from ded_bench.plants.detailed.static_dispatch import StaticDispatch
@@ -141,14 +141,14 @@ class DetailedPlant:
         Behind an infinite slack angles would be worse than none: turbines' powers, which are not told, or a
         planner's own network, hold others, and what it plans from would be far from any equilibrium.
         """
-        data, machines = self.system.data, self.system.scheduled
-        omega = (state.x[SPEED] * data.omega_0)[machines]
+        from ded_bench.plants.detailed import equations  # and with it Numba
+
+        (theta, omega, p_gen), mean = equations.observed(self.system.data, state.x, self.system.scheduled)
         if self.case.slack is not None:
             return State(None, omega, state.p_set)
-        agc, mean = None, float(data.inertia @ state.x[DELTA])
+        agc = None
         if self.case.agc is not None:
             agc = AgcState.model_construct(None, held_pu=state.held, integral_rad=mean, next_s=state.next_s)
-        theta, p_gen = (state.x[DELTA] - mean)[machines], self.system.turbines(state.x)[machines]
         return State(theta, omega, state.p_set, p_gen, agc)
 
     def columns(self, states: DetailedRun) -> Mapping[str, Array]:

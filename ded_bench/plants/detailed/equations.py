@@ -21,7 +21,7 @@ import numpy as np
 from ded_bench.plants.detailed import machine_arrays as at
 from ded_bench.plants.detailed.machine_arrays import MachineArrays
 from ded_bench.problem.compiled import compiled, copy_row, inlined
-from ded_bench.problem.quantities import Array
+from ded_bench.problem.quantities import Array, Indices
 
 #: The fixed point gives up after so many steps, Newton's method, which renews W in each, after so many.
 FIXED_POINT_STEPS, NEWTON_STEPS = 12, 20
@@ -82,6 +82,16 @@ def mean_angle(data: MachineArrays, x: Array) -> float:
     for i in range(x.shape[1]):
         mean += data[i].inertia * x[at.DELTA, i]
     return mean
+
+
+@compiled
+def observed(data: MachineArrays, x: Array, machines: Indices) -> tuple[Array, float]:
+    """Of some machines angles from the mean, rad, speeds, rad/s, turbines' powers, pu, (3, n); the mean."""
+    mean, found = mean_angle(data, x), np.empty((3, len(machines)))
+    for j, i in enumerate(machines):
+        found[0, j], found[1, j] = x[at.DELTA, i] - mean, x[at.SPEED, i] * data[i].omega_0
+        found[2, j] = data[i].reheat * x[at.GATE, i] + (1.0 - data[i].reheat) * x[at.TURBINE, i]
+    return found, mean
 
 
 @compiled

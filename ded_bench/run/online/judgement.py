@@ -127,7 +127,7 @@ def _in_windows(case: Case, scenario: Scenario, regime: str) -> tuple[str, Judge
 def whole_instance(case: Case, scenario: Scenario) -> Instance:
     """A scenario as one instance, with its true loads."""
     last, loads = scenario.duration_s, forecast(scenario, case, "perfect", 0.0, scenario.duration_s)
-    return loads.instance(scenario, case, 0.0, last, scenario.initial, scenario.id)
+    return loads.instance(0.0, last, scenario.initial, scenario.id)
 
 
 def unforeseen_hz(case: Case, scenario: Scenario, options: LoopOptions, plant: Plant) -> float:

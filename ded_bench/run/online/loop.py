@@ -24,6 +24,7 @@ from ded_bench.methods.solution import Settings, Solution
 from ded_bench.plants.plant import Piece, Plant, PlantState, SimulationError, plant_of
 from ded_bench.plants.score import AGC_COLUMN
 from ded_bench.problem.case import Array, Case
+from ded_bench.problem.compiled import compiled, copy_row, interpolated
 from ded_bench.problem.forecast import Forecast, forecast
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.scenario import Scenario
@@ -140,24 +141,27 @@ class LoopOutcome(NamedTuple):
     plans_s: float  # from measurements to answers, all together, s of the clock
 
 
-@dataclass(frozen=True)
-class _Course:
-    """A schedule that is followed from a point of the scenario's grid on."""
+@compiled
+def _later(t: Array, p: Array, passed: float, horizon_s: float) -> tuple[Array, Array]:
+    """Times and powers of a schedule from a time on, for `horizon_s`; its end stays."""
+    times, count = np.empty(len(t) + 2), 1
+    times[0] = 0.0
+    for later in t - passed:
+        if WHOLE < later < horizon_s - WHOLE:
+            times[count] = later
+            count += 1
+    times[count] = horizon_s
+    times = times[: count + 1]
+    return times, interpolated(t, p, times + passed)
 
-    schedule: Schedule
-    start: int
-    grid: Array  # of the scenario, s
 
-    def at(self, first: int, last: int) -> Array:
-        """Planned powers at the points first..last, shape (last - first + 1, n_gen), pu; its end stays."""
-        return self.schedule.at(self.grid[first - self.start : last + 1 - self.start])
-
-    def later(self, start: int, horizon_s: float) -> Schedule:
-        """The same plan on the time of an instance that starts later and lasts `horizon_s`."""
-        shifted = self.schedule.t - self.grid[start - self.start]
-        inside = shifted[(shifted > WHOLE) & (shifted < horizon_s - WHOLE)]
-        times = np.concatenate([[0.0], inside, [horizon_s]])
-        return Schedule(times, self.schedule.at(times + self.grid[start - self.start]))
+@compiled
+def _followed(t: Array, p: Array, times: Array, first: Array, limits: tuple[Array, Array, Array]) -> Array:
+    """Powers at some times on the way from the `first` ones to a schedule's, within limits (see `track`)."""
+    power = interpolated(t, p, times)
+    copy_row(first, power[0])
+    track(power.reshape((1, *power.shape)), *limits)
+    return power
 
 
 class History:
@@ -232,8 +236,8 @@ class _Loop:
         first, p_load = scenario.snapshot(case, 0.0), scenario.p_load(case)
         self.history = History(case, plant, first, scenario.grid, p_load)
         power = self.history.p_set[0]
-        stay = Schedule(np.array([0.0, self.horizon]), np.array([power, power]))
-        self.course, self.held = _Course(stay, 0, scenario.grid), False
+        # The plan in force, where on the scenario's grid it begins, and whether a method has made it.
+        self.plan, self.start, self.held = (np.array([0.0, self.horizon]), np.array([power, power])), 0, False
         endless = np.full_like(case.ramp, np.inf)
         self.limits = -endless, endless, case.ramp * self.dt
         self.asked, self.plans_s = list[Planned](), 0.0
@@ -265,14 +269,17 @@ class _Loop:
             answer = Planned(None, error=f"no prediction: {error}")
         else:
             warm = self.options.warm and self.held and getattr(self.ask, "starts_warm", True)
-            answer = self.ask(instance, self.course.later(start, self.horizon) if warm else None)
+            passed = self.scenario.grid[start - self.start]
+            last = Schedule(*_later(*self.plan, passed, self.horizon)) if warm else None
+            answer = self.ask(instance, last)
         self.plans_s += time.perf_counter() - measured
         self.asked.append(answer)
         return answer
 
     def _take(self, answer: Planned, start: int) -> None:
         if answer.schedule is not None:
-            self.course, self.held = _Course(answer.schedule, start, self.scenario.grid), True
+            plan = answer.schedule.t, np.ascontiguousarray(answer.schedule.p)
+            self.plan, self.start, self.held = plan, start, True
 
     def _state(self, loads: Forecast, start: int) -> PlantState:
         """The state that a plan from `start` begins with."""
@@ -285,7 +292,7 @@ class _Loop:
         left = (self.scenario.steps - start) * self.dt
         horizon = min(self.horizon, left) if self.options.to_end else self.horizon
         name, initial = f"{self.scenario.id[:50]}-{start}", self.plant.observed(state).initial(self.case)
-        return loads.instance(self.scenario, self.case, start * self.dt, horizon, initial, name)
+        return loads.instance(start * self.dt, horizon, initial, name)
 
     def _go_on(self, until: int) -> None:
         if until > self.history.now:
@@ -294,7 +301,5 @@ class _Loop:
     def _followed(self, until: int) -> Array:
         """Set-points from now to `until` on the way to the plan's, within ramp limits."""
         now = self.history.now
-        power = self.course.at(now, until)
-        power[0] = self.history.p_set[now]
-        track(power[None], *self.limits)
-        return power
+        times = self.scenario.grid[now - self.start : until + 1 - self.start]
+        return _followed(*self.plan, times, self.history.p_set[now], self.limits)

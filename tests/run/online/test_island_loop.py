@@ -210,6 +210,6 @@ def test_shipped_scenarios_can_be_served(name):
         plant_of(case).static_dispatch(whole_instance(case, scenario), times)
         plant_of(case).initial(scenario.snapshot(case, 0.0))
     for load, nominal in zip(scenarios[-1].load.values(), case.load_nominal, strict=False):
-        drift = np.abs(load.fluctuation.array / nominal)
+        drift = np.abs(load.fluctuation.values / nominal)
         assert 0.005 < drift.max() <= DRIFT + 1e-6
         assert abs(load.at(np.array(3600.0)) / nominal - 1) <= HOUR_RANGE + DRIFT + 1e-6

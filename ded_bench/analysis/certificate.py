@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -203,12 +203,13 @@ def certify(
     fingerprint = hashlib.sha256(decisive.encode()).hexdigest()[:12]
     done = {r.index: r for r in ROWS.existing(path) if r.fingerprint == fingerprint and r.index < count}
     missing = [i for i in range(count) if i not in done]
-    calls = [
-        (case, candidate, seed, tuple(missing[start : start + CHUNK]))
-        for start in range(0, len(missing), CHUNK)
-    ]
-    with tqdm(total=count, initial=len(done), unit="instance", disable=None, desc="certify") as bar:
-        for made in _judged(calls, workers):
+    chunks = [tuple(missing[start : start + CHUNK]) for start in range(0, len(missing), CHUNK)]
+    calls = [(judge, (case, candidate, seed, chunk)) for chunk in chunks]
+    bar = tqdm(total=count, initial=len(done), unit="instance", disable=None, desc="certify")
+    with bar, Workers(workers) as pool:
+        for _, made in pool.imap(calls, chunks):
+            if not isinstance(made, list):
+                raise WorkersLostError(f"a chunk of the certificate failed: {made}")
             done |= {row.index: dataclasses.replace(row, fingerprint=fingerprint) for row in made}
             ROWS.write(path, [done[index] for index in sorted(done)])
             bar.update(len(made))
@@ -253,11 +254,3 @@ def judge(case: Case, candidate: Candidate, seed: int, indices: Sequence[int]) -
         cells = {name: getattr(own, name) for name in SCORES} if own else {}
         rows.append(CertificateRow(index, "", reference=other.objective if other else None, **cells))
     return rows
-
-
-def _judged(calls: list[tuple[Any, ...]], workers: int) -> Iterator[list[CertificateRow]]:
-    with Workers(workers) as pool:
-        for _, answer in pool.imap([(judge, call) for call in calls], calls):
-            if not isinstance(answer, list):
-                raise WorkersLostError(f"a chunk of the certificate failed: {answer}")
-            yield answer

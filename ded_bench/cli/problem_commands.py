@@ -13,7 +13,7 @@ from ded_bench.cli.arguments import command, counted, declare, natural, positive
 from ded_bench.files.errors import InputError
 from ded_bench.files.strict import write_atomically, write_record
 from ded_bench.methods.options import described
-from ded_bench.methods.registry import Method, get_method, registered
+from ded_bench.methods.registry import get_method, registered
 from ded_bench.plants.plant import SimulationError, servable
 from ded_bench.problem.benchmark import (
     Manifest,
@@ -152,21 +152,17 @@ def _import(a: argparse.Namespace) -> int:
 
 
 def _methods(a: argparse.Namespace) -> int:
-    chosen = [get_method(a.name)] if a.name else registered().values()
-    print("\n".join(line for method in chosen for line in lines_of(method)))
-    return 0
-
-
-def lines_of(method: Method) -> list[str]:
     """A line for a method, and one for each of its options; what cannot be imported says why."""
-    try:
-        options = described(method.options)
-    except InputError as error:
-        return [f"{method.name:<16} cannot be used: {error}"]
-    lines = [f"{method.name:<16} {method.title}"]
-    for name, default, text in options:
-        lines += textwrap.wrap(f"  {f'{name}={default}':<20} {text}", 110, subsequent_indent=" " * 23)
-    return lines
+    for method in [get_method(a.name)] if a.name else registered().values():
+        try:
+            options = described(method.options)
+        except InputError as error:
+            print(f"{method.name:<16} cannot be used: {error}")
+            continue
+        print(f"{method.name:<16} {method.title}")
+        for name, default, text in options:
+            print(textwrap.fill(f"  {f'{name}={default}':<20} {text}", 110, subsequent_indent=" " * 23))
+    return 0
 
 
 def _list() -> int:

@@ -112,7 +112,7 @@ def opening(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Blo
     said += [f"**Certificate** of {title(c.method, c.settings)}: {c.sentence}" for c in sources.certificates]
     usual = (found["settings"] == DEFAULT) | ~found["method"].isin(list(METHODS))
     printed = columns.OUTCOME if case.slack else (*columns.OUTCOME, *columns.ISLAND)
-    notes = (*_problems(sources), *_makers(sources), *sources.notes)
+    notes = (*_problems(sources), *sources.notes)
     return [
         f"# Dynamics-aware economic dispatch on {case.id}",
         what,
@@ -223,7 +223,7 @@ def alarms(sources: Sources) -> list[str]:
 
 
 def _problems(sources: Sources) -> Iterator[str]:
-    """Rows of several problem versions, of unknown regimes, or without scores; objectives from elsewhere."""
+    """Rows that are not of one problem, of this case or of today's methods; objectives from elsewhere."""
     rows, judged = sources.rows, sources.judged
     versions = set(rows["problems_version"])
     named = ", ".join(version or "(none given)" for version in sorted(versions))
@@ -239,14 +239,10 @@ def _problems(sources: Sources) -> Iterator[str]:
             f"{reference.shipped} objectives of {reference.title} are those of the reference run that ships "
             "with the case, since it was not run on these instances here."
         )
-
-
-def _makers(sources: Sources) -> Iterator[str]:
-    """Rows that today's methods would not make."""
-    made = sources.judged[sources.judged["objective"].notna()]
+    made = judged[judged["objective"].notna()]
     today = {str(name): METHODS[str(name)].version for name in set(made["method"]) & set(METHODS)}
-    versions = zip(made["method"], made["method_version"], strict=True)
-    if old := sorted({method for method, version in versions if version != today.get(method, version)}):
+    by_method = zip(made["method"], made["method_version"], strict=True)
+    if old := sorted({method for method, version in by_method if version != today.get(method, version)}):
         names = ", ".join(title(method) for method in old)
         yield f"Rows come from other versions of their methods than those installed here: {names}."
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ded_bench.plants.lossless.network import Network
-from ded_bench.problem.case import Array, Case
+from ded_bench.problem.case import Case
 from ded_bench.surrogates.identify import training_trajectories
 from ded_bench.surrogates.koopman import Koopman
 from ded_bench.surrogates.linear import EPSILON
@@ -84,26 +84,19 @@ def identify_paper(case: Case, seed: int = 0, count: int | None = None, steps: i
     optimiser = torch.optim.Adam(model.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
-        k = torch.randint(state.shape[0] - 1, (BATCH,), generator=generator)
-        j = torch.randint(state.shape[1], (BATCH,), generator=generator)
-        loss = model(state[k, j], state[k + 1, j], inputs[k + 1, j]).mean()
+        at = torch.randint(state.shape[0] - 1, (BATCH,), generator=generator)
+        run = torch.randint(state.shape[1], (BATCH,), generator=generator)
+        loss = model(state[at, run], state[at + 1, run], inputs[at + 1, run]).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
     training = {"seed": seed, "trajectories": data.inputs.shape[1], "steps": steps}
     training["one_step_loss"] = loss.item()
-    return _in_original_units(case, model, offset, scale, training)
-
-
-def _in_original_units(
-    case: Case, model: PaperKoopman, offset: Array, scale: Array, training: dict[str, int | float]
-) -> Koopman:
-    n_gen, n_bus = len(case.generators), case.n_bus
-    with torch.no_grad():
+    with torch.no_grad():  # back to the original units
         k, b = (matrix.numpy() for matrix in model.matrices())
         first, last = model.first, model.last
-        weight = first.weight.numpy() / scale
+        weight, n_bus = first.weight.numpy() / scale, case.n_bus
         mlp = ((weight, first.bias.numpy() - weight @ offset), (last.weight.numpy(), last.bias.numpy()))
     unit = np.concatenate([scale[n_gen + 1 :], scale[[n_gen]], np.ones(len(model.steady))])
     k = unit[:, None] * k / unit

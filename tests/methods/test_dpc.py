@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from ded_bench.methods.dpc.channels import Channels, Response
-from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
+from ded_bench.methods.dpc.dpc_policy import DispatchPolicy
+from ded_bench.methods.dpc.inference import CompiledStages
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance, LoadPoints
@@ -35,7 +36,7 @@ def test_compiled_twin_equals_the_torch_network(case: Case) -> None:
         arrays = channels.start, channels.free_response, channels.sequence, channels.constants
         expected = network(*(torch.as_tensor(a, dtype=torch.float32) for a in arrays)).numpy()
     state = {name: value.numpy() for name, value in network.state_dict().items()}
-    shapes = weight_shapes(case)
+    shapes = DispatchPolicy.shapes(case, {})
     assert [(name, value.shape) for name, value in state.items()] == list(shapes.items())
     twin = CompiledStages(case, response_of(case), state)
     np.testing.assert_allclose(twin(channels), expected, rtol=1e-4, atol=1e-4)

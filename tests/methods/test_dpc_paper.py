@@ -9,14 +9,7 @@ import pytest
 import torch
 
 from ded_bench.files.errors import InputError
-from ded_bench.methods.dpc_paper.paper_policy import (
-    FILTERS,
-    WINDOWS,
-    PaperPolicy,
-    channels,
-    n_channels,
-    weight_shapes,
-)
+from ded_bench.methods.dpc_paper.paper_policy import FILTERS, WINDOWS, PaperPolicy, channels, n_channels
 from ded_bench.methods.dpc_paper.paper_training import (
     BATCH,
     LEARNING_RATE,
@@ -74,7 +67,7 @@ def test_the_policy_is_its_torch_network(case: Case, count: int) -> None:
     with torch.inference_mode():
         expected = network(torch.as_tensor(seen, dtype=torch.float32)).double().numpy()
     weights = weights_of(network)
-    shapes = weight_shapes(n_channels(case), len(case.generators))
+    shapes = PaperPolicy.shapes(case, {})
     assert [(name, value.shape) for name, value in weights.items()] == list(shapes.items())
     schedules = PaperPolicy(Scope(case, "NO", HORIZON), weights, {})(instances)
     # two orders of adding up a few hundred float32 products of order one

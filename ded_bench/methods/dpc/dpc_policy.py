@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ded_bench.methods.dpc.channels import Channels, Response
-from ded_bench.methods.dpc.inference import CompiledStages, weight_shapes
+from ded_bench.methods.dpc.channels import Channels, Response, n_channels
+from ded_bench.methods.dpc.inference import DILATIONS, EMBEDDING, STAGES, WIDTH, CompiledStages
 from ded_bench.methods.dpc.refinement import BoundKeeper, Refiner
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Artifact, Settings, Solver, model_artifact
@@ -63,8 +63,26 @@ class DispatchPolicy(TrainedPolicy):
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-        """See `TrainedPolicy.shapes`."""
-        return weight_shapes(case)
+        """See `TrainedPolicy.shapes`; in the order of a StagedNetwork's state dict."""
+        n_gen, (n_sequence, n_constants), n_blocks = len(case.generators), n_channels(case), len(DILATIONS)
+        n_seen = n_gen + 2 * (n_gen + 1) + n_sequence
+        stage: dict[str, tuple[int, ...]] = {
+            "sequence_mean": (n_seen,),
+            "sequence_scale": (n_seen,),
+            "constants_mean": (n_constants,),
+            "constants_scale": (n_constants,),
+        }
+        layers: dict[str, tuple[int, ...]] = {
+            "first": (WIDTH, n_seen, 1, 3),
+            "embed.0": (EMBEDDING, n_constants),
+            "embed.2": (WIDTH * (1 + n_blocks), EMBEDDING),
+            **{f"spread.{i}": (WIDTH, WIDTH, 1, 3) for i in range(n_blocks)},
+            **{f"mix.{i}": (WIDTH, WIDTH, 1, 1) for i in range(n_blocks)},
+            "last": (n_gen, WIDTH, 1, 1),
+        }
+        for name, shape in layers.items():
+            stage |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
+        return {f"stages.{i}.{name}": shape for i in range(STAGES) for name, shape in stage.items()}
 
 
 def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ded_bench.methods.dpc.channels import Channels, Response, n_channels
+from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, copy_row, inlined
@@ -61,29 +61,6 @@ class CompiledStages:
             )
             track(p_gen.swapaxes(1, 2), *self._limits)
         return p_gen.swapaxes(1, 2)
-
-
-def weight_shapes(case: Case) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a StagedNetwork's weights, in the order of its state dict."""
-    n_gen, (n_sequence, n_constants), n_blocks = len(case.generators), n_channels(case), len(DILATIONS)
-    n_seen = n_gen + 2 * (n_gen + 1) + n_sequence
-    stage: dict[str, tuple[int, ...]] = {
-        "sequence_mean": (n_seen,),
-        "sequence_scale": (n_seen,),
-        "constants_mean": (n_constants,),
-        "constants_scale": (n_constants,),
-    }
-    layers: dict[str, tuple[int, ...]] = {
-        "first": (WIDTH, n_seen, 1, 3),
-        "embed.0": (EMBEDDING, n_constants),
-        "embed.2": (WIDTH * (1 + n_blocks), EMBEDDING),
-        **{f"spread.{i}": (WIDTH, WIDTH, 1, 3) for i in range(n_blocks)},
-        **{f"mix.{i}": (WIDTH, WIDTH, 1, 1) for i in range(n_blocks)},
-        "last": (n_gen, WIDTH, 1, 1),
-    }
-    for name, shape in layers.items():
-        stage |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
-    return {f"stages.{i}.{name}": shape for i in range(STAGES) for name, shape in stage.items()}
 
 
 def _matrices(weights: Mapping[str, np.ndarray], stage: str, half: Array) -> StageWeights:

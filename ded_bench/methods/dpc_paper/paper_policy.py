@@ -44,8 +44,15 @@ class PaperPolicy(TrainedPolicy):
 
     @staticmethod
     def shapes(case: Case, training: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-        """See `TrainedPolicy.shapes`."""
-        return weight_shapes(n_channels(case), len(case.generators))
+        """See `TrainedPolicy.shapes`; in the order of a PaperNetwork's state dict."""
+        inputs, n_gen = n_channels(case), len(case.generators)
+        shapes: dict[str, tuple[int, ...]] = {"mean": (inputs, 1), "scale": (inputs, 1)}
+        shapes |= {"p_min": (n_gen, 1), "p_max": (n_gen, 1)}
+        sizes = (inputs, FILTERS, FILTERS, n_gen)
+        for i, window in enumerate(WINDOWS):
+            place = f"layers.{3 * i + 1}"  # after the padding; a ReLU follows
+            shapes |= {f"{place}.weight": (sizes[i + 1], sizes[i], window), f"{place}.bias": (sizes[i + 1],)}
+        return shapes
 
 
 artifacts = PaperPolicy.artifacts
@@ -96,19 +103,8 @@ def channels(network: Network, instances: Sequence[Instance], knots: Array) -> A
     return np.concatenate([p_load.transpose(0, 2, 1), repeated], axis=1)
 
 
-def weight_shapes(n_channels: int, n_gen: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a PaperNetwork's weights, in the order of its state dict."""
-    shapes: dict[str, tuple[int, ...]] = {"mean": (n_channels, 1), "scale": (n_channels, 1)}
-    shapes |= {"p_min": (n_gen, 1), "p_max": (n_gen, 1)}
-    sizes = (n_channels, FILTERS, FILTERS, n_gen)
-    for i, window in enumerate(WINDOWS):
-        place = f"layers.{3 * i + 1}"  # after the padding; a ReLU follows
-        shapes |= {f"{place}.weight": (sizes[i + 1], sizes[i], window), f"{place}.bias": (sizes[i + 1],)}
-    return shapes
-
-
 class NumpyPaperNetwork:
-    """The same function as a PaperNetwork with these weights (see `weight_shapes`)."""
+    """The same function as a PaperNetwork with these weights (see `PaperPolicy.shapes`)."""
 
     def __init__(self, state: Mapping[str, np.ndarray]) -> None:
         self._mean, self._scale = state["mean"], 1.0 / state["scale"]

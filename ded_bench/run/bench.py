@@ -21,7 +21,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -125,11 +125,8 @@ def bench(
             order = present[shift:] + present[:shift]
             for job in tqdm(order, unit="turn", disable=None, desc=f"bench, round {round_}"):
                 if (round_, *own[job].job, instances[-1].id) not in rows:
-                    calls = _ask(pools[job], case, job, warm_up, instances)
-                    for instance, call in zip([warm_up, *instances], calls, strict=True):
-                        number = WARM_UP if instance is warm_up else round_
-                        told: Told = {"run": run, "round": number, "instance": instance.id} | call
-                        made = dataclasses.replace(own[job], **told)
+                    row = dataclasses.replace(own[job], run=run, round=round_)
+                    for made in _turn(pools[job], case, job, row, warm_up, instances):
                         rows.setdefault(made.key, made)  # the first turn's warm-up stands
                     TIMING.write(partial, rows.values())
                 if round_ >= rounds_for(job):
@@ -147,6 +144,16 @@ def _complete(path: Path, run: str, jobs: set[tuple[str, str, str, str]]) -> lis
         problem = f"holds a run that timed others, too ({method} in {regime}); write elsewhere"
         raise InputError(path, "method", problem)
     return there if {row.run for row in there} == {run} else []
+
+
+def _turn(
+    pool: Workers, case: Case, job: Job, row: TimingRow, warm_up: Instance, instances: Sequence[Instance]
+) -> Iterator[TimingRow]:
+    """The rows of one turn of a job, made from one with its run and round: the warm-up's, then the others."""
+    calls = _ask(pool, case, job, warm_up, instances)
+    for instance, call in zip([warm_up, *instances], calls, strict=True):
+        number = WARM_UP if instance is warm_up else row.round
+        yield dataclasses.replace(row, round=number, instance=instance.id, **call)
 
 
 def measure(case: Case, job: Job, path: Path) -> list[TimingRow]:

@@ -36,6 +36,7 @@ class Forecast:
     def instance(self, start: float, horizon_s: float, initial: Initial, name: str) -> Instance:
         """An instance of this name that begins at `start`, s of the scenario, in a state (instance/2)."""
         points, ends = _distinct(self.times, self.values, start, horizon_s)
+        points.flags.writeable = False
         # Of parts that were checked: to do it again would take as long as the plant.
         loads = [LoadPoints.model_construct(points=points[i:j]) for i, j in itertools.pairwise(ends.tolist())]
         return Instance.model_construct(

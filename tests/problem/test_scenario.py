@@ -15,7 +15,7 @@ from ded_bench.plants.plant import servable
 from ded_bench.problem.benchmark import Manifest, scenario_files, write_scenarios
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.forecast import forecast
-from ded_bench.problem.instance import Instance
+from ded_bench.problem.instance import Instance, LoadPoints
 from ded_bench.problem.sampling import FLUCTUATION, LOAD_RANGE, sample_scenario
 from ded_bench.problem.scenario import QUALITIES, Scenario, load_scenarios
 
@@ -109,6 +109,9 @@ def test_points_of_an_instance_are_the_forecast(known, threebus, quality):
     times = np.linspace(0.0, 6.0, 601)
     np.testing.assert_allclose(points.at(times), loads.at(7.31 + times)[:, 0], atol=1e-14)
     assert points.points[-1][0] == 6.0
+    for given in (points, LoadPoints.model_validate(points.model_dump())):
+        with pytest.raises(ValueError, match="read-only"):
+            given.points[0, 1] = 0.0
 
 
 @pytest.mark.parametrize(

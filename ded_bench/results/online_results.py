@@ -51,7 +51,8 @@ class OnlineRow(Judgement, Made):
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
     that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
     method's own word, exceeds limits as little as it can. `method_s` and `loop_s` are wall-clock seconds of
-    the plans, from measurements to answers, and of all else.
+    the plans, from measurements to answers, and of all else; `plant_s` of the latter are the
+    plant's simulation.
     """
 
     scenario: PlainName
@@ -75,6 +76,7 @@ class OnlineRow(Judgement, Made):
     limit_s: float | None = None
     method_s: float | None = None
     loop_s: float | None = None
+    plant_s: float | None = None
     latency_source: str = ""  # timing, zero or given
     model: PlainName = ""
     policy: PlainName = ""

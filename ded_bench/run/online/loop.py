@@ -139,6 +139,7 @@ class LoopOutcome(NamedTuple):
     trajectory: Trajectory
     answers: list[Planned]
     plans_s: float  # from measurements to answers, all together, s of the clock
+    plant_s: float  # while the plant went on, likewise
 
 
 @compiled
@@ -184,11 +185,14 @@ class History:
         self.omega, self.p_set, self.p_gen = np.empty((3, len(grid), len(case.generators)))
         self.p_slack, self.agc = np.empty((2, len(grid)))
         self.p_set[0] = first.p_initial(case)
+        self.plant_s = 0.0  # what the plant took to go on, s of the clock
 
     def go_on(self, p_set: Array) -> None:
         """Go on under set-points at the present point and those after it, shape (n, n_gen), pu."""
         k = slice(self.now, self.now + len(p_set))
+        started = time.perf_counter()
         piece = self.ahead(p_set, self.p_load[k])
+        self.plant_s += time.perf_counter() - started
         self.omega[k], self.p_set[k], self.p_gen[k] = piece.omega, p_set, piece.p_gen
         self.p_slack[k], self.agc[k], self.state = piece.p_slack, piece.agc, piece.end
         self.now += len(p_set) - 1
@@ -255,7 +259,7 @@ class _Loop:
             self._take(answer, due if self.options.predict else decision)
             decision = max(decision + period, due)
         self._go_on(last)
-        return LoopOutcome(self.history.trajectory(), self.asked, self.plans_s)
+        return LoopOutcome(self.history.trajectory(), self.asked, self.plans_s, self.history.plant_s)
 
     def _decide(self, lag: int) -> Planned:
         """Ask for a plan from `lag` steps after now, or from now on."""

@@ -163,7 +163,7 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
         unforeseen = None
     started = time.perf_counter()
     planner = Planner(case, asked.regime, asked.method, o.settings, asked.limit_s or LIMIT_S)
-    trajectory, answers, method_s = run_loop(case, o.scenario, planner, o.options, plant)
+    trajectory, answers, method_s, plant_s = run_loop(case, o.scenario, planner, o.options, plant)
     judgement = judge_operation(case, o.scenario, trajectory, asked.regime)
     keep_trajectory(files.trajectory(asked.key), trajectory)
     missing = [answer for answer in answers if answer.schedule is None]
@@ -185,6 +185,7 @@ def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> Onlin
         warm_used=any(answer.warm for answer in answers),
         method_s=method_s,
         loop_s=loop_s,
+        plant_s=plant_s,
     )
 
 

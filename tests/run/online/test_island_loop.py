@@ -168,7 +168,7 @@ def test_rows_are_the_same_to_the_last_bit(island, scenario, tmp_path):
     )
     files = [OnlineResults(tmp_path / name) for name in "ab"]
     first, again = (operate(island, asked, results, look_back=False)[0] for results in files)
-    varying = {"method_s": None, "loop_s": None, "date": ""}
+    varying = {"method_s": None, "loop_s": None, "plant_s": None, "date": ""}
     assert dataclasses.replace(first, **varying) == dataclasses.replace(again, **varying)
     assert first.error == ""
     assert first.increase_percent is None

@@ -75,7 +75,7 @@ class RealTimeSolver:
     time_limit_s: float | None = None  # of a step
 
     def __call__(self, instance: Instance) -> Solution:
-        """Solve by two steps; the first, from the static dispatch, is `setup_s`."""
+        """Solve by two steps; the first, from the static dispatch, is `setup_s`. Claims nothing."""
         bounds = self._bounds
         if self.case.slack is None:  # condensed programs leave open what they may
             bounds = bounds.tightened(part=SOFT_TOLERANCE)
@@ -84,7 +84,10 @@ class RealTimeSolver:
         if first.schedule is None:
             return first
         second = self._step(bounds, instance, knots, Plan(first.schedule))
-        return dataclasses.replace(second, setup_s=(first.build_s or 0.0) + (first.solve_s or 0.0))
+        setup_s = (first.build_s or 0.0) + (first.solve_s or 0.0)
+        if second.status == Status.INFEASIBLE and second.schedule is not None:  # of one linear model
+            second = dataclasses.replace(second, status=Status.FEASIBLE, error="")
+        return dataclasses.replace(second, setup_s=setup_s)
 
     def solve(self, instance: Instance, last: Solution | None = None) -> Solution:
         """Solve in operation: `Infeasible` comes with the schedule that the penalty makes cheapest.
@@ -141,8 +144,7 @@ class RealTimeSolver:
         return StateEstimate(self.surrogate.plant)
 
     def _step(self, bounds: Bounds, instance: Instance, knots: Indices, plan: Plan) -> Solution:
-        solution = solve_on_surrogate(
-            self.case, self.surrogate, instance, bounds, knots, self.time_limit_s, plan=plan
-        )
+        given = self.case, self.surrogate, instance, bounds, knots, self.time_limit_s
+        solution = solve_on_surrogate(*given, plan=plan)
         is_claimed = solution.status == Status.OPTIMAL  # of a penalty, roughly
         return dataclasses.replace(solution, status=Status.FEASIBLE) if is_claimed else solution

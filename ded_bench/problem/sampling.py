@@ -26,8 +26,8 @@ VALIDATION_SEED = POLICY_SEED + 500_000
 #: Scenarios are drawn from master seeds from here on.
 SCENARIO_SEED = 4_000_000
 DECIMALS = 9
-#: How often one is drawn before the case's ranges are taken to be wrong.
-ATTEMPTS = 1000
+#: How often one is drawn before the case's ranges are taken to be wrong; a scenario's most horizons.
+ATTEMPTS, MOST_HORIZONS = 1000, 600
 #: Scenarios of a case, and their duration, s, unless told otherwise.
 SCENARIOS, DURATION_S = 20, 300.0
 #: Loads of scenarios stay within this part of their nominal value, but for fluctuation and drift.
@@ -178,8 +178,10 @@ def sample_scenario(
             all of it, loads linear between points ISLAND_STEP_S apart; None: all can be.
 
     Raises:
-        InputError: the case's ranges leave hardly anything to draw.
+        InputError: the case's ranges leave hardly anything to draw, or its horizon is far too short.
     """
+    if duration_s > MOST_HORIZONS * case.sampling.horizon_s:
+        raise InputError(f"case {case.id}", "horizon_s", f"is too short for scenarios of {duration_s:g} s")
     numbers = (SCENARIO_SEED + seed, index) + ((round(HOUR_S),) if duration_s >= HOUR_S else ())
     generator = np.random.default_rng(np.random.SeedSequence(numbers))
     for _ in range(ATTEMPTS):

@@ -51,8 +51,7 @@ class OnlineRow(Judgement, Made):
     the time they took effect; `warm` that the method might start from the plan in force, and `warm_used`
     that it takes one. `failed` counts answers without a schedule, `infeasible` those with one that, by the
     method's own word, exceeds limits as little as it can. `method_s` and `loop_s` are wall-clock seconds of
-    the plans, from measurements to answers, and of all else; `plant_s` of the latter are the
-    plant's simulation.
+    the plans, from measurements to answers, and of all else, `plant_s` those of the plant among the latter.
     """
 
     scenario: PlainName

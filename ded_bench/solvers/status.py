@@ -22,7 +22,7 @@ class Status(enum.StrEnum):
         return {
             Status.OPTIMAL: "the solver reports an optimum within its tolerances",
             Status.FEASIBLE: "the method gives a schedule without a claim of optimality",
-            Status.INFEASIBLE: "the solver reports that no schedule meets every constraint",
+            Status.INFEASIBLE: "the solver reports that no schedule of its kind meets every constraint",
             Status.TIME_LIMIT: "the time limit passed before the solver finished",
             Status.FAILED: "the method ended without a schedule",
             Status.POLICY: "a trained policy was evaluated; no solver ran",

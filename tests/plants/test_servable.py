@@ -12,7 +12,7 @@ from ded_bench.plants.plant import plant_of, servable
 from ded_bench.problem.case import Case
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
-from ded_bench.problem.sampling import drawn_with_redraws, sample_instances
+from ded_bench.problem.sampling import drawn_with_redraws, sample_instances, sample_scenario
 
 COUNT = 200
 
@@ -91,3 +91,9 @@ def test_check_servable_names_source_and_field(case, quiet_instance):
     with pytest.raises(InputError, match=rf"my\.json: load: loads at t = {horizon:g} s cannot be served"):
         check_servable(case, cut_off, "my.json")
     check_servable(case, quiet_instance(case, load=_ramp(case, start=horizon + 1, rate=-40.0)), "my.json")
+
+
+def test_scenarios_of_countless_horizons_are_refused(weak: Case) -> None:
+    """Every horizon has a ramp for each load: it would draw for hours."""
+    with pytest.raises(InputError, match=r"horizon_s: is too short for scenarios of 1e\+06 s"):
+        sample_scenario(weak, 0, 0, duration_s=1e6)

@@ -146,5 +146,4 @@ def cost_and_excess(
     matrix, limit = (torch.from_numpy(part).to(power) for part in (bounds.matrix, bounds.limit))
     beyond = (omega @ matrix.T).abs() - limit
     during = beyond[:, :, torch.from_numpy(~bounds.at_end)].amax(dim=(1, 2))
-    worst = torch.maximum(during, beyond[:, -1].amax(dim=1))
-    return cost, worst.clamp(min=0.0) / (2 * np.pi)
+    return cost, torch.maximum(during, beyond[:, -1].amax(dim=1)).clamp(min=0.0) / (2 * np.pi)

@@ -85,8 +85,7 @@ class SlpSolver:
         bounds = self.case.bounds(self.regime)
         parts = _OnPlant(self.case, instance, bounds, points, deadline, soft, near is not None)
         if is_reachable(self.case, instance, points):
-            start = static_dispatch(self.case, instance) if near is None else near
-            end = parts.run(start)
+            end = parts.run(static_dispatch(self.case, instance) if near is None else near)
         else:
             end = End(Status.INFEASIBLE, None, None, 0, "")
         status, schedule = parts.verdict(end)

@@ -381,8 +381,7 @@ class KnotProgram:
     def _all_knots(self) -> sp.csc_matrix:
         row = np.arange(self._held.size).reshape(self._held.shape)
         outputs = np.broadcast_to(self.model.output, (self._n, *self.model.output.shape))
-        every = self._columns.matrix(row.size, [(row, self._columns.x, outputs)])
-        return every[np.flatnonzero(self._held)]
+        return self._columns.matrix(row.size, [(row, self._columns.x, outputs)])[np.flatnonzero(self._held)]
 
     def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
         rows = self.model.output_rows(limits[:, 0], limits[:, 1])

@@ -158,8 +158,7 @@ def solve_with_rows_added(
         has_none = answer.status in (Status.FAILED, Status.INFEASIBLE)  # or PIQP finds none
         if not rows.soft and (infeasible or has_none):
             iterations += 0 if infeasible else answer.iterations
-            left = deadline - time.perf_counter()
-            answer, widened = program.solve_relaxed(places, left)
+            answer, widened = program.solve_relaxed(places, deadline - time.perf_counter())
             infeasible = infeasible or float(widened.max()) > rows.open
         iterations += answer.iterations
         if answer.status != Status.OPTIMAL:

@@ -90,5 +90,4 @@ def _deviation(case: Case, instance: Instance) -> Array:
         return np.zeros(len(case.generators))
     network = Network(case)
     p_load = instance.p_load(case, np.zeros(1))[0]
-    equilibrium = network.power_flow(instance.p_initial(case), p_load)
-    return np.asarray(theta - equilibrium[network.generators])
+    return np.asarray(theta - network.power_flow(instance.p_initial(case), p_load)[network.generators])

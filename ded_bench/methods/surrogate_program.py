@@ -67,8 +67,7 @@ def solve_on_surrogate(
         program = KnotProgram(case, instance, bounds, model, plan)
         built = time.perf_counter()
         is_near = plan is not None and plan.last is not None
-        none = np.zeros(len(points) - 1)
-        limits = program.near(program.model.omega, widened=none) if is_near else set()
+        limits = program.near(program.model.omega, widened=np.zeros(len(points) - 1)) if is_near else set()
         return solve_with_rows_added(program, limits, rows, deadline)
 
     if not is_reachable(case, instance, points):

@@ -18,6 +18,8 @@ _OPTIONS: dict[str, Any] = {
     "primal_feasibility_tolerance": 1e-9,
     "simplex_scale_strategy": 0,  # columns are powers in pu as they are: a quarter less time on islands
 }
+#: For a program that round-off spoils: as it stands, and scaled.
+_CAREFUL: dict[str, Any] = {"presolve": "off", "simplex_scale_strategy": 2}
 _STATUS = {
     highspy.HighsModelStatus.kOptimal: Status.OPTIMAL,
     highspy.HighsModelStatus.kInfeasible: Status.INFEASIBLE,
@@ -50,7 +52,13 @@ def solve_form(form: FreeForm, time_limit_s: float = np.inf, start: Basis | None
         begun.valid = begun.alien = True
         highs.setBasis(begun)
     highs.run()
-    found, iterations = highs.getModelStatus(), int(highs.getInfo().simplex_iteration_count)
+    iterations = int(highs.getInfo().simplex_iteration_count)
+    if (found := highs.getModelStatus()) not in _STATUS:
+        highs.clearSolver()
+        for name, value in _CAREFUL.items():
+            highs.setOptionValue(name, value)
+        highs.run()
+        found, iterations = highs.getModelStatus(), iterations + int(highs.getInfo().simplex_iteration_count)
     status, x = _STATUS.get(found, Status.FAILED), np.array(highs.getSolution().col_value)
     ended = highs.getBasis()
     basis = Basis(np.array(ended.col_status, dtype=object), np.array(ended.row_status, dtype=object))

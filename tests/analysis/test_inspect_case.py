@@ -62,8 +62,7 @@ def test_draws_that_cannot_be_served_or_collapse_are_counted(threebus: Case, alt
 
 def test_an_island_has_its_modes_and_breaks_its_bounds_under_static_dispatch() -> None:
     """ANDES has, at the nominal point, 0.62 Hz with 8.6 % between areas, 0.10 Hz with 35 % of frequency."""
-    case = Case.load("two-area-agc")
-    found = check_case(case, 4)
+    found = check_case(Case.load("two-area-agc"), 4)
     modes = list(zip(found.frequency_hz, 100 * found.damping, strict=True))
     for frequency, damping in ((0.62, 8.6), (0.11, 35.0)):
         assert any(abs(f - frequency) < 5e-3 and abs(d - damping) < 0.5 for f, d in modes)

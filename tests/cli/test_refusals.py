@@ -103,8 +103,7 @@ def test_a_versioned_case_is_not_changed_by_chance(tmp_path: Path, capsys) -> No
         assert "--out" in line
         assert "--force" in line
         assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
-        lost = sorted(place.rglob("*0001.json"))[0]
-        lost.unlink()
+        sorted(place.rglob("*0001.json"))[0].unlink()
         assert main([*draw, "--count", str(wanted)]) == 0  # the same again: made whole
         assert {path: path.read_bytes() for path in place.rglob("*.json")} == before
         assert main([*draw, "--count", "3", "--seed", "7", "--out", str(tmp_path / command)]) == 0

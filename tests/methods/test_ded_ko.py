@@ -93,8 +93,7 @@ def test_impossible_instances_are_reported_as_such(method, case: Case, koopman: 
         assert solution.schedule is None
         assert solution.solver_objective is None
         assert solution.error
-    again = prepared(method, case, koopman, "NO")(instance)
-    assert again.status == Status.OPTIMAL
+    assert prepared(method, case, koopman, "NO")(instance).status == Status.OPTIMAL
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -217,5 +217,4 @@ def test_the_states_that_move():
     """Classical machines have two and the governor's; a machine without exciter has no field voltage."""
     count = {grid: len(system_of(grid, island=True).moving) for grid in GRIDS}
     assert count == {"two-area": 4 * 13, "39bus": 10 * 13, "68bus": 12 * 13 + 4 * 10, "140bus": 372}
-    infinite = system_of("39bus", island=False)
-    assert len(infinite.moving) == 128
+    assert len(system_of("39bus", island=False).moving) == 128

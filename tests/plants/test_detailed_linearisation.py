@@ -71,8 +71,7 @@ def test_rows_are_those_of_the_rollout(made):
 def test_a_step_is_the_exponential(made):
     plant, instance, _, model = made
     system = plant.system
-    point = system.network.nominal()
-    modes = system.modes(point)
+    modes = system.modes(system.network.nominal())
     moving = np.exp(modes * instance.dt_s)
     mapped = np.linalg.eigvals(model.step.f[0])
     for mode in moving[np.abs(modes) < 30.0]:

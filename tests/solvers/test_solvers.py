@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import highspy
 import numpy as np
 import pyomo.environ as pyo
 import pytest
@@ -57,6 +58,15 @@ def test_programs_given_by_arrays(solve) -> None:
     impossible = solve(dataclasses.replace(FORM, low=np.array([5.0])))
     assert impossible.status in (Status.INFEASIBLE, Status.FAILED)
     assert impossible.message
+
+
+def test_what_round_off_spoils_is_solved_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of HiGHS's status `Unknown`: without presolve and scaled, the answer is the same."""
+    told, first = highspy.Highs.getModelStatus, [highspy.HighsModelStatus.kUnknown]
+    monkeypatch.setattr(highspy.Highs, "getModelStatus", lambda self: first.pop() if first else told(self))
+    answer = highs.solve_form(FORM)
+    assert (answer.status, answer.message, first) == (Status.OPTIMAL, "Optimal", [])
+    np.testing.assert_allclose(answer.x, [2.0, 1.0], atol=1e-9)
 
 
 def rosenbrock() -> pyo.ConcreteModel:

@@ -53,8 +53,7 @@ class PaperNetwork(nn.Module):
     def forward(self, channels: Tensor) -> Tensor:
         """Map (batch, n_channels, n_knots) to powers, (batch, n_knots, n_gen), pu, within bounds."""
         out = self.layers((channels - self.mean) / self.scale)
-        power = self.p_min + 0.5 * (1.0 + torch.tanh(out)) * (self.p_max - self.p_min)
-        return power.transpose(1, 2)
+        return (self.p_min + 0.5 * (1.0 + torch.tanh(out)) * (self.p_max - self.p_min)).transpose(1, 2)
 
 
 class Batch(NamedTuple):

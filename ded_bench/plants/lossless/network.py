@@ -103,8 +103,7 @@ class Network:
 
     def injections(self, theta: Array) -> Array:
         """f(θ) at every bus, shape (..., n_bus), pu; sums to zero since lines are lossless."""
-        flow = np.sin(theta @ self.incidence.T) * self.coupling
-        return np.asarray(flow @ self.incidence)
+        return np.asarray((np.sin(theta @ self.incidence.T) * self.coupling) @ self.incidence)
 
     def load_injections(self, p_load: Array) -> Array:
         """Injections at the algebraic buses, shape (..., n_algebraic): loads, and zero at junctions."""

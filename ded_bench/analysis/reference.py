@@ -103,8 +103,7 @@ def result_lines(rows: pd.DataFrame, timing: pd.DataFrame, paper: Paper, referen
     """
     ours = {tuple(line[name] for name in GROUP): line for line in records(summary(rows))}
     usual = {key[:2]: key for key in ours if title(*key[1:]) == title(key[1])}
-    theirs = paper.rows()
-    beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in theirs.items()}
+    beside = {usual.get(place, (*place, DEFAULT, "")): numbers for place, numbers in paper.rows().items()}
     times = {tuple(line[name] for name in GROUP): line for line in records(timing)}
     lines = []
     for key in sorted(dict.fromkeys((*beside, *ours)), key=lambda key: str(key[0])):

@@ -42,8 +42,7 @@ def title(method: str, settings: str = DEFAULT, model: str = "") -> str:
 
 def titled(frame: pd.DataFrame) -> pd.DataFrame:
     """The frame with a column `title` of its lines."""
-    keys = frame[GROUP[1:]].itertuples(index=False, name=None)
-    return frame.assign(title=[title(*key) for key in keys])
+    return frame.assign(title=[title(*key) for key in frame[GROUP[1:]].itertuples(index=False, name=None)])
 
 
 def named(frame: pd.DataFrame) -> pd.DataFrame:

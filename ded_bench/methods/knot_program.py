@@ -120,8 +120,7 @@ class KnotProgram:
             pieces = before._columns.pieces
         self._columns: KnotColumns = KnotColumns(case, instance, model, self.condensed, pieces)
         self._output_rows = OutputRows(model)
-        generation = self._columns.generation[1:]
-        self._all_costs = (generation if self.condensed else self._columns.cost).sum()
+        self._all_costs = (self._columns.generation[1:] if self.condensed else self._columns.cost).sum()
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded

@@ -330,8 +330,7 @@ def _improve(
     weights[2] = setting[2] * setting[4] / (limits.bound**2 * points)
     weights[3] = setting[3] * setting[5] * per_unit / points
     modes, change = given.mean.powers[b], np.empty_like(p)
-    modal = np.dot(gradient, modes)
-    modal_change(given.mean.maps[b], given.mean.outputs[b], weights, modal, change)
+    modal_change(given.mean.maps[b], given.mean.outputs[b], weights, np.dot(gradient, modes), change)
     step = np.dot(change, modes.T)
     for j in range(p.shape[0]):
         for g in range(p.shape[1]):

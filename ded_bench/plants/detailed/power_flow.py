@@ -162,8 +162,7 @@ def port_network(network: Any, machines: Any, loads: Collection[str] = ()) -> Po
         bus.pd + 1j * bus.qd - (0.0 if bus.id in stations else bus.pg + 1j * bus.qg) for bus in network.buses
     ])  # fmt: skip
     drawing = [i for i, bus in enumerate(network.buses) if drawn[i] != 0.0 or bus.id in loads]
-    bare = sorted({index[bus] for bus in stations} - set(drawing))
-    ports = np.array([*drawing, *bare])
+    ports = np.array([*drawing, *sorted({index[bus] for bus in stations} - set(drawing))])
     inner = np.setdiff1d(np.arange(len(index)), ports)
     spread = np.zeros((len(index), len(ports)), dtype=complex)
     spread[ports] = np.eye(len(ports))

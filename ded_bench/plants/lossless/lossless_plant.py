@@ -103,8 +103,7 @@ class LosslessPlant:
         advanced from grid point to grid point by the exact map of that equation (first-order hold).
         """
         network, n_gen = self.network, len(self.case.generators)
-        middle = trajectory.states[(points[:-1] + points[1:]) // 2]
-        stiffness = network.linearise(middle).stiffness
+        stiffness = network.linearise(trajectory.states[(points[:-1] + points[1:]) // 2]).stiffness
         dt_s = float(trajectory.t[1] - trajectory.t[0])
         step = _one_step(stiffness / network.m[:, None], network.d / network.m, 1.0 / network.m, dt_s)
         slack = -stiffness.sum(axis=1)

@@ -203,10 +203,10 @@ class KnotProgram:
                 if answer.status == Status.FAILED and self._is_sparse:
                     other = solve_form(form, max(deadline - time.perf_counter(), 0.0), staged=True)
                     answer = replace(other, iterations=answer.iterations + other.iterations)
-            if answer.status == Status.FAILED:
-                other = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
-                version = f"{answer.version}, {other.version}"
-                answer = replace(other, iterations=answer.iterations + other.iterations, version=version)
+                if answer.status == Status.FAILED:
+                    other = solve_by_highs(form, max(deadline - time.perf_counter(), 0.0))
+                    version, iterations = f"{answer.version}, {other.version}", answer.iterations
+                    answer = replace(other, iterations=iterations + other.iterations, version=version)
             if answer.status != Status.OPTIMAL:
                 return answer, np.zeros(self._n)
             return replace(answer, x=answer.x[place]), answer.x[widening]

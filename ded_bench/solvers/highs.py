@@ -18,7 +18,8 @@ _OPTIONS: dict[str, Any] = {
     "primal_feasibility_tolerance": 1e-9,
     "simplex_scale_strategy": 0,  # columns are powers in pu as they are: a quarter less time on islands
 }
-#: For a program that round-off spoils: as it stands, and scaled.
+#: For a program that round-off spoils: as it stands, and scaled. Of 2,495 programs of `ded-rti` on validation
+#: draws of two-area-agc 15 were such; all of them have an optimum so, nine if merely begun anew.
 _CAREFUL: dict[str, Any] = {"presolve": "off", "simplex_scale_strategy": 2}
 _STATUS = {
     highspy.HighsModelStatus.kOptimal: Status.OPTIMAL,

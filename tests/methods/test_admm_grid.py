@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods.admm.modal_grid import MISMATCH, SMALLEST_COST
-from ded_bench.methods.admm.problems import POINTS, problems_of, sampled
+from ded_bench.methods.admm.coarse_dispatch import SMALLEST_COST
+from ded_bench.methods.admm.modal_grid import MISMATCH
+from ded_bench.methods.admm.problems import problems_of, sampled
 from ded_bench.methods.stacked_instances import load_segments
 from ded_bench.plants.plant import simulate
 from ded_bench.problem.case import Case
@@ -84,18 +85,18 @@ def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_first_schedules_follow_a_dispatch_within_ramps(name: str) -> None:
-    """Its cost, knot by knot, is that of linear programs; schedules start at P_0, keep bounds and ramps."""
+def test_costs_are_relative_to_a_merit_order_within_ramps(name: str) -> None:
+    """Its cost, coarse knot by coarse knot, is that of linear programs; schedules keep bounds and ramps."""
     grid = modal_grid(Case.load(name))
-    (start, _), case = started(grid, 4), grid.case
-    problems, n = start.problems, len(case.generators)
+    (start, _), case, coarse = started(grid, 4), grid.case, grid.coarse
+    problems, n, points = start.problems, len(case.generators), grid.per_interval * coarse.every
     costs = []
     for cost, before, loads in zip(
-        problems.cost, problems.p_initial, problems.load[:, ::POINTS], strict=True
+        problems.cost, problems.p_initial, problems.load[:, ::points], strict=True
     ):
         prices, found = np.append(cost[1:], [cost[0], cost[0]]), []
         for j, load in enumerate(loads.sum(axis=1)):
-            step = np.zeros(n) if j == 0 else grid.ramp
+            step = np.zeros(n) if j == 0 else coarse.ramp
             reach = np.stack(
                 [np.maximum(case.p_min, before - step), np.minimum(case.p_max, before + step)], 1
             )
@@ -109,6 +110,41 @@ def test_first_schedules_follow_a_dispatch_within_ramps(name: str) -> None:
     np.testing.assert_array_equal(start.schedule[:, 0], problems.p_initial)
     assert (np.abs(np.diff(start.schedule, axis=1)) <= grid.ramp + 1e-12).all()
     assert ((start.schedule >= case.p_min) & (start.schedule <= case.p_max))[:, 1:].all()
+
+
+@pytest.mark.parametrize("name", ["two-area", "39bus"])
+def test_first_schedules_are_nearly_the_cheapest_dispatch(name: str) -> None:
+    """Where angles turn no faster than the bound lets them: 0.2 % above the linear program."""
+    grid = modal_grid(Case.load(name), 60.0)
+    (start, _), case, coarse = started(grid, 12), grid.case, grid.coarse
+    problems, n, n_gen = start.problems, len(coarse.waves), len(case.generators)
+    points = grid.per_interval * coarse.every
+    weights, stiffness = np.append(np.ones(n - 1), 0.5) / n, np.kron(np.eye(n), grid.stiffness)
+    differences = np.kron(np.eye(n) - np.eye(n, k=-1), np.eye(n_gen))
+    shares, none = np.kron(np.eye(n), grid.stiffness.sum(axis=0)), np.zeros((n * n_gen, n))
+    found, least = [], []
+    for b in range(len(problems)):
+        base = problems.p_initial[b] + start.taken[b, ::points]
+        short = -problems.load[b, ::points].sum(axis=1) - base.sum(axis=1)
+        price, ramps, powers = problems.cost[b], np.diff(base, axis=0).ravel(), base[1:].ravel()
+        limits = [
+            (stiffness, case.p_max[None] - base[1:], base[1:] - case.p_min[None]),
+            (differences @ stiffness, np.tile(coarse.ramp, n) - ramps, np.tile(coarse.ramp, n) + ramps),
+            (differences, np.full(n * n_gen, coarse.turn), np.full(n * n_gen, coarse.turn)),
+        ]
+        rows = [np.hstack([sign * part, none]) for part, *_ in limits for sign in (1.0, -1.0)]
+        most = [np.ravel(side) for _, *sides in limits for side in sides]
+        rows += [np.hstack([-shares, -np.eye(n)]), np.hstack([shares, -np.eye(n)])]
+        cost = np.append(np.kron(weights, price[1:]) @ stiffness, price[0] * weights)
+        free = [(None, None)] * (n * n_gen) + [(0.0, None)] * n
+        program = linprog(cost, np.vstack(rows), np.concatenate([*most, -short[1:], short[1:]]), bounds=free)
+        assert program.status == 0
+        constant = float(np.kron(weights, price[1:]) @ powers)
+        schedule = start.schedule[b, coarse.every :: coarse.every]
+        drawn = -problems.load[b, ::points].sum(axis=1)[1:] - schedule.sum(axis=1)
+        found.append(weights @ (schedule @ price[1:] + price[0] * np.abs(drawn)) / start.scale[b])
+        least.append((program.fun + constant) / start.scale[b])
+    assert np.mean(found) < np.mean(least) + 2e-3
 
 
 @pytest.mark.parametrize("far", [np.inf, np.nan, 1e300])

@@ -30,7 +30,7 @@ from ded_bench.problem.sampling import POLICY_SEED
 
 #: Iterations of an answer: the fewest, and times generators on small grids, where they take less time. Where
 #: the bound on |ω| is loose, schedules are shaped by ramps, and a few iterations go almost as far.
-TIGHT, LOOSE = (14, 60), (3, 30)
+TIGHT, LOOSE = (6, 60), (3, 30)
 #: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
 RAMPING = 0.1
 #: Steps of an epoch, epochs.

@@ -1,4 +1,4 @@
-"""Problems on the time grid: of instances, and drawn for training; their first schedules."""
+"""Problems on the time grid: of instances, and drawn for training."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
-from ded_bench.problem.case import Array, Case, Indices
+from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import DECAY_S, FLUCTUATION, sample_instances
 
-#: Points of the time grid per interval between knots.
-POINTS = 4
 #: One of so many drawn problems is of the closed loop's kind.
 OPERATING = 4
 
@@ -92,69 +89,3 @@ def sampled(segments: Array, points: Array) -> Array:
                     mean = (max(u + 1.0, 0.0) ** 3 - 2.0 * max(u, 0.0) ** 3) / 6.0
                     values[b, k, i] += bend * spacing * (mean - max(u, 0.0))
     return values
-
-
-@compiled
-def ramp_limited_schedules(
-    problem: tuple[Array, Array, Array],
-    order: Indices,
-    taken: Array,
-    grid: tuple[Array, Array],
-    limits: tuple[Array, Array, Array],
-    rate: float,
-    n: int,
-) -> tuple[Array, Array]:
-    """Schedules whose steady angles go to those of the ramp-limited dispatch, at a limited rate.
-
-    That dispatch is a merit order at every knot, as in `problem.dispatch`, with powers no farther from those
-    of the knot before than ramps allow: while a cheap generator rises, a dearer one delivers the rest.
-
-    Args:
-        problem: loads at the grid points (batch, n_points, n_load), pu; costs of slack and generators
-            (batch, 1 + n_gen); P_0 (batch, n_gen), pu.
-        order: generators from the cheapest to the dearest, (batch, n_gen).
-        taken: T (L - L_0) at the grid points, (batch, n_points, n_gen), pu.
-        grid: inverse of the stiffness, and the stiffness, (n_gen, n_gen), rad/pu and pu/rad.
-        limits: of powers, from below and above, and of their change between two knots, (n_gen,), pu.
-        rate: most that an angle moves between two knots, rad.
-        n: how many knots there are.
-
-    Returns:
-        Mean cost of the dispatch over the knots, (batch,), and the schedules, (batch, n, n_gen), pu.
-    """
-    (load, cost, p_initial), (compliance, stiffness), (low, high, step) = problem, grid, limits
-    batch, n_gen = p_initial.shape
-    mean_cost, start = np.empty(batch), np.empty((batch, n, n_gen))
-    points = (load.shape[1] - 1) // (n - 1)  # of the time grid, from one knot to the next
-    least, room, dispatch = np.empty(n_gen), np.empty(n_gen), np.empty(n_gen)
-    for b in range(batch):
-        angles = np.empty((n, n_gen))
-        mean_cost[b] = 0.0
-        for g in range(n_gen):
-            dispatch[g] = start[b, 0, g] = p_initial[b, g]
-        for j in range(n):
-            reach = 0.0 if j == 0 else 1.0
-            demand = -load[b, j * points].sum()
-            for g in range(n_gen):
-                least[g] = max(low[g], dispatch[g] - reach * step[g])
-                room[g] = min(high[g], dispatch[g] + reach * step[g]) - least[g]
-                demand -= least[g]
-            price = 0.0
-            for g in order[b]:
-                raised = min(max(demand, 0.0), room[g]) if cost[b, 1 + g] < cost[b, 0] else 0.0
-                demand -= raised
-                dispatch[g] = least[g] + raised
-                price += cost[b, 1 + g] * dispatch[g]
-                angles[j, g] = dispatch[g] - p_initial[b, g] - taken[b, j * points, g]
-            mean_cost[b] += (price + cost[b, 0] * abs(demand)) / n
-        angles = np.dot(angles, compliance)
-        angles[0] = 0.0
-        for j in range(1, n):
-            for g in range(n_gen):
-                angles[j, g] = min(max(angles[j, g], angles[j - 1, g] - rate), angles[j - 1, g] + rate)
-        powers = np.dot(angles, stiffness)
-        for j in range(1, n):
-            for g in range(n_gen):
-                start[b, j, g] = powers[j, g] + p_initial[b, g] + taken[b, j * points, g]
-    track(start, low, high, step)
-    return mean_cost, start

@@ -25,7 +25,7 @@ from ded_bench.methods.admm.admm_inference import (
 from ded_bench.methods.admm.admm_policy import prepare
 from ded_bench.methods.admm.admm_training import with_margin
 from ded_bench.methods.admm.modal_kernels import SLOWEST, interval_maps, modal_change, oscillators
-from ded_bench.methods.admm.problems import problems_of
+from ded_bench.methods.admm.problems import POINTS, problems_of
 from ded_bench.methods.admm.torch_iterations import ModalChange, TorchIterations, Transposed, judged
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.solution import Settings

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods.admm.coarse_dispatch import SMALLEST_COST
-from ded_bench.methods.admm.modal_grid import MISMATCH
-from ded_bench.methods.admm.problems import problems_of, sampled
+from ded_bench.methods.admm.modal_grid import MISMATCH, SMALLEST_COST
+from ded_bench.methods.admm.problems import POINTS, problems_of, sampled
 from ded_bench.methods.stacked_instances import load_segments
 from ded_bench.plants.plant import simulate
 from ded_bench.problem.case import Case
@@ -85,26 +84,15 @@ def test_a_power_flow_without_solution_is_not_served(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_costs_are_relative_to_a_merit_order_within_ramps(name: str) -> None:
+def test_costs_are_relative_to_the_static_dispatch(name: str) -> None:
     """Its cost, coarse knot by coarse knot, is that of linear programs; schedules keep bounds and ramps."""
     grid = modal_grid(Case.load(name))
-    (start, _), case, coarse = started(grid, 4), grid.case, grid.coarse
-    problems, n, points = start.problems, len(case.generators), grid.per_interval * coarse.every
-    costs = []
-    for cost, before, loads in zip(
-        problems.cost, problems.p_initial, problems.load[:, ::points], strict=True
-    ):
-        prices, found = np.append(cost[1:], [cost[0], cost[0]]), []
-        for j, load in enumerate(loads.sum(axis=1)):
-            step = np.zeros(n) if j == 0 else coarse.ramp
-            reach = np.stack(
-                [np.maximum(case.p_min, before - step), np.minimum(case.p_max, before + step)], 1
-            )
-            slack = [(0.0, None), (0.0, None)]  # what the slack takes and gives
-            program = linprog(prices, A_eq=[[1.0] * n + [1.0, -1.0]], b_eq=[-load], bounds=[*reach, *slack])
-            before = program.x[:n]
-            found.append(program.fun)
-        costs.append(np.mean(found))
+    (start, _), case, every = started(grid, 4), grid.case, grid.coarse.every
+    problems, n, reach = start.problems, len(case.generators), np.stack([case.p_min, case.p_max], 1)
+    bounds, costs = [*reach, (0.0, None), (0.0, None)], []  # what the slack takes and gives
+    for cost, loads in zip(problems.cost, problems.load[:, :: POINTS * every].sum(axis=2), strict=True):
+        prices, rows = np.append(cost[1:], [cost[0], cost[0]]), [[1.0] * n + [1.0, -1.0]]
+        costs.append(np.mean([linprog(prices, A_eq=rows, b_eq=[-x], bounds=bounds).fun for x in loads]))
     least = SMALLEST_COST * max(1.0, n / 2)
     np.testing.assert_allclose(start.scale, np.maximum(costs, least), rtol=1e-9)
     np.testing.assert_array_equal(start.schedule[:, 0], problems.p_initial)
@@ -118,7 +106,7 @@ def test_first_schedules_are_nearly_the_cheapest_dispatch(name: str) -> None:
     grid = modal_grid(Case.load(name), 60.0)
     (start, _), case, coarse = started(grid, 12), grid.case, grid.coarse
     problems, n, n_gen = start.problems, len(coarse.waves), len(case.generators)
-    points = grid.per_interval * coarse.every
+    points = POINTS * coarse.every
     weights, stiffness = np.append(np.ones(n - 1), 0.5) / n, np.kron(np.eye(n), grid.stiffness)
     differences = np.kron(np.eye(n) - np.eye(n, k=-1), np.eye(n_gen))
     shares, none = np.kron(np.eye(n), grid.stiffness.sum(axis=0)), np.zeros((n * n_gen, n))

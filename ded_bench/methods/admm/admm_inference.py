@@ -27,6 +27,7 @@ from ded_bench.methods.admm.modal_kernels import (
     swing,
     swing_adjoint,
 )
+from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
 from ded_bench.problem.compiled import compiled, copy_row, inlined
@@ -146,8 +147,7 @@ def filled_up(values: Floats) -> Array32:
 def mean_modes_of(grid: ModalGrid, linear: ModalLinearisation) -> MeanModes:
     """Modes of the mean stiffness along trajectories, in which powers weigh by inertia."""
     mean = grid.stiffness + np.tensordot(linear.stiffness, grid.shares, axes=(1, 0))
-    inertia, h = float(grid.network.m.mean()), float(grid.points[1])
-    return mean_modes(mean, grid.mass, inertia, grid.rate, h, grid.per_interval)
+    return mean_modes(mean, grid.mass, float(grid.network.m.mean()), grid.rate, float(grid.points[1]), POINTS)
 
 
 class CompiledIterations:

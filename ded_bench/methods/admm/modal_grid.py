@@ -17,14 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.admm.coarse_dispatch import coarse_grid, dispatch_angles
+from ded_bench.methods.admm.coarse_dispatch import cheapen, coarse_grid
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
+from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.methods.stacked_instances import StackedInstances
 from ded_bench.plants.lossless import algebraic
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, copy_row
+from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.quantities import Indices, largest_divisor
 
 #: Mismatch of a power flow that is good enough here, pu.
@@ -33,12 +35,13 @@ MISMATCH = 1e-5
 CONTRACTION = 0.3
 #: Damping rates that differ by less than this part are the same in all but the digits of the data.
 ROUND_OFF = 1e-6
-#: Points of the time grid per interval between knots: with two, a tenth of the bound has to be left free.
-POINTS = 4
 #: Knots at which the stiffness along a trajectory is taken; linear between them.
 STIFFNESS_KNOTS = 5
 #: Longest time from one power flow along a trajectory to the next, s, but for knots farther apart.
-FLOWS_S = 0.8
+FLOWS_S = 2.0
+#: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per
+#: pair of generators.
+SMALLEST_COST = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class Start:
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0: q, q̇, (batch, 2, n_modes)
     taken: Array  # T (L - L_0) on the time grid, (batch, n_points, n_gen), pu
-    scale: Array  # what costs are relative to: mean cost of the merit order, (batch,)
+    scale: Array  # what costs are relative to: mean cost of the static dispatch, (batch,)
     schedule: Array  # first schedule, (batch, n_knots, n_gen), pu
 
 
@@ -70,13 +73,12 @@ class ModalGrid:
     def __init__(self, case: Case, bound: float, horizon_s: float) -> None:
         self.case, self.bound, self.network = case, bound, Network(case)
         self.knots = knots = case.knot_times(horizon_s)
-        #: The time grid, (n_points,), s, and how many of its points are an interval between knots.
-        self.per_interval = POINTS
-        self.points = np.linspace(knots[0], knots[-1], self.per_interval * (len(knots) - 1) + 1)
+        #: The time grid: knots and points between them, (n_points,), s.
+        self.points = np.linspace(knots[0], knots[-1], POINTS * (len(knots) - 1) + 1)
         self.spacing = float(knots[1] - knots[0])
         self.ramp = case.ramp * self.spacing
         self._linearise_nominal()
-        self.coarse = coarse_grid(case, knots, bound, self.stiffness, self.compliance)
+        self.coarse = coarse_grid(case, knots, bound, self.stiffness)
         #: Knots from one power flow along a trajectory to the next; those where stiffness is taken.
         self.every = largest_divisor(len(knots) - 1, FLOWS_S / self.spacing)
         n_flows = (len(knots) - 1) // self.every + 1
@@ -87,7 +89,7 @@ class ModalGrid:
         self.between = np.stack([np.interp(self.points, at, row) for row in np.eye(len(at))], axis=1)
         self.shares = np.trapezoid(self.between, self.points, axis=0) / self.points[-1]
         half = 0.5 * float(self.points[1])
-        self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * self.per_interval)
+        self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * POINTS)
         #: Solved for generators and buses without machines, and for these, which the last one eliminates.
         network, n_gen = self.network, len(self.mass)
         buses = np.concatenate([network.generators, network.algebraic])
@@ -131,28 +133,36 @@ class ModalGrid:
         served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
-        points, order = self.per_interval * self.coarse.every, np.argsort(problems.cost[:, 1:], kind="stable")
-        load = problems.load[:, ::points].sum(axis=2)
-        given = load, problems.cost, problems.p_initial, taken[:, ::points], order
-        scale, x = dispatch_angles(self.coarse, *given)
-        schedule = linear_between(x, self.coarse.every) @ self.stiffness
-        schedule += problems.p_initial[:, None] + taken[:, :: self.per_interval]
-        track(schedule, self.case.p_min, self.case.p_max, self.ramp)
+        scale, schedule = self._first(problems, taken)
         return Start(problems, served, theta, state, taken, scale, schedule)
+
+    def _first(self, problems: StackedInstances, taken: Array) -> tuple[Array, Array]:
+        """Mean cost of the static dispatch, (batch,), and first schedules, (batch, n_knots, n_gen), pu."""
+        case, every, cost = self.case, self.coarse.every, problems.cost[:, None]
+        load = problems.load[:, :: every * POINTS]
+        base = problems.p_initial[:, None] + taken[:, :: every * POINTS]
+        static, demand = merit_order(case, cost[..., 1:], cost[..., 0], load), -load.sum(axis=2)
+        paid = (cost[..., 1:] * static).sum(axis=2) + cost[..., 0] * np.abs(demand - static.sum(axis=2))
+        scale = np.maximum(paid.mean(axis=1), SMALLEST_COST * max(1.0, len(self.gain) / 2))
+        x = (static - base) @ self.compliance
+        x[:, 0] = 0.0
+        cheapen(self.coarse, base, demand, problems.cost / scale[:, None], x)
+        schedule = linear_between(x @ self.stiffness, every)
+        schedule += problems.p_initial[:, None] + taken[:, ::POINTS]
+        track(schedule, case.p_min, case.p_max, self.ramp)
+        return scale, schedule
 
     def along_first(self, start: Start) -> ModalLinearisation:
         """The grid linearised along the steady angles of the first schedules."""
         powers = start.schedule[:, :: self.every] - start.problems.p_initial[:, None]
-        return self.linearise(
-            start, (powers - start.taken[:, :: self.every * self.per_interval]) @ self.compliance
-        )
+        return self.linearise(start, (powers - start.taken[:, :: self.every * POINTS]) @ self.compliance)
 
     def along(self, start: Start, x: Array) -> ModalLinearisation:
         """The grid linearised along trajectories of x on the time grid, (batch, n_points, n_gen), rad.
 
         What swings faster than the time from one power flow to the next is averaged out.
         """
-        return self.linearise(start, averaged(x, self.every * self.per_interval))
+        return self.linearise(start, averaged(x, self.every * POINTS))
 
     def linearise(self, start: Start, slow: Array) -> ModalLinearisation:
         """The grid linearised along slow trajectories of x.
@@ -163,7 +173,7 @@ class ModalGrid:
             start: of the problems; those without a power flow all along are `served` no more.
             slow: x at every `every`-th knot, (batch, n_flows, n_gen), rad.
         """
-        problems, points = start.problems, self.every * self.per_interval
+        problems, points = start.problems, self.every * POINTS
         batch, n_flows, n_gen = slow.shape
         f = np.empty((batch, n_flows, n_gen))
         stiffness = np.empty((batch, len(self.stiffness_knots), n_gen, n_gen))
@@ -181,8 +191,7 @@ class ModalGrid:
             slow = np.where(bad[:, None, None], 0.0, slow)
         change = stiffness - self.stiffness
         rest = f - slow @ self.stiffness
-        for s, shares in enumerate(self.between[::points].T):
-            rest -= shares[:, None] * (slow @ change[:, s])
+        rest -= np.einsum("ks,bskg->bkg", self.between[::points], slow[:, None] @ change)
         whole = start.taken + linear_between(rest - start.taken[:, ::points], points)
         slack = -(whole.sum(axis=2) + problems.load.sum(axis=2))
         return ModalLinearisation(-(whole @ self.gain), self.gain.T @ change @ self.shape.T, slack, change)
@@ -193,7 +202,7 @@ class ModalGrid:
         Returns:
             On the time grid: x (batch, n_points, n_gen), rad, ω likewise, rad/s, P_s (batch, n_points), pu.
         """
-        v = linear_between(powers @ self.gain, self.per_interval) + linear.offset
+        v = linear_between(powers @ self.gain, POINTS) + linear.offset
         q, speed = np.empty_like(v), np.empty_like(v)
         q[:, 0], speed[:, 0] = start.state[:, 0], start.state[:, 1]
         for b in range(len(v)):
@@ -208,12 +217,9 @@ class ModalGrid:
 
 def linear_between(values: Array, points: int) -> Array:
     """Linear between rows, (batch, n, n_columns) to (batch, points (n - 1) + 1, n_columns)."""
-    batch, n, n_columns = values.shape
-    found = np.empty((batch, points * (n - 1) + 1, n_columns))
-    for i in range(points):
-        found[:, i:-1:points] = values[:, :-1] * (1 - i / points) + values[:, 1:] * (i / points)
-    found[:, -1] = values[:, -1]
-    return found
+    shares = np.arange(points)[:, None] / points
+    found = values[:, :-1, None] + shares * (values[:, 1:] - values[:, :-1])[:, :, None]
+    return np.concatenate([found.reshape(len(values), -1, values.shape[2]), values[:, -1:]], axis=1)
 
 
 def averaged(values: Array, every: int) -> Array:

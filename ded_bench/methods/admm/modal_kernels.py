@@ -35,7 +35,7 @@ class MeanModes(NamedTuple):
     """Modes of the mean stiffness along trajectories of a batch, each of which moves alone."""
 
     powers: Array  # by column, (batch, n_gen, n_modes)
-    maps: Array  # of `interval_maps`, (batch, points + 1, 2, 4, n_modes)
+    maps: Array  # of `interval_maps`, (batch, POINTS + 1, 2, 4, n_modes)
     outputs: Array  # Σ ω² over the generators for q̇ = 1, and P_s² for q = 1, (batch, 2, n_modes)
 
 
@@ -241,7 +241,7 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
     each mode moved alone. Up to t = 0 all is 0.
 
     Args:
-        maps: of `interval_maps`, (points + 1, 2, 4, n_modes).
+        maps: of `interval_maps`, (POINTS + 1, 2, 4, n_modes).
         outputs: Σ ω² over the generators for q̇ = 1, and P_s² for q = 1, (2, n_modes).
         weights: (4,).
         gradient: (n_knots, n_modes); the first knot's does not matter.

@@ -14,6 +14,8 @@ from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import DECAY_S, FLUCTUATION, sample_instances
 
+#: Points of the time grid per interval between knots.
+POINTS = 4
 #: One of so many drawn problems is of the closed loop's kind.
 OPERATING = 4
 

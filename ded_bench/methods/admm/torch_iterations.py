@@ -22,6 +22,7 @@ from ded_bench.methods.admm.admm_inference import (
 )
 from ded_bench.methods.admm.modal_grid import ModalGrid, ModalLinearisation, Start, linear_between
 from ded_bench.methods.admm.modal_kernels import MeanModes, modal_change, swing, swing_adjoint
+from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.training_run import follow_within
 from ded_bench.problem.case import Array
 
@@ -56,7 +57,7 @@ class TorchIterations(nn.Module):
         low, high, step, mass = map(_single, (limits.low, limits.high, limits.step, limits.mass))
         by_mass, n = 1.0 / (mass * limits.unit**2), start.schedule.shape[1]
         cost = _single(start.problems.cost / start.scale[:, None])
-        at_knots, at_points = means_over_time(n), means_over_time(len(grid.points))
+        at_knots, at_points = means_over_time(n), means_over_time(POINTS * (n - 1) + 1)
         price = cost[:, :1] * at_points
         own = at_knots[1:, None] * cost[:, None, 1:]
         p = _single(start.schedule)
@@ -64,8 +65,8 @@ class TorchIterations(nn.Module):
         duals = [torch.zeros(())] * 4
         for setting in self.settings() * torch.tensor([limits.price] * PENALTIES + [1.0] * 4):
             omega, p_slack = Respond.apply(p, grid, start, linear)  # type: ignore[no-untyped-call]
-            heavy = setting[3] / (limits.unit**2 * grid.per_interval)
-            steady = setting[2] / (limits.bound**2 * grid.per_interval)
+            heavy = setting[3] / (limits.unit**2 * POINTS)
+            steady = setting[2] / (limits.bound**2 * POINTS)
             weights = setting[0] * by_mass, setting[1] * by_mass, steady, heavy
             now = [p[:, 1:], p.diff(dim=1), omega, p_slack]
             if not copies:
@@ -90,7 +91,7 @@ class TorchIterations(nn.Module):
                 [
                     setting[0] / limits.unit**2,
                     setting[1] / limits.unit**2,
-                    setting[2] * setting[4] / (limits.bound**2 * grid.per_interval),
+                    setting[2] * setting[4] / (limits.bound**2 * POINTS),
                     heavy * setting[5],
                 ]
             )
@@ -158,7 +159,7 @@ class Transposed(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
         """The response itself, from rest and without loads."""
         grid, linear = ctx.grid, ctx.linear
-        v = linear_between(_double(gradients[0]) @ grid.gain, grid.per_interval)
+        v = linear_between(_double(gradients[0]) @ grid.gain, POINTS)
         q, speed = np.zeros_like(v), np.zeros_like(v)
         for b in range(len(v)):
             swing(grid.modes, linear.change[b], v[b], q[b], speed[b])
@@ -202,11 +203,10 @@ def _transposed(grid: ModalGrid, linear: ModalLinearisation, on_omega: Array, on
     on_q, on_speed = on_x @ grid.shape.T, on_omega @ grid.shape.T
     for b in range(len(on_v)):
         swing_adjoint(grid.modes, linear.change[b], on_q[b], on_speed[b], on_v[b])
-    points = grid.per_interval
-    found = on_v[:, ::points].copy()
-    for i in range(1, points):
-        found[:, :-1] += (1 - i / points) * on_v[:, i::points]
-        found[:, 1:] += (i / points) * on_v[:, i::points]
+    found = on_v[:, ::POINTS].copy()
+    for i in range(1, POINTS):
+        found[:, :-1] += (1 - i / POINTS) * on_v[:, i::POINTS]
+        found[:, 1:] += (i / POINTS) * on_v[:, i::POINTS]
     return np.asarray(found @ grid.gain.T)
 
 

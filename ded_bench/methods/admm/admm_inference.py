@@ -182,7 +182,7 @@ class CompiledIterations:
 def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes, settings: Array) -> None:
     """Turn first schedules into answers by iterations of ADMM; see the top.
 
-    An answer is the last schedule within its limits, or the first if that is better.
+    An answer is the last schedule within its limits, or the first where the last is not finite.
 
     Args:
         powers: (batch, n_knots, n_gen), pu; receives the answers.
@@ -199,26 +199,21 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
     bounded, moved = np.empty((2, n, n_gen)), np.empty((2, n, n_gen))
     speeds, slack = np.empty((2, n_points, n_gen), np.float32), np.empty((2, n_points))
     for b in range(batch):
-        first = 0.0
         for j in range(n):
             copy_row(powers[b, j], p[j])
-        for i in range(len(settings) + 1):
-            if i == len(settings):
-                track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
+        for i in range(len(settings)):
             _respond(p, given, b, limits, modes, omega, p_slack)
-            loss = _loss(p, omega, p_slack, given, b, limits, modes) if i % len(settings) == 0 else 0.0
             if i == 0:
-                first = loss
                 _begin(p, omega, p_slack, bounded, moved, speeds, slack)
-            if i < len(settings):
-                _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
-                _project_response(
-                    (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
-                )
-                _improve(p, gradient, given, b, limits, settings[i])
-            elif loss <= first:
-                for j in range(n):
-                    copy_row(p[j], powers[b, j])
+            _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
+            _project_response(
+                (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
+            )
+            _improve(p, gradient, given, b, limits, settings[i])
+        track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
+        if np.isfinite(p).all():  # where the grid swings up, it may not be
+            for j in range(n):
+                copy_row(p[j], powers[b, j])
 
 
 @inlined
@@ -335,27 +330,6 @@ def _improve(
     for j in range(p.shape[0]):
         for g in range(p.shape[1]):
             p[j, g] += step[j, g]
-
-
-@inlined
-def _loss(
-    p: Array, omega: Array32, p_slack: Array32, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes
-) -> float:
-    """Cost as a part of `Start.scale`, and the penalty; see `torch_iterations.judged`."""
-    cost, penalty, (n, n_gen), n_points = 0.0, 0.0, p.shape, len(p_slack)
-    for j in range(n):
-        for g in range(n_gen):
-            share = 0.5 if j == 0 or j == n - 1 else 1.0
-            cost += share * given.cost[b, 1 + g] * p[j, g] / (n - 1)
-    for k in range(n_points):
-        share = 0.5 if k == 0 or k == n_points - 1 else 1.0
-        cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_points - 1)
-        for g in range(n_gen):
-            if abs(omega[k, g]) > limits.bound:
-                excess = abs(omega[k, g]) / limits.bound - 1.0
-                bent = min(excess, STRAIGHT)
-                penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
-    return float(cost + PRICE * penalty * 2.0 * modes.half)
 
 
 @inlined

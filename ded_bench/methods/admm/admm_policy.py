@@ -31,9 +31,6 @@ VERSION = 1
 #: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
 #: linearised grid errs (studies/admm.md).
 MARGIN = 0.01
-#: Weights that were learned for fewer iterations take long steps and do not serve many: the policy answers
-#: with them, and goes on with those where training starts.
-LEARNED_FOR = 10
 
 
 @dataclass(frozen=True)
@@ -61,10 +58,12 @@ class AdmmPolicy(TrainedPolicy):
         return CompiledIterations(self.grid, self.grid.bound, nodes, iterations)
 
     def further(self, iterations: int, margin: float = MARGIN) -> CompiledIterations:
-        """So many iterations to go on with."""
-        few, nodes = self.training["iterations"] < LEARNED_FOR, self.weights["nodes"]
+        """So many iterations to go on with, with the weights where training starts.
+
+        Weights that were learned for a few take long steps and do not serve many.
+        """
         bound = (1.0 - margin) * self.scope.case.omega_bound(self.scope.regime)
-        return CompiledIterations(self.grid, bound, np.zeros_like(nodes) if few else nodes, iterations)
+        return CompiledIterations(self.grid, bound, np.zeros_like(self.weights["nodes"]), iterations)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""

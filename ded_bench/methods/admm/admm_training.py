@@ -28,11 +28,8 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
-#: Iterations of an answer: the fewest, and times generators on small grids, where they take less time. Where
-#: the bound on |ω| is loose, schedules are shaped by ramps, and a few iterations go almost as far.
-TIGHT, LOOSE = (6, 60), (3, 30)
-#: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
-RAMPING = 0.1
+#: Iterations of an answer (studies/admm.md).
+ITERATIONS = 5
 #: Steps of an epoch, epochs.
 STEPS, EPOCHS = 100, 8
 #: Problems of a step: so many that generators times knots of all are near the first number.
@@ -70,7 +67,7 @@ def train(
         return train_on_island(case, regime, instances, out, options)
     horizon = instances[0].horizon_s
     grid = ModalGrid(case, case.omega_bound(regime), horizon)
-    network = TorchIterations(grid, iterations_of(grid))
+    network = TorchIterations(grid, ITERATIONS)
     check = grid.start(problems_of(case, instances[:HELD_OUT], grid.points))
     run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
@@ -79,18 +76,11 @@ def train(
         "batch": run.batch,
         "instances": run.step * run.batch,
         "held_out": len(check.served),
-        "iterations": len(network.start),
+        "iterations": ITERATIONS,
     }
     policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights_of(network), facts), instances)
     policy.save(out)
     return policy
-
-
-def iterations_of(grid: ModalGrid) -> int:
-    """Iterations of an answer, by the size of a case and how tight its bound is."""
-    rates = grid.ramp / (np.diag(grid.stiffness) * grid.spacing)
-    fewest, rounds = LOOSE if np.median(rates) < RAMPING * grid.bound else TIGHT
-    return max(fewest, rounds // len(rates))
 
 
 class _AdmmTraining(TrainingRun):

@@ -25,7 +25,7 @@ APART_S = 4.0
 #: Part of the bound on |ω| at which angles turn: the rest is left to oscillations.
 RATE = 0.9
 #: Iterations; penalties of turns, powers, ramps and P_s; relaxation (see studies/admm.md).
-ITERATIONS, PENALTIES, RELAXATION = 20, (5.5, 4.0, 5.0, 5.7), 1.35
+ITERATIONS, PENALTIES, RELAXATION = 40, (5.5, 4.0, 5.0, 5.7), 1.35
 
 
 class CoarseGrid(NamedTuple):

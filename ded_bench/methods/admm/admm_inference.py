@@ -30,7 +30,7 @@ from ded_bench.methods.admm.modal_kernels import (
 from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled, copy_row, inlined
+from ded_bench.problem.compiled import compiled, inlined
 from ded_bench.problem.quantities import Array32
 from ded_bench.surrogates.koopman import hat_functions
 
@@ -158,6 +158,7 @@ class CompiledIterations:
         self._grid, self._limits, modes = grid, limits_of(grid, bound), grid.modes
         self.settings = settings_of(nodes, iterations)
         self.settings[:, :PENALTIES] *= self._limits.price
+        self.settings[0, 6] = 1.0  # the first copies are what the first schedule does
         self._modes = modes._replace(step=filled_up(modes.step), damping=filled_up(modes.damping))
 
     def __call__(self, start: Start, linear: ModalLinearisation, schedule: Array) -> Array:
@@ -199,12 +200,10 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
     bounded, moved = np.empty((2, n, n_gen)), np.empty((2, n, n_gen))
     speeds, slack = np.empty((2, n_points, n_gen), np.float32), np.empty((2, n_points))
     for b in range(batch):
-        for j in range(n):
-            copy_row(powers[b, j], p[j])
+        p[:] = powers[b]
+        bounded[:], moved[:], speeds[:], slack[:] = 0.0, 0.0, 0.0, 0.0
         for i in range(len(settings)):
             _respond(p, given, b, limits, modes, omega, p_slack)
-            if i == 0:
-                _begin(p, omega, p_slack, bounded, moved, speeds, slack)
             _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
             _project_response(
                 (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
@@ -212,23 +211,7 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
             _improve(p, gradient, given, b, limits, settings[i])
         track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
         if np.isfinite(p).all():  # where the grid swings up, it may not be
-            for j in range(n):
-                copy_row(p[j], powers[b, j])
-
-
-@inlined
-def _begin(
-    p: Array, omega: Array32, p_slack: Array32, bounded: Array, moved: Array, speeds: Array32, slack: Array
-) -> None:
-    """First copies are what the first schedule does; duals are zero."""
-    bounded[1], moved[1], speeds[1], slack[1] = 0.0, 0.0, 0.0, 0.0
-    for j in range(len(p)):
-        copy_row(p[j], bounded[0, j])
-        for g in range(p.shape[1]):
-            moved[0, j, g] = p[j, g] - p[max(j - 1, 0), g]
-    copy_row(p_slack, slack[0])
-    for k in range(len(p_slack)):
-        copy_row(omega[k], speeds[0, k])
+            powers[b] = p
 
 
 @inlined

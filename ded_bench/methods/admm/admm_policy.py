@@ -28,6 +28,8 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
 
 VERSION = 1
+#: Weights that were learned for fewer iterations take long steps and do not serve many.
+LEARNED_FOR = 10
 #: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
 #: linearised grid errs (studies/admm.md).
 MARGIN = 0.01
@@ -58,12 +60,10 @@ class AdmmPolicy(TrainedPolicy):
         return CompiledIterations(self.grid, self.grid.bound, nodes, iterations)
 
     def further(self, iterations: int, margin: float = MARGIN) -> CompiledIterations:
-        """So many iterations to go on with, with the weights where training starts.
-
-        Weights that were learned for a few take long steps and do not serve many.
-        """
+        """So many iterations to go on with; their weights are the learned or those where training starts."""
+        few, nodes = self.training["iterations"] < LEARNED_FOR, self.weights["nodes"]
         bound = (1.0 - margin) * self.scope.case.omega_bound(self.scope.regime)
-        return CompiledIterations(self.grid, bound, np.zeros_like(self.weights["nodes"]), iterations)
+        return CompiledIterations(self.grid, bound, np.zeros_like(nodes) if few else nodes, iterations)
 
     def answers(self, instances: Sequence[Instance]) -> Array:
         """See `TrainedPolicy.answers`."""

@@ -28,8 +28,8 @@ from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
 from ded_bench.problem.sampling import POLICY_SEED
 
-#: Iterations of an answer (studies/admm.md).
-ITERATIONS = 5
+#: Iterations of an answer: the fewest, and times generators on small grids (studies/admm.md).
+ITERATIONS, ON_SMALL_GRIDS = 5, 45
 #: Steps of an epoch, epochs.
 STEPS, EPOCHS = 100, 8
 #: Problems of a step: so many that generators times knots of all are near the first number.
@@ -67,7 +67,7 @@ def train(
         return train_on_island(case, regime, instances, out, options)
     horizon = instances[0].horizon_s
     grid = ModalGrid(case, case.omega_bound(regime), horizon)
-    network = TorchIterations(grid, ITERATIONS)
+    network = TorchIterations(grid, max(ITERATIONS, ON_SMALL_GRIDS // len(case.generators)))
     check = grid.start(problems_of(case, instances[:HELD_OUT], grid.points))
     run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
@@ -76,7 +76,7 @@ def train(
         "batch": run.batch,
         "instances": run.step * run.batch,
         "held_out": len(check.served),
-        "iterations": ITERATIONS,
+        "iterations": len(network.start),
     }
     policy = with_margin(AdmmPolicy(Scope(case, regime, horizon), weights_of(network), facts), instances)
     policy.save(out)

@@ -192,8 +192,7 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
         modes: of the case.
         settings: of each iteration, (n_iterations, 8); the columns are those of `SETTINGS`.
     """
-    batch, n, n_gen = powers.shape
-    n_points = given.offset.shape[1]
+    (batch, n, n_gen), n_points = powers.shape, given.offset.shape[1]
     omega, p_slack = np.empty((n_points, n_gen), np.float32), np.empty(n_points, np.float32)
     p, gradient = np.empty((n, n_gen)), np.empty((n, n_gen))
     # copies and duals

@@ -60,8 +60,7 @@ def coarse_grid(case: Case, knots: Array, bound: float, stiffness: Array) -> Coa
     penalties = price / unit * np.array(PENALTIES) * [(unit / turn) ** 2, 1.0, 1.0, 1.0]
     squares, waves = np.linalg.eigh(np.diag([2.0] * (n - 1) + [1.0]) - np.eye(n, k=1) - np.eye(n, k=-1))
     on_turns, on_powers, on_ramps, on_slack = penalties
-    total = stiffness.sum(axis=0)
-    same = on_powers * stiffness @ stiffness + on_slack * np.outer(total, total)
+    same = stiffness @ (on_powers * np.eye(len(stiffness)) + on_slack) @ stiffness
     differences = on_turns * np.eye(len(stiffness)) + on_ramps * stiffness @ stiffness
     inverses = np.linalg.inv(same + squares[:, None, None] * differences)
     ramp = case.ramp * apart_s
@@ -127,4 +126,4 @@ def _project(
     wanted = new * value + (1.0 - new) * kept[0, j, g] + kept[1, j, g] / weight
     copy = min(max(wanted, low), high)
     kept[0, j, g], kept[1, j, g] = copy, weight * (wanted - copy)
-    return weight * copy - kept[1, j, g]
+    return float(weight * copy - kept[1, j, g])

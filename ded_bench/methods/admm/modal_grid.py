@@ -28,6 +28,7 @@ from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, copy_row
 from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.quantities import Indices, largest_divisor
+from ded_bench.surrogates.koopman import hat_functions
 
 #: Mismatch of a power flow that is good enough here, pu.
 MISMATCH = 1e-5
@@ -85,9 +86,11 @@ class ModalGrid:
         taken = np.linspace(0, n_flows - 1, min(STIFFNESS_KNOTS, n_flows)).round().astype(np.int64)
         self.stiffness_knots = self.every * taken
         #: Linear interpolation from there to the time grid, and shares of a mean over time.
-        at = knots[self.stiffness_knots]
-        self.between = np.stack([np.interp(self.points, at, row) for row in np.eye(len(at))], axis=1)
+        self.between = hat_functions(self.points, knots[self.stiffness_knots])
         self.shares = np.trapezoid(self.between, self.points, axis=0) / self.points[-1]
+        #: Means around power flows, weighted by hat functions; both ends are kept as they are.
+        self._means = hat_functions(self.points, knots[:: self.every]).T / (self.every * POINTS)
+        self._means[[0, -1]] = np.eye(len(self.points))[[0, -1]]
         half = 0.5 * float(self.points[1])
         self.modes = Modes(self._step, half * self._damping, half, self.stiffness_knots * POINTS)
         #: Solved for generators and buses without machines, and for these, which the last one eliminates.
@@ -138,17 +141,16 @@ class ModalGrid:
 
     def _first(self, problems: StackedInstances, taken: Array) -> tuple[Array, Array]:
         """Mean cost of the static dispatch, (batch,), and first schedules, (batch, n_knots, n_gen), pu."""
-        case, every, cost = self.case, self.coarse.every, problems.cost[:, None]
-        load = problems.load[:, :: every * POINTS]
-        base = problems.p_initial[:, None] + taken[:, :: every * POINTS]
+        case, every = self.case, self.coarse.every
+        cost, p_initial = problems.cost[:, None], problems.p_initial[:, None]
+        load, base = problems.load[:, :: every * POINTS], p_initial + taken[:, :: every * POINTS]
         static, demand = merit_order(case, cost[..., 1:], cost[..., 0], load), -load.sum(axis=2)
         paid = (cost[..., 1:] * static).sum(axis=2) + cost[..., 0] * np.abs(demand - static.sum(axis=2))
         scale = np.maximum(paid.mean(axis=1), SMALLEST_COST * max(1.0, len(self.gain) / 2))
         x = (static - base) @ self.compliance
         x[:, 0] = 0.0
         cheapen(self.coarse, base, demand, problems.cost / scale[:, None], x)
-        schedule = linear_between(x @ self.stiffness, every)
-        schedule += problems.p_initial[:, None] + taken[:, ::POINTS]
+        schedule = p_initial + taken[:, ::POINTS] + linear_between(x @ self.stiffness, every)
         track(schedule, case.p_min, case.p_max, self.ramp)
         return scale, schedule
 
@@ -162,7 +164,7 @@ class ModalGrid:
 
         What swings faster than the time from one power flow to the next is averaged out.
         """
-        return self.linearise(start, averaged(x, self.every * POINTS))
+        return self.linearise(start, self._means @ x)
 
     def linearise(self, start: Start, slow: Array) -> ModalLinearisation:
         """The grid linearised along slow trajectories of x.
@@ -220,21 +222,6 @@ def linear_between(values: Array, points: int) -> Array:
     shares = np.arange(points)[:, None] / points
     found = values[:, :-1, None] + shares * (values[:, 1:] - values[:, :-1])[:, :, None]
     return np.concatenate([found.reshape(len(values), -1, values.shape[2]), values[:, -1:]], axis=1)
-
-
-def averaged(values: Array, every: int) -> Array:
-    """Means weighted by the hat function of every so many-th point.
-
-    Args:
-        values: (batch, n, n_columns); both ends are kept as they are.
-        every: how many points make one.
-    """
-    hat = np.minimum(np.arange(1, 2 * every), np.arange(1, 2 * every)[::-1]) / every**2
-    found, last = values[:, ::every].copy(), values.shape[1] - every
-    found[:, 1:-1] = 0.0
-    for k, weight in enumerate(hat, start=1):
-        found[:, 1:-1] += weight * values[:, k : last + k - every : every]
-    return found
 
 
 @compiled

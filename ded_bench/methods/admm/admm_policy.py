@@ -30,8 +30,8 @@ from ded_bench.problem.instance import Instance
 VERSION = 1
 #: Weights that were learned for fewer iterations take long steps and do not serve many.
 LEARNED_FOR = 10
-#: By what part of it further iterations keep away from the bound on |ω|: their schedules ride it, and the
-#: linearised grid errs (studies/admm.md).
+#: By what part of it further iterations keep away from the bound on |ω|, or by half the learned margin where
+#: that is more: their schedules ride it, and the linearised grid errs (studies/admm.md).
 MARGIN = 0.01
 
 
@@ -59,9 +59,10 @@ class AdmmPolicy(TrainedPolicy):
         nodes, iterations = self.weights["nodes"], self.training["iterations"]
         return CompiledIterations(self.grid, self.grid.bound, nodes, iterations)
 
-    def further(self, iterations: int, margin: float = MARGIN) -> CompiledIterations:
+    def further(self, iterations: int, margin: float | None = None) -> CompiledIterations:
         """So many iterations to go on with; their weights are the learned or those where training starts."""
         few, nodes = self.training["iterations"] < LEARNED_FOR, self.weights["nodes"]
+        margin = max(MARGIN, 0.5 * self.training.get("margin", 0.0)) if margin is None else margin
         bound = (1.0 - margin) * self.scope.case.omega_bound(self.scope.regime)
         return CompiledIterations(self.grid, bound, np.zeros_like(nodes) if few else nodes, iterations)
 
@@ -127,7 +128,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     policy = AdmmPolicy.find(case, regime, own)
     if margin is not None:
         policy = replace(policy, training={**policy.training, "margin": margin})
-    further = policy.further(iterations, MARGIN if margin is None else margin) if iterations else None
+    further = policy.further(iterations, margin) if iterations else None
 
     def answer(instance: Instance) -> Array:
         return np.asarray(policy.powers(policy.problems([instance]), further)[0])

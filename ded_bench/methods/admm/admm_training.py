@@ -46,8 +46,6 @@ HELD_OUT = 100
 MARGINS = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.2, 0.25)
 #: The first that keeps so large a part of the instances within the scorer's tolerance is taken.
 WANTED = 0.98
-#: So many margins after the best so far, none better, end the search.
-PATIENCE = 3
 #: Most instances that are simulated with each margin.
 SIMULATED = 50
 
@@ -131,7 +129,6 @@ def with_margin(policy: AdmmPolicy, instances: Sequence[Instance]) -> AdmmPolicy
         share = kept / len(chosen)
         facts = tried.training | {"margin_feasible": share, "margin_instances": len(chosen)}
         found.append((share, dataclasses.replace(tried, training=facts)))
-        best = max(found, key=lambda pair: pair[0])
-        if share >= WANTED or len(found) - found.index(best) > PATIENCE:
+        if share >= WANTED:
             break
-    return best[1]
+    return max(found, key=lambda pair: pair[0])[1]

@@ -143,6 +143,10 @@ def read_sources(case: Case, folder: Path) -> Sources:
     }
 
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]
+    of_rows = counting.groupby(summary.GROUP)["made_with"].last()
+    for job, made in {call.job: f"{call.model} {call.policy}".strip() for call in calls}.items():
+        if of_rows.get(job, made) != made:
+            notes.append(f"Times of {summary.title(*job[1:])} {job[0]} are of {made}, its rows are not.")
     instances, test_count, version = _benchmark(case, notes)
     if paper and (unknown := sorted(set(paper.regimes) - set(case.regimes))):
         problem = f"is no regime of case {case.id}"

@@ -96,6 +96,19 @@ def copy(finished: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "copy", ignore=ignored))
 
 
+def test_times_of_another_model_or_policy_are_told(problems: Path, finished: Path, tmp_path: Path) -> None:
+    folder = copy(finished, tmp_path)
+    made = Results(folder).frame()
+    model = made[made["method"] == "ded-ko"]["model"].iloc[0]
+    timed = dataclasses.replace(TIMING.existing(folder / "timing.csv")[0], method="ded-ko", solve_s=1.0)
+    other = model.partition("@")[0] + "@0"
+    for timed_model, is_told in ((model, False), (other, True)):
+        TIMING.write(folder / "timing.csv", [dataclasses.replace(timed, model=timed_model)])
+        write_report(Case.load(problems), folder)
+        text = (folder / "report.md").read_text()
+        assert (f"Times of DED-KO TO are of {other}, its rows are not." in text) == is_told
+
+
 def cells(markdown: str, heading: str) -> list[list[str]]:
     """Rows of the first table after a heading."""
     after = markdown[markdown.index(heading) :]

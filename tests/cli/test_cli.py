@@ -202,7 +202,7 @@ def test_only_policies_that_need_a_koopman_model_ask_for_one(
     problem: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     """`ded-admm` is trained on the grid itself."""
-    for name, small in (("STEPS", 1), ("ROWS", 400), ("ON_SMALL_GRIDS", 3)):
+    for name, small in (("STEPS", 1), ("ROWS", 400), ("TIGHT", (3, 0))):
         monkeypatch.setattr(f"ded_bench.methods.admm.admm_training.{name}", small)
     where = ("--case", str(problem), "--regime", "TO", "--limit", "1", "--epochs", "1", "--results")
     assert main(["train-dpc", "--method", "ded-dpc", *where, str(tmp_path)]) == 2

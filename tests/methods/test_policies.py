@@ -118,7 +118,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dpc_training, "FRESH", 300)
     monkeypatch.setattr(admm_training, "STEPS", 4)
     monkeypatch.setattr(admm_training, "ROWS", 400)
-    monkeypatch.setattr(admm_training, "ON_SMALL_GRIDS", 12)
+    monkeypatch.setattr(admm_training, "TIGHT", (6, 0))
 
 
 def trained(module: ModuleType, case: Case, out: Path, **options: object) -> TrainedPolicy:

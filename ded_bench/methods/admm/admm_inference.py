@@ -71,6 +71,7 @@ class AdmmLimits(NamedTuple):
     high: Array
     step: Array  # largest change between knots by ramps
     bound: float  # of |ω|, rad/s
+    is_tight: bool  # see `CoarseGrid`
     mass: Array  # M in means of all, (n_gen,)
     unit: float  # of powers: what ramps and the bound allow between knots, pu
     price: float  # one unit at one knot, as a part of what all generators can give at all of them
@@ -124,6 +125,7 @@ def limits_of(grid: ModalGrid, bound: float) -> AdmmLimits:
         high=case.p_max,
         step=grid.ramp,
         bound=bound,
+        is_tight=grid.coarse.is_tight,
         mass=grid.mass,
         unit=unit,
         price=unit / ((len(grid.knots) - 1) * largest),
@@ -183,7 +185,8 @@ class CompiledIterations:
 def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes, settings: Array) -> None:
     """Turn first schedules into answers by iterations of ADMM; see the top.
 
-    An answer is the last schedule within its limits, or the first where the last is not finite.
+    An answer is the last schedule within its limits, or the first: where the last is not finite, or where
+    the bound is loose and the first is better.
 
     Args:
         powers: (batch, n_knots, n_gen), pu; receives the answers.
@@ -201,14 +204,21 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
     for b in range(batch):
         p[:] = powers[b]
         bounded[:], moved[:], speeds[:], slack[:] = 0.0, 0.0, 0.0, 0.0
+        first = np.inf
         for i in range(len(settings)):
             _respond(p, given, b, limits, modes, omega, p_slack)
+            if i == 0 and not limits.is_tight:
+                first = _loss(p, omega, p_slack, given, b, limits, modes)
             _project_powers(p, given.cost[b], limits, settings[i], bounded, moved, gradient)
             _project_response(
                 (omega, p_slack), (speeds, slack), given, b, limits, modes, settings[i], gradient
             )
             _improve(p, gradient, given, b, limits, settings[i])
         track(p.reshape(1, n, n_gen), limits.low, limits.high, limits.step)
+        if not limits.is_tight:
+            _respond(p, given, b, limits, modes, omega, p_slack)
+            if not _loss(p, omega, p_slack, given, b, limits, modes) <= first:
+                continue
         if np.isfinite(p).all():  # where the grid swings up, it may not be
             powers[b] = p
 
@@ -312,6 +322,27 @@ def _improve(
     for j in range(p.shape[0]):
         for g in range(p.shape[1]):
             p[j, g] += step[j, g]
+
+
+@inlined
+def _loss(
+    p: Array, omega: Array32, p_slack: Array32, given: AdmmProblems, b: int, limits: AdmmLimits, modes: Modes
+) -> float:
+    """Cost as a part of `Start.scale`, and the penalty; see `torch_iterations.judged`."""
+    cost, penalty, (n, n_gen), n_points = 0.0, 0.0, p.shape, len(p_slack)
+    for j in range(n):
+        for g in range(n_gen):
+            share = 0.5 if j == 0 or j == n - 1 else 1.0
+            cost += share * given.cost[b, 1 + g] * p[j, g] / (n - 1)
+    for k in range(n_points):
+        share = 0.5 if k == 0 or k == n_points - 1 else 1.0
+        cost += share * given.cost[b, 0] * abs(p_slack[k]) / (n_points - 1)
+        for g in range(n_gen):
+            if abs(omega[k, g]) > limits.bound:
+                excess = abs(omega[k, g]) / limits.bound - 1.0
+                bent = min(excess, STRAIGHT)
+                penalty += excess + (excess - 0.5 * bent) * bent / DOUBLING
+    return float(cost + PRICE * penalty * 2.0 * modes.half)
 
 
 @inlined

@@ -5,9 +5,11 @@ those at t = 0. With x linear between knots a few seconds apart, the dispatch is
 
     min Σ_j w_j (c · P_j + c_s |P_s|_j)   with P_j, P_{j+1} - P_j and x_{j+1} - x_j within limits.
 
-Iterations of the alternating direction method of multipliers (Boyd et al. 2011) solve it roughly. The matrix
-of their quadratic program is always the same: it falls apart into one for each eigenvector of DᵀD, where D
-takes differences in time, and these are inverted once for a case.
+Iterations of the alternating direction method of multipliers (Boyd et al. 2011) solve it roughly, from the
+merit order. The matrix of their quadratic program is always the same: it falls apart into one for each
+eigenvector of DᵀD, where D takes differences in time, and these are inverted once for a case.
+
+Where the bound is loose, ramps shape schedules: a merit order within ramps, at all knots, is as cheap.
 """
 
 from __future__ import annotations
@@ -18,8 +20,10 @@ import numpy as np
 
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, inlined
-from ded_bench.problem.quantities import largest_divisor
+from ded_bench.problem.quantities import Indices, largest_divisor
 
+#: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
+RAMPING = 0.1
 #: Coarse knots are at most so far apart, s, but for knots farther apart.
 APART_S = 4.0
 #: Part of the bound on |ω| at which angles turn: the rest is left to oscillations.
@@ -32,7 +36,9 @@ class CoarseGrid(NamedTuple):
     """What the program has of a case, on n intervals between coarse knots."""
 
     every: int  # knots from one coarse knot to the next
+    is_tight: bool  # the bound
     stiffness: Array  # S, (n_gen, n_gen), pu/rad
+    compliance: Array  # its inverse
     low: Array  # of powers, (n_gen,), pu
     high: Array
     ramp: Array  # largest change of powers over an interval, (n_gen,), pu
@@ -42,7 +48,7 @@ class CoarseGrid(NamedTuple):
     inverses: Array  # of the quadratic program, for each of them, (n, n_gen, n_gen)
 
 
-def coarse_grid(case: Case, knots: Array, bound: float, stiffness: Array) -> CoarseGrid:
+def coarse_grid(case: Case, knots: Array, bound: float, stiffness: Array, compliance: Array) -> CoarseGrid:
     """The program of a case.
 
     Args:
@@ -50,8 +56,10 @@ def coarse_grid(case: Case, knots: Array, bound: float, stiffness: Array) -> Coa
         knots: of schedules, (n_knots,), s.
         bound: of |ω|, rad/s.
         stiffness: S, (n_gen, n_gen), pu/rad.
+        compliance: its inverse.
     """
-    every = largest_divisor(len(knots) - 1, APART_S / float(knots[1]))
+    is_tight = bool(np.median(case.ramp / np.diag(stiffness)) >= RAMPING * bound)
+    every = largest_divisor(len(knots) - 1, APART_S / float(knots[1])) if is_tight else 1
     n, apart_s = (len(knots) - 1) // every, every * float(knots[1])
     turn = RATE * bound * apart_s
     unit = float(np.exp(np.log(np.diag(stiffness) * turn).mean()))  # pu
@@ -63,59 +71,104 @@ def coarse_grid(case: Case, knots: Array, bound: float, stiffness: Array) -> Coa
     same = stiffness @ (on_powers * np.eye(len(stiffness)) + on_slack) @ stiffness
     differences = on_turns * np.eye(len(stiffness)) + on_ramps * stiffness @ stiffness
     inverses = np.linalg.inv(same + squares[:, None, None] * differences)
-    ramp = case.ramp * apart_s
-    return CoarseGrid(every, stiffness, case.p_min, case.p_max, ramp, turn, penalties, waves, inverses)
+    given = every, is_tight, stiffness, compliance, case.p_min, case.p_max, case.ramp * apart_s
+    return CoarseGrid(*given, turn, penalties, waves, inverses)
 
 
 @compiled
-def cheapen(grid: CoarseGrid, base: Array, demand: Array, cost: Array, x: Array) -> None:
-    """Move angles towards the cheapest dispatch, then within their limits.
+def dispatch_angles(
+    grid: CoarseGrid, base: Array, demand: Array, cost: Array, order: Indices, scale: Array
+) -> Array:
+    """Angles of the cheapest dispatch.
 
     Args:
         grid: the program.
         base: P_0 + T (L - L_0) at the coarse knots, (batch, n + 1, n_gen), pu.
         demand: -L, (batch, n + 1), pu.
-        cost: of slack and generators, parts of an instance's cost, (batch, 1 + n_gen), 1/pu.
-        x: angles, which change, (batch, n + 1, n_gen), rad; the first are 0.
+        cost: of slack and generators, (batch, 1 + n_gen), 1/pu.
+        order: generators from the cheapest to the dearest, (batch, n_gen).
+        scale: smallest mean cost that others are relative to, (batch,); receives the merit order's if larger.
+
+    Returns:
+        (batch, n + 1, n_gen), rad; the first are 0.
     """
+    x, powers = np.zeros(base.shape), np.empty_like(base[0])
+    for b in range(len(x)):
+        scale[b] = max(scale[b], _merit_order(grid, demand[b], cost[b], base[b, 0], order[b], powers))
+        x[b, 1:] = np.dot(powers - base[b], grid.compliance)[1:]
+        if grid.is_tight:
+            _cheapen(grid, base[b], demand[b], cost[b] / scale[b], x[b])
+        for j in range(1, len(powers)):
+            for g in range(powers.shape[1]):
+                x[b, j, g] = min(max(x[b, j, g], x[b, j - 1, g] - grid.turn), x[b, j - 1, g] + grid.turn)
+    return x
+
+
+@inlined
+def _merit_order(
+    grid: CoarseGrid, demand: Array, cost: Array, p_initial: Array, order: Indices, powers: Array
+) -> float:
+    """Merit order at every coarse knot; mean cost. Where the bound is loose, it keeps ramps.
+
+    While a cheap generator rises, a dearer one delivers the rest then.
+    """
+    n_knots, n_gen = powers.shape
+    total, room = 0.0, np.empty(n_gen)
+    for j in range(n_knots):
+        left = demand[j]
+        for g in range(n_gen):
+            low, high = grid.low[g], grid.high[g]
+            if not grid.is_tight:
+                before, ramp = (powers[j - 1, g], grid.ramp[g]) if j > 0 else (p_initial[g], 0.0)
+                low, high = max(low, before - ramp), min(high, before + ramp)
+            powers[j, g], room[g] = low, high - low
+            left -= low
+        for g in order:
+            raised = min(max(left, 0.0), room[g]) if cost[1 + g] < cost[0] else 0.0
+            left -= raised
+            powers[j, g] += raised
+            total += cost[1 + g] * powers[j, g]
+        total += cost[0] * abs(left)
+    return float(total / n_knots)
+
+
+@inlined
+def _cheapen(grid: CoarseGrid, base: Array, demand: Array, cost: Array, x: Array) -> None:
+    """Move angles, (n + 1, n_gen), towards the cheapest dispatch; costs are parts of an instance's."""
     n, n_gen = len(grid.waves), len(grid.stiffness)
     on_turns, on_powers, on_ramps, on_slack = grid.penalties
     pull, wanted = np.empty((n, n_gen)), np.empty((n, n_gen))
-    for b in range(len(x)):
-        turns, powers, ramps = np.zeros((2, n, n_gen)), np.zeros((2, n, n_gen)), np.zeros((2, n, n_gen))
-        slack = np.zeros((2, n))  # as the others: copies, then duals
-        for k in range(ITERATIONS):
-            new = RELAXATION if k > 0 else 1.0
-            p = base[b] + np.dot(x[b], grid.stiffness)
-            for j in range(n):
-                weight, short = (0.5 if j == n - 1 else 1.0) / n, demand[b, j + 1] - p[j + 1].sum()
-                drawn = new * short + (1.0 - new) * slack[0, j] + slack[1, j] / on_slack
-                paid = weight * cost[b, 0] / on_slack
-                slack[0, j] = max(drawn - paid, 0.0) + min(drawn + paid, 0.0)
-                slack[1, j] = on_slack * (drawn - slack[0, j])
-                shared = on_slack * (demand[b, j + 1] - base[b, j + 1].sum() - slack[0, j]) + slack[1, j]
-                for g in range(n_gen):
-                    turn, change = x[b, j + 1, g] - x[b, j, g], p[j + 1, g] - p[j, g]
-                    pull[j, g] = _project(turns, j, g, new, turn, on_turns, -grid.turn, grid.turn)
-                    wanted[j, g] = shared - weight * cost[b, 1 + g]
-                    power = _project(powers, j, g, new, p[j + 1, g], on_powers, grid.low[g], grid.high[g])
-                    wanted[j, g] += power - on_powers * base[b, j + 1, g]
-                    force = _project(ramps, j, g, new, change, on_ramps, -grid.ramp[g], grid.ramp[g])
-                    force -= on_ramps * (base[b, j + 1, g] - base[b, j, g])
-                    wanted[j, g] += force
-                    if j > 0:
-                        wanted[j - 1, g] -= force
-                        pull[j - 1, g] -= pull[j, g]
-            moved = np.dot(grid.waves.T, pull + np.dot(wanted, grid.stiffness))
-            for j in range(n):
-                pull[j] = 0.0
-                for i in range(n_gen):
-                    for g in range(n_gen):
-                        pull[j, g] += moved[j, i] * grid.inverses[j, i, g]
-            x[b, 1:] = np.dot(grid.waves, pull)
+    turns, powers, ramps = np.zeros((2, n, n_gen)), np.zeros((2, n, n_gen)), np.zeros((2, n, n_gen))
+    slack = np.zeros((2, n))  # as the others: copies, then duals
+    for k in range(ITERATIONS):
+        new = RELAXATION if k > 0 else 1.0
+        p = base + np.dot(x, grid.stiffness)
         for j in range(n):
+            weight, short = (0.5 if j == n - 1 else 1.0) / n, demand[j + 1] - p[j + 1].sum()
+            drawn = new * short + (1.0 - new) * slack[0, j] + slack[1, j] / on_slack
+            paid = weight * cost[0] / on_slack
+            slack[0, j] = max(drawn - paid, 0.0) + min(drawn + paid, 0.0)
+            slack[1, j] = on_slack * (drawn - slack[0, j])
+            shared = on_slack * (demand[j + 1] - base[j + 1].sum() - slack[0, j]) + slack[1, j]
             for g in range(n_gen):
-                x[b, j + 1, g] = min(max(x[b, j + 1, g], x[b, j, g] - grid.turn), x[b, j, g] + grid.turn)
+                turn, change = x[j + 1, g] - x[j, g], p[j + 1, g] - p[j, g]
+                pull[j, g] = _project(turns, j, g, new, turn, on_turns, -grid.turn, grid.turn)
+                wanted[j, g] = shared - weight * cost[1 + g]
+                power = _project(powers, j, g, new, p[j + 1, g], on_powers, grid.low[g], grid.high[g])
+                wanted[j, g] += power - on_powers * base[j + 1, g]
+                force = _project(ramps, j, g, new, change, on_ramps, -grid.ramp[g], grid.ramp[g])
+                force -= on_ramps * (base[j + 1, g] - base[j, g])
+                wanted[j, g] += force
+                if j > 0:
+                    wanted[j - 1, g] -= force
+                    pull[j - 1, g] -= pull[j, g]
+        moved = np.dot(grid.waves.T, pull + np.dot(wanted, grid.stiffness))
+        pull[:] = 0.0
+        for j in range(n):
+            for i in range(n_gen):
+                for g in range(n_gen):
+                    pull[j, g] += moved[j, i] * grid.inverses[j, i, g]
+        x[1:] = np.dot(grid.waves, pull)
 
 
 @inlined

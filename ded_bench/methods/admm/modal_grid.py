@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ded_bench.methods.admm.coarse_dispatch import cheapen, coarse_grid
+from ded_bench.methods.admm.coarse_dispatch import coarse_grid, dispatch_angles
 from ded_bench.methods.admm.modal_kernels import Modes, oscillators, swing
 from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
@@ -26,7 +26,6 @@ from ded_bench.plants.lossless import algebraic
 from ded_bench.plants.lossless.network import Network
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.compiled import compiled, copy_row
-from ded_bench.problem.dispatch import merit_order
 from ded_bench.problem.quantities import Indices, largest_divisor
 from ded_bench.surrogates.koopman import hat_functions
 
@@ -38,9 +37,10 @@ CONTRACTION = 0.3
 ROUND_OFF = 1e-6
 #: Knots at which the stiffness along a trajectory is taken; linear between them.
 STIFFNESS_KNOTS = 5
-#: Longest time from one power flow along a trajectory to the next, s, but for knots farther apart.
-FLOWS_S = 2.0
-#: Costs are relative to the static dispatch, but an instance is not worth more than this mean cost per
+#: Longest time from one power flow along a trajectory to the next, s, but where half of the time between
+#: coarse knots is longer.
+FLOWS_S = 0.8
+#: Costs are relative to the merit order, but an instance is not worth more than this mean cost per
 #: pair of generators.
 SMALLEST_COST = 0.05
 
@@ -54,7 +54,7 @@ class Start:
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0: q, q̇, (batch, 2, n_modes)
     taken: Array  # T (L - L_0) on the time grid, (batch, n_points, n_gen), pu
-    scale: Array  # what costs are relative to: mean cost of the static dispatch, (batch,)
+    scale: Array  # what costs are relative to: mean cost of the merit order, (batch,)
     schedule: Array  # first schedule, (batch, n_knots, n_gen), pu
 
 
@@ -79,9 +79,10 @@ class ModalGrid:
         self.spacing = float(knots[1] - knots[0])
         self.ramp = case.ramp * self.spacing
         self._linearise_nominal()
-        self.coarse = coarse_grid(case, knots, bound, self.stiffness)
+        self.coarse = coarse_grid(case, knots, bound, self.stiffness, self.compliance)
         #: Knots from one power flow along a trajectory to the next; those where stiffness is taken.
-        self.every = largest_divisor(len(knots) - 1, FLOWS_S / self.spacing)
+        flows = max(FLOWS_S / self.spacing, 0.5 * self.coarse.every)
+        self.every = largest_divisor(len(knots) - 1, flows)
         n_flows = (len(knots) - 1) // self.every + 1
         taken = np.linspace(0, n_flows - 1, min(STIFFNESS_KNOTS, n_flows)).round().astype(np.int64)
         self.stiffness_knots = self.every * taken
@@ -140,16 +141,13 @@ class ModalGrid:
         return Start(problems, served, theta, state, taken, scale, schedule)
 
     def _first(self, problems: StackedInstances, taken: Array) -> tuple[Array, Array]:
-        """Mean cost of the static dispatch, (batch,), and first schedules, (batch, n_knots, n_gen), pu."""
-        case, every = self.case, self.coarse.every
-        cost, p_initial = problems.cost[:, None], problems.p_initial[:, None]
-        load, base = problems.load[:, :: every * POINTS], p_initial + taken[:, :: every * POINTS]
-        static, demand = merit_order(case, cost[..., 1:], cost[..., 0], load), -load.sum(axis=2)
-        paid = (cost[..., 1:] * static).sum(axis=2) + cost[..., 0] * np.abs(demand - static.sum(axis=2))
-        scale = np.maximum(paid.mean(axis=1), SMALLEST_COST * max(1.0, len(self.gain) / 2))
-        x = (static - base) @ self.compliance
-        x[:, 0] = 0.0
-        cheapen(self.coarse, base, demand, problems.cost / scale[:, None], x)
+        """Mean cost of the merit order, (batch,), and first schedules, (batch, n_knots, n_gen), pu."""
+        case, every, p_initial = self.case, self.coarse.every, problems.p_initial[:, None]
+        demand = -problems.load[:, :: every * POINTS].sum(axis=2)
+        order = np.argsort(problems.cost[:, 1:], kind="stable")
+        scale = np.full(len(problems), SMALLEST_COST * max(1.0, len(self.gain) / 2))
+        base = p_initial + taken[:, :: every * POINTS]
+        x = dispatch_angles(self.coarse, base, demand, problems.cost, order, scale)
         schedule = p_initial + taken[:, ::POINTS] + linear_between(x @ self.stiffness, every)
         track(schedule, case.p_min, case.p_max, self.ramp)
         return scale, schedule

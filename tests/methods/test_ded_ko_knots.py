@@ -131,9 +131,9 @@ def test_what_a_sparse_matrix_does_not_solve_blocks_do(ninebus: Case, monkeypatc
     instance, solve = short(ninebus, 1), ded_ko.prepare(ninebus, "TO", Settings(model="trajectory"))
     usual = solve(instance)
 
-    def hard(form: FreeForm, time_limit_s: float, staged: bool = False) -> FormAnswer:
+    def hard(form: FreeForm, time_limit_s: float, staged: bool = False, error: float = 0.0) -> FormAnswer:
         if staged:
-            return solve_form(form, time_limit_s, staged)
+            return solve_form(form, time_limit_s, staged, error)
         return FormAnswer(Status.FAILED, np.empty(0), 3, "piqp", "hard")
 
     monkeypatch.setattr(knot_program, "solve_form", hard)

@@ -60,6 +60,14 @@ def test_programs_given_by_arrays(solve) -> None:
     assert impossible.message
 
 
+def test_an_error_of_the_objective_saves_iterations() -> None:
+    """And is not exceeded."""
+    rough = piqp.solve_form(FORM, error=0.1)
+    assert rough.status == Status.OPTIMAL
+    assert rough.iterations < piqp.solve_form(FORM).iterations
+    assert FORM.cost @ rough.x == pytest.approx(7.0, abs=0.1)
+
+
 def test_what_round_off_spoils_is_solved_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of HiGHS's status `Unknown`: without presolve and scaled, the answer is the same."""
     told, first = highspy.Highs.getModelStatus, [highspy.HighsModelStatus.kUnknown]

@@ -24,6 +24,7 @@ from ded_bench.problem.schedule import Schedule
 from ded_bench.results.rows import Key, Row
 from ded_bench.results.timing import TIMING, TimingRow, timing_summary
 from ded_bench.run import bench as bench_module
+from ded_bench.run import environment
 from ded_bench.run.bench import ROUNDS, Job, bench, rounds_of, runs_of, timed
 from ded_bench.run.pool import WorkerDiedError, Workers
 from ded_bench.run.tasks import prepared
@@ -272,3 +273,19 @@ def test_runs_of_a_results_table(fake, tmp_path: Path) -> None:
         Job("fake", "TO", Settings(time_limit_s=20.0, search=(tmp_path,))),
         Job("fake", "TO", Settings("fast=on", "linear", search=(tmp_path,))),
     ]
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ("model name\t: Some CPU\nflags\t\t: fpu avx2 avx512f\n", "Some CPU AVX-512"),
+        ("model name\t: Some CPU\nflags\t\t: fpu avx2\n", "Some CPU AVX2"),
+        ("model name\t: Some CPU\nflags\t\t: fpu\n", "Some CPU"),
+        ("", "unknown processor"),
+    ],
+)
+def test_a_host_is_told_with_its_vectors(facts: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processors of one name may differ in them, and then in times."""
+    monkeypatch.setattr(environment.Path, "read_text", lambda self: facts)
+    monkeypatch.setattr(environment.platform, "processor", lambda: "")
+    assert environment.host.__wrapped__().startswith(f"{said}, ")

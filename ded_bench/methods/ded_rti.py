@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ded_bench.methods.knot_program import Plan
-from ded_bench.methods.knots import knots_ahead, knots_in_operation, knots_on_clock
+from ded_bench.methods.knots import case_knots, knots_in_operation, knots_on_clock
 from ded_bench.methods.options import option, read_options
 from ded_bench.methods.solution import Settings, Solution
 from ded_bench.methods.state_estimate import StateEstimate
@@ -79,7 +79,7 @@ class RealTimeSolver:
         bounds = self._bounds
         if self.case.slack is None:  # condensed programs leave open what they may
             bounds = bounds.tightened(part=SOFT_TOLERANCE)
-        knots = knots_ahead(self.case, instance)
+        knots = case_knots(self.case, instance)
         first = self._step(bounds, instance, knots, Plan(None))
         if first.schedule is None:
             return first

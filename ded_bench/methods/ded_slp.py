@@ -42,6 +42,8 @@ REFINEMENT = 0.01
 FREE_STEPS = 3
 #: Agreement of a simulated schedule's cost with its program's, as a fraction.
 COST_TOLERANCE = 1e-6
+#: Error of a program's optimum, as a fraction; studies/linear_programs.md tells how many iterations it saves.
+ERROR = 2e-7
 #: A program is not the last if its trajectory stays clear, by this part of it, of a bound that held it: on
 #: validation draws by 6e-4 at most.
 PESSIMISM = 5e-3
@@ -168,7 +170,8 @@ class _OnPlant:
     def _solve(self, around: Simulated, number: int) -> Attempt[Prediction]:
         model = plant_of(self.case).linearise_along(around.trajectory, self.points)
         given = self.case, self.instance, self.bounds.tightened(MARGIN), model
-        self.last = program = KnotProgram(*given, radius=self.radius, before=self.last)
+        error = ERROR * abs(around.cost)
+        self.last = program = KnotProgram(*given, radius=self.radius, before=self.last, error=error)
         if self.is_near or not (number or program.condensed):  # a condensed program's rows are dense
             self.limits |= program.near(program.model.omega)
         enough = max(OPEN, REFINEMENT * around.excess) if number or self.is_near else np.inf

@@ -47,10 +47,6 @@ LONG = 20
 #: little as possible, and where a program prices every excess from the start: an exact penalty above nearly
 #: all multipliers of the limits.
 LEAST_PRICE, SOFT_PRICE = 100.0, 10.0
-#: Error of the objective that PIQP may leave, as a part of what the trajectory costs: of a program for a
-#: schedule, and of one that corrects a plan. On validation draws of 39bus and 140bus that saves a seventh of
-#: the iterations of `ded-slp`, whose costs change by less than 1e-7.
-ERROR, PLAN_ERROR = 2e-7, 1e-5
 #: Where an output exceeds this part of its bound it gets rows: at peaks, at so many points of an interval. A
 #: peak beyond the last part moves when it is cut off: the two points on either side of it get rows, too.
 NEAR, PARTS, CUT = 0.9, 6, 0.99
@@ -101,6 +97,7 @@ class KnotProgram:
         radius: most that a set-point may move, pu (trust region).
         condensed: whether states are substituted; None: on islands.
         before: the program along the trajectory before, near whose end to start.
+        error: of the objective that PIQP may leave, in its unit.
     """
 
     def __init__(
@@ -113,21 +110,20 @@ class KnotProgram:
         radius: float = np.inf,
         condensed: bool | None = None,
         before: KnotProgram | None = None,
+        error: float = 0.0,
     ) -> None:
         self.model = model = model.monitored(bounds.matrix)
         self.bounds, self._radius, self._surprises = bounds, radius, plan.room if plan else None
+        self._error = error
         self._margin = np.zeros(len(model.omega)) if plan is None or plan.margin is None else plan.margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
         self.condensed = case.slack is None if condensed is None else condensed
-        pieces = None
+        pieces = None if plan is None else pieces_of(model)
         if before is not None and len(before._columns.signs) > 1:
             pieces = before._columns.pieces
         self._columns: KnotColumns = KnotColumns(case, instance, model, self.condensed, pieces)
         self._output_rows = OutputRows(model)
         self._all_costs = (self._columns.generation[1:] if self.condensed else self._columns.cost).sum()
-        by_slack = self._columns.slack_price * np.abs(model.p_slack).sum()
-        along = float((self._columns.generation * model.p_gen).sum() + by_slack)
-        self._error = abs(along) * (ERROR if plan is None else PLAN_ERROR)
         #: Outputs and knots whose limits have rows, by knots.
         bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
         self._bounded = self._held = bounded
@@ -206,7 +202,7 @@ class KnotProgram:
                 places, (up, down) = self._output_rows.places(self._held, limits), self._sides(limits)
                 answer = self._by_simplex(form, np.append(places[up], -1 - places[down]), left_s)
             else:
-                answer = solve_form(form, left_s, staged=not self._is_sparse, error=self._error)
+                answer = solve_form(form, left_s, staged=not self._is_sparse)
                 if answer.status == Status.FAILED and self._is_sparse:
                     other = solve_form(form, max(deadline - time.perf_counter(), 0.0), staged=True)
                     answer = replace(other, iterations=answer.iterations + other.iterations)

@@ -12,10 +12,6 @@ from ded_bench.problem.instance import Instance
 #: scenarios of two-area-agc and 39bus-agc 3 s let one peak pass the bound by 0.3 mHz, and from 6 to 10 s
 #: neither peaks nor costs changed by more than 0.06 %.
 NEAR_S = 8.0
-#: How many times as long as the first interval of a plan the last may be. On 24 validation draws each of
-#: 39bus and two-area costs are then 0.007 and 0.005 % higher than with the case's knots, in two thirds of the
-#: time on 39bus; with 3 times one draw of two-area exceeds its bound.
-GROWTH = 2.5
 
 
 def is_reachable(case: Case, instance: Instance, points: Indices) -> bool:
@@ -49,18 +45,6 @@ def case_knots(case: Case, instance: Instance, distance_s: float | None = None) 
     if distance_s is not None:
         times = np.linspace(0.0, horizon_s, max(round(horizon_s / distance_s), 1) + 1)
     return knot_points(np.concatenate([times, control_times(case, instance)]), instance.dt_s)
-
-
-def knots_ahead(case: Case, instance: Instance) -> Indices:
-    """Grid points of knots of a plan whose end matters least: as close as the case's at first, then farther.
-
-    Intervals grow geometrically, by GROWTH in all. Under secondary control knots are the case's.
-    """
-    if case.agc is not None:
-        return case_knots(case, instance)
-    count = round((case.n_knots - 1) * np.log(GROWTH) / (GROWTH - 1))
-    times = np.append(0.0, np.cumsum(np.geomspace(1.0, GROWTH, count)))
-    return knot_points(times * (instance.horizon_s / times[-1]), instance.dt_s)
 
 
 def knots_in_operation(case: Case, instance: Instance) -> Indices:

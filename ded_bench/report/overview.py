@@ -68,7 +68,10 @@ def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = (
     items = [f"`{case}`: `{place.as_posix()}`, seen from this page" for case, place in places.items()]
     hosts = sorted({str(host) for grid in grids for host in grid.timing["host"]})
     items += [f"{grid.case.id}: {note}" for grid in grids for note in grid.notes if note.startswith("Times")]
-    items += [f"Times taken on: {', '.join(hosts) or '–'}.", f"Written {now()} with: {environment()}."]
+    for host in hosts:
+        timed = ", ".join(grid.case.id for grid in grids if (grid.timing["host"] == host).any())
+        items.append(f"Times of {timed} were taken on: {host}.")
+    items.append(f"Written {now()} with: {environment()}.")
     return write_page([*made, "## Where the rows come from", bullets(items)], out, "overview")
 
 

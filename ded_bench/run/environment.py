@@ -68,7 +68,7 @@ def _version(package: str) -> str:
 
 
 def _cpu() -> str:
-    """Its name, and its widest vectors, which change times of solvers of dense blocks twofold."""
+    """Its name, and its widest vectors: processors of one name may differ in them."""
     try:
         lines = [line.partition(":") for line in Path("/proc/cpuinfo").read_text().splitlines()]
     except OSError:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ded_bench.methods import ded_ko_knots, ded_rti, surprises
+from ded_bench.methods import ded_ko_knots, surprises
 from ded_bench.methods.ded_rti import NEAR_S, Options, RealTimeSolver
 from ded_bench.methods.ed import static_dispatch
 from ded_bench.methods.knot_program import KnotProgram, Plan
-from ded_bench.methods.knots import GROWTH, case_knots, knots_ahead
+from ded_bench.methods.knots import case_knots
 from ded_bench.methods.registry import get_method
 from ded_bench.methods.reserve import steady_speeds, sudden_speeds
 from ded_bench.methods.slp import MAX_SOFT_PROGRAMS
@@ -52,22 +52,9 @@ def steady(case: Case, instance: Instance) -> Instance:
     return at_rest(case, instance).model_copy(update={"load": load})
 
 
-def test_knots_of_a_plan_lie_farther_apart_the_later(case: Case) -> None:
-    """From the case's distance to GROWTH of it, within a grid step and what fewer intervals leave over."""
-    instance = short(case, 0)
-    own, ahead = case_knots(case, instance), knots_ahead(case, instance)
-    lengths = np.diff(ahead)
-    assert (ahead[0], ahead[-1]) == (own[0], own[-1])
-    assert (np.diff(lengths) >= -1).all()
-    assert lengths[[0, -1]] == pytest.approx(np.diff(own)[0] * np.array([1.0, GROWTH]), rel=0.1, abs=1.0)
-
-
 @pytest.mark.parametrize("regime", ["NO", "TO"])
-def test_soft_limits_do_not_change_the_optimum(
-    case: Case, koopman, regime: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_soft_limits_do_not_change_the_optimum(case: Case, koopman, regime: str) -> None:
     """A lifted model is the same along every plan; where limits can hold, the penalty is exact."""
-    monkeypatch.setattr(ded_rti, "knots_ahead", case_knots)
     for index in range(3):
         instance = at_rest(case, short(case, index))
         hard = prepared(ded_ko_knots, case, koopman, regime)(instance)
@@ -94,9 +81,8 @@ def test_a_horizon_shorter_than_the_plans_own_is_planned_to_its_end(threebus: Ca
     assert (np.diff(plan.t) > 0).all()
 
 
-def test_what_is_infeasible_is_exceeded_little(ninebus: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_infeasible_is_exceeded_little(ninebus: Case) -> None:
     """A start beyond the bound: in operation a plan says so; its total excess is nearly the least."""
-    monkeypatch.setattr(ded_rti, "knots_ahead", case_knots)
     koopman = linear_model(ninebus)
     bound, instance = ninebus.omega_bound("TO"), short(ninebus, 0)
     beyond = instance.initial.model_copy(update={"omega": dict.fromkeys(ninebus.generators, 1.2 * bound)})

@@ -61,6 +61,7 @@ def test_the_page_and_its_tables(folders: list[Path], tmp_path: Path) -> None:
     page = Page((out / "overview.html").read_text())
     assert not page.open
     assert not list(page.every("img"))
+    assert f"- Times of {', '.join(GENERATORS)} were taken on: h.\n" in (out / "overview.md").read_text()
 
 
 def test_folders_without_results_of_one_shipped_case_are_refused(folders, threebus, tmp_path, capsys) -> None:

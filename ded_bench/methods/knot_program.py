@@ -95,7 +95,6 @@ class KnotProgram:
         model: a linear model along a trajectory that starts at P_0.
         plan: to correct, if any: its margin, and its room where excess has a price.
         radius: most that a set-point may move, pu (trust region).
-        condensed: whether states are substituted; None: on islands.
         before: the program along the trajectory before, near whose end to start.
         error: of the objective that PIQP may leave, in its unit.
     """
@@ -108,7 +107,6 @@ class KnotProgram:
         model: TimeVarying,
         plan: Plan | None = None,
         radius: float = np.inf,
-        condensed: bool | None = None,
         before: KnotProgram | None = None,
         error: float = 0.0,
     ) -> None:
@@ -117,7 +115,6 @@ class KnotProgram:
         self._error = error
         self._margin = np.zeros(len(model.omega)) if plan is None or plan.margin is None else plan.margin
         self._case, self._instance, self._n = case, instance, len(model.lengths)
-        self.condensed = case.slack is None if condensed is None else condensed
         pieces = None if plan is None else pieces_of(model)
         if before is not None and len(before._columns.signs) > 1:
             pieces = before._columns.pieces
@@ -135,6 +132,11 @@ class KnotProgram:
             self.fixed = before.fixed
         if before is not None and self.condensed:
             self._held, self._basis = self._held | before._held, before._basis
+
+    @property
+    def condensed(self) -> bool:
+        """Whether states are substituted: on islands."""
+        return self._case.slack is None
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
         """Solve with outputs limited, either way, at all knots and at the points chosen.

@@ -125,7 +125,7 @@ def test_an_estimate_under_a_forecast_that_comes_true_is_the_state(island: Case,
 
 @pytest.mark.parametrize("price", [None, LEAST_PRICE, SOFT_PRICE])
 def test_condensed_programs_have_the_optimum_of_those_with_states(
-    island: Case, instance: Instance, price: float | None
+    island: Case, instance: Instance, price: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Along the static dispatch, beyond its bounds; widened where no schedule can keep them."""
     points = case_knots(island, instance)
@@ -134,7 +134,8 @@ def test_condensed_programs_have_the_optimum_of_those_with_states(
     bounds = island.bounds("TO").tightened(part=0.0 if price is None else 0.99)
     found, widened = [], []
     for condensed in (False, True):
-        program = KnotProgram(island, instance, bounds, model, condensed=condensed)
+        monkeypatch.setattr(KnotProgram, "condensed", condensed)
+        program = KnotProgram(island, instance, bounds, model)
         if not condensed:
             limits = np.array(sorted(program.near(program.model.omega)))
         if price is None:

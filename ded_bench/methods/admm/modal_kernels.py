@@ -257,20 +257,7 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
     for first in range(0, n_modes, LANES):
         used = min(LANES, n_modes - first)
         s[:] = 0.0
-        for m in range(used):
-            mode, at = first + m, 0
-            for r in range(4):
-                to_q[r, m], to_speed[r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
-                for c in range(r, 4):
-                    for i in range(1, len(maps)):
-                        on_speed, on_q = weights[2] * outputs[0, mode], weights[3] * outputs[1, mode]
-                        stage[at, m] += on_speed * maps[i, 1, r, mode] * maps[i, 1, c, mode]
-                        stage[at, m] += on_q * maps[i, 0, r, mode] * maps[i, 0, c, mode]
-                    at += 1
-        for m in range(LANES):
-            stage[7, m] += weights[1]
-            stage[8, m] -= weights[1]
-            stage[9, m] += weights[1] + weights[0]
+        _weigh_interval(maps, outputs, weights, first, to_q, to_speed, stage)
         for k in range(n - 2, -1, -1):
             for m in range(used):
                 pull[m] = gradient[k + 1, first + m]
@@ -305,6 +292,27 @@ def modal_change(maps: Array, outputs: Array, weights: Array, gradient: Array, c
                 for m in range(LANES):
                     gains[k, r, m] = gain[r, m]
         _roll_out(gains, to_q, to_speed, state, change, first)
+
+
+@compiled
+def _weigh_interval(
+    maps: Array, outputs: Array, weights: Array, first: int, to_q: Array, to_speed: Array, stage: Array
+) -> None:
+    """The map of an interval and its weights, of LANES modes from the first on; see `modal_change`."""
+    for m in range(min(LANES, maps.shape[3] - first)):
+        mode, at = first + m, 0
+        for r in range(4):
+            to_q[r, m], to_speed[r, m] = maps[-1, 0, r, mode], maps[-1, 1, r, mode]
+            for c in range(r, 4):
+                for i in range(1, len(maps)):
+                    on_speed, on_q = weights[2] * outputs[0, mode], weights[3] * outputs[1, mode]
+                    stage[at, m] += on_speed * maps[i, 1, r, mode] * maps[i, 1, c, mode]
+                    stage[at, m] += on_q * maps[i, 0, r, mode] * maps[i, 0, c, mode]
+                at += 1
+    for m in range(LANES):
+        stage[7, m] += weights[1]
+        stage[8, m] -= weights[1]
+        stage[9, m] += weights[1] + weights[0]
 
 
 @compiled

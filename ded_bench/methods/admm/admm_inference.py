@@ -148,7 +148,7 @@ def filled_up(values: Floats) -> Array32:
 
 def mean_modes_of(grid: ModalGrid, linear: ModalLinearisation) -> MeanModes:
     """Modes of the mean stiffness along trajectories, in which powers weigh by inertia."""
-    mean = grid.stiffness + np.tensordot(linear.stiffness, grid.shares, axes=(1, 0))
+    mean = grid.stiffness + np.einsum("k,bkgh->bgh", grid.shares, linear.stiffness)
     return mean_modes(mean, grid.mass, float(grid.network.m.mean()), grid.rate, float(grid.points[1]), POINTS)
 
 

@@ -53,7 +53,8 @@ class Start:
     served: NDArray[np.bool_]  # whether there is a power flow, (batch,)
     theta: Array  # equilibrium angles at t = 0, (batch, n_bus), rad
     state: Array  # modes at t = 0: q, q̇, (batch, 2, n_modes)
-    taken: Array  # T (L - L_0) on the time grid, (batch, n_points, n_gen), pu
+    demand: Array  # -L of all loads on the time grid, (batch, n_points), pu
+    taken: Array  # T (L - L_0) there, (batch, n_points, n_gen), pu
     scale: Array  # what costs are relative to: mean cost of the merit order, (batch,)
     schedule: Array  # first schedule, (batch, n_knots, n_gen), pu
 
@@ -130,24 +131,20 @@ class ModalGrid:
         network, batch = self.network, len(problems)
         theta, served = np.tile(self.theta, (batch, 1)), np.empty(batch, bool)
         wanted = np.hstack([problems.p_initial, network.load_injections(problems.load[:, 0])])
-        f, work = np.empty(network.n_bus), (np.empty(wanted.shape[1]), np.empty(len(network.coupling)))
-        for b in range(batch):
-            factor = self._factors[0].copy()
-            served[b] = algebraic.solve_algebraic(self._whole, wanted[b], factor, theta[b], f, work)
-        served &= (np.abs(theta @ network.incidence.T) < 0.5 * np.pi).all(axis=1)
+        solve_power_flows(self._whole, wanted, self._factors[0], theta, served)
+        demand = -problems.load.sum(axis=2)
         taken = (problems.load - problems.load[:, :1]) @ self.share.T
         state = np.stack([problems.delta @ self._inverse, problems.omega @ self._inverse], axis=1)
-        scale, schedule = self._first(problems, taken)
-        return Start(problems, served, theta, state, taken, scale, schedule)
+        scale, schedule = self._first(problems, demand, taken)
+        return Start(problems, served, theta, state, demand, taken, scale, schedule)
 
-    def _first(self, problems: StackedInstances, taken: Array) -> tuple[Array, Array]:
+    def _first(self, problems: StackedInstances, demand: Array, taken: Array) -> tuple[Array, Array]:
         """Mean cost of the merit order, (batch,), and first schedules, (batch, n_knots, n_gen), pu."""
         case, every, p_initial = self.case, self.coarse.every, problems.p_initial[:, None]
-        demand = -problems.load[:, :: every * POINTS].sum(axis=2)
         order = np.argsort(problems.cost[:, 1:], kind="stable")
         scale = np.full(len(problems), SMALLEST_COST * max(1.0, len(self.gain) / 2))
-        base = p_initial + taken[:, :: every * POINTS]
-        x = dispatch_angles(self.coarse, base, demand, problems.cost, order, scale)
+        base, coarse_demand = p_initial + taken[:, :: every * POINTS], demand[:, :: every * POINTS]
+        x = dispatch_angles(self.coarse, base, coarse_demand, problems.cost, order, scale)
         schedule = p_initial + taken[:, ::POINTS] + linear_between(x @ self.stiffness, every)
         track(schedule, case.p_min, case.p_max, self.ramp)
         return scale, schedule
@@ -193,7 +190,7 @@ class ModalGrid:
         rest = f - slow @ self.stiffness
         rest -= np.einsum("ks,bskg->bkg", self.between[::points], slow[:, None] @ change)
         whole = start.taken + linear_between(rest - start.taken[:, ::points], points)
-        slack = -(whole.sum(axis=2) + problems.load.sum(axis=2))
+        slack = start.demand - whole.sum(axis=2)
         return ModalLinearisation(-(whole @ self.gain), self.gain.T @ change @ self.shape.T, slack, change)
 
     def respond(self, powers: Array, start: Start, linear: ModalLinearisation) -> tuple[Array, Array, Array]:
@@ -215,11 +212,40 @@ class ModalGrid:
         return np.asarray(self.stiffness.sum(axis=0) + self.between @ linear.stiffness.sum(axis=2))
 
 
+@compiled
 def linear_between(values: Array, points: int) -> Array:
     """Linear between rows, (batch, n, n_columns) to (batch, points (n - 1) + 1, n_columns)."""
-    shares = np.arange(points)[:, None] / points
-    found = values[:, :-1, None] + shares * (values[:, 1:] - values[:, :-1])[:, :, None]
-    return np.concatenate([found.reshape(len(values), -1, values.shape[2]), values[:, -1:]], axis=1)
+    batch, n, n_columns = values.shape
+    found = np.empty((batch, points * (n - 1) + 1, n_columns))
+    for b in range(batch):
+        for k in range(n - 1):
+            for i in range(points):
+                for c in range(n_columns):
+                    change = values[b, k + 1, c] - values[b, k, c]
+                    found[b, points * k + i, c] = values[b, k, c] + i / points * change
+        copy_row(values[b, n - 1], found[b, points * (n - 1)])
+    return found
+
+
+@compiled
+def solve_power_flows(
+    grid: algebraic.CompiledGrid, wanted: Array, factor: Array, theta: Array, served: NDArray[np.bool_]
+) -> None:
+    """Power flows of a batch, each from the same angles.
+
+    Args:
+        grid: solves for all buses but the slack.
+        wanted: injections there, (batch, n_algebraic), pu.
+        factor: of the Jacobian at the first angles, (n_factor,).
+        theta: angles of all buses to start from; receives the answers, (batch, n_bus), rad.
+        served: receives whether there is one with less than 90° across each line, (batch,).
+    """
+    f, work = np.empty(theta.shape[1]), (np.empty(wanted.shape[1]), np.empty(len(grid.coupling)))
+    for b in range(len(theta)):
+        served[b] = algebraic.solve_algebraic(grid, wanted[b], factor.copy(), theta[b], f, work)
+        for i in range(len(grid.lines)):
+            across = theta[b, grid.lines[i, 0]] - theta[b, grid.lines[i, 1]]
+            served[b] = served[b] and abs(across) < 0.5 * np.pi
 
 
 @compiled

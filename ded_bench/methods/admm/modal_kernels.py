@@ -213,6 +213,7 @@ def interval_maps(step: Array, points: int) -> Array:
     return maps
 
 
+@compiled
 def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, points: int) -> MeanModes:
     """Modes of stiffnesses, in which powers weigh by the inverse of inertia.
 
@@ -224,13 +225,28 @@ def mean_modes(mean: Array, mass: Array, inertia: float, rate: float, h: float, 
         h: time from one grid point to the next, s.
         points: how many of them make an interval between knots.
     """
-    root = np.sqrt(mass)
-    squares, u = np.linalg.eigh(mean / np.outer(root, root))
-    maps = np.stack([interval_maps(oscillators(each / inertia, rate, h), points) for each in squares])
-    maps[:, :, :, 2:] /= inertia
-    shapes = u / root[:, None]
-    slack = (mean.sum(axis=2)[:, None] @ shapes)[:, 0]
-    return MeanModes(root[:, None] * u, maps, np.stack([(shapes**2).sum(axis=1), slack**2], axis=1))
+    (batch, n, _), root, relative = mean.shape, np.sqrt(mass), np.empty(mean.shape[1:])
+    powers, outputs = np.empty_like(mean), np.zeros((batch, 2, n))
+    maps = np.empty((batch, points + 1, 2, 4, n))
+    for b in range(batch):
+        for g in range(n):
+            for i in range(n):
+                relative[g, i] = mean[b, g, i] / (inertia * root[g] * root[i])
+        squares, u = np.linalg.eigh(relative)
+        found = interval_maps(oscillators(squares, rate, h), points)
+        for m in range(n):
+            drawn = 0.0
+            for g in range(n):
+                powers[b, g, m], angle = root[g] * u[g, m], u[g, m] / root[g]
+                outputs[b, 0, m] += angle**2
+                for i in range(n):
+                    drawn += mean[b, g, i] * angle
+            outputs[b, 1, m] = drawn**2
+            for i in range(points + 1):
+                for r in range(2):
+                    for c in range(4):
+                        maps[b, i, r, c, m] = found[i, r, c, m] / (1.0 if c < 2 else inertia)
+    return MeanModes(powers, maps, outputs)
 
 
 @compiled

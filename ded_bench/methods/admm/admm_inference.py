@@ -30,7 +30,7 @@ from ded_bench.methods.admm.modal_kernels import (
 from ded_bench.methods.admm.problems import POINTS
 from ded_bench.methods.knots import track
 from ded_bench.problem.case import Array
-from ded_bench.problem.compiled import compiled, inlined
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Array32
 from ded_bench.surrogates.koopman import hat_functions
 
@@ -197,12 +197,12 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
     """
     (batch, n, n_gen), n_points = powers.shape, given.offset.shape[1]
     omega, p_slack = np.empty((n_points, n_gen), np.float32), np.empty(n_points, np.float32)
-    p, gradient = np.empty((n, n_gen)), np.empty((n, n_gen))
+    gradient = np.empty((n, n_gen))
     # copies and duals
     bounded, moved = np.empty((2, n, n_gen)), np.empty((2, n, n_gen))
     speeds, slack = np.empty((2, n_points, n_gen), np.float32), np.empty((2, n_points))
     for b in range(batch):
-        p[:] = powers[b]
+        p = powers[b].copy()
         bounded[:], moved[:], speeds[:], slack[:] = 0.0, 0.0, 0.0, 0.0
         first = np.inf
         for i in range(len(settings)):
@@ -220,7 +220,8 @@ def iterate(powers: Array, given: AdmmProblems, limits: AdmmLimits, modes: Modes
             if not _loss(p, omega, p_slack, given, b, limits, modes) <= first:
                 continue
         if np.isfinite(p).all():  # where the grid swings up, it may not be
-            powers[b] = p
+            for j in range(n):
+                copy_row(p[j], powers[b, j])
 
 
 @inlined

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ded_bench.problem.case import Array, Case
-from ded_bench.problem.compiled import compiled, inlined
+from ded_bench.problem.compiled import compiled, copy_row, inlined
 from ded_bench.problem.quantities import Indices, largest_divisor
 
 #: A bound is loose if a generator that ramps alone, at its limit, turns at less than this part of it.
@@ -95,7 +95,9 @@ def dispatch_angles(
     x, powers = np.zeros(base.shape), np.empty_like(base[0])
     for b in range(len(x)):
         scale[b] = max(scale[b], _merit_order(grid, demand[b], cost[b], base[b, 0], order[b], powers))
-        x[b, 1:] = np.dot(powers - base[b], grid.compliance)[1:]
+        angles = np.dot(powers - base[b], grid.compliance)
+        for j in range(1, len(powers)):
+            copy_row(angles[j], x[b, j])
         if grid.is_tight:
             _cheapen(grid, base[b], demand[b], cost[b] / scale[b], x[b])
         for j in range(1, len(powers)):
@@ -168,7 +170,7 @@ def _cheapen(grid: CoarseGrid, base: Array, demand: Array, cost: Array, x: Array
             for i in range(n_gen):
                 for g in range(n_gen):
                     pull[j, g] += moved[j, i] * grid.inverses[j, i, g]
-        x[1:] = np.dot(grid.waves, pull)
+        np.dot(grid.waves, pull, x[1:])
 
 
 @inlined

@@ -27,7 +27,7 @@ STEP       = $(RUN) $@ --case "$(CASE)" --results "$(RESULTS)" --split "$(SPLIT)
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo "  Settings: CASE=$(CASE) RESULTS=$(RESULTS) SPLIT=test|train|all REGIME=r LIMIT=n WORKERS=$(WORKERS)"
+	@echo "  Settings: CASE=$(CASE) RESULTS=$(RESULTS) SPLIT=test|train|validation|all REGIME=r LIMIT=n WORKERS=$(WORKERS)"
 	@echo "    SCENARIOS=n TIMED=n; further options of commands: KOOPMAN=\"--count 24\" TRAIN=\"--seconds 60\" BENCH=..."
 	@echo "  CASE: a shipped case ($(CASES), and the islands two-area-agc ...) or a folder"
 
@@ -45,7 +45,7 @@ solve-baselines:  ## solve and score static dispatch, DED and DED-KO in all regi
 radau:            ## full DED by Radau collocation: the accurate reference
 train-dpc:        ## train the policies on the training instances
 solve-dpc:        ## solve and score with the policies
-models:           ## DED-KO on other models of the dynamics, and the errors of each
+models:           ## DED-KO on other models of the dynamics
 bench:            ## everything that is missing, then time each method alone on the machine
 report:           ## the same, then the tables and the report
 online:           ## the closed loop: all methods at their own latency, then sweeps over latency and forecast
@@ -53,7 +53,7 @@ certify:          ## certify the policy on fresh instances
 train-ko solve-baselines radau train-dpc solve-dpc models bench report online certify: $(STAMP)
 	$(STEP)
 
-suite: $(STAMP)  ## the reports of all cases, then one page over them
+suite: $(STAMP)  ## the reports of the lossless grids, then one page over them
 	for case in $(CASES); do $(MAKE) report CASE=$$case RESULTS=results/$$case || exit 1; done
 	$(BIN)/ded-bench overview --results $(CASES:%=results/%)
 

@@ -28,7 +28,7 @@ try:
     import gymnasium
     from gymnasium.spaces import Box, Dict
 except ModuleNotFoundError:
-    raise InputError("gymnasium", "", "environments need it: pip install 'ded-bench[gym]'") from None
+    raise InputError("gymnasium", "", "environments need it: pip install gymnasium") from None
 
 __all__ = ["DispatchEnv", "register"]
 

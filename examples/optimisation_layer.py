@@ -2,7 +2,7 @@
 
 From the folder that holds this file (extras `train` and `examples`); the second line trains for some minutes:
 
-    pip install 'ded-bench[train,examples]'
+    pip install '.[train,examples]'
     python optimisation_layer.py
     ded-bench solve --method optimisation_layer:solve --regime TO --limit 3 --out results/mine
 """

@@ -2,7 +2,7 @@
 
 From the folder that holds this file; the second line trains for a quarter of an hour, and writes the weights:
 
-    pip install 'ded-bench[train,gym,examples]'
+    pip install '.[train,gym,examples]'
     python trained_agent.py
     ded-bench solve --case two-area --method trained_agent:solve --regime TO --limit 3 --out results/mine
     ded-bench online --case two-area --method trained_agent:solve --regime TO --scenarios 3 --out results/mine

@@ -42,8 +42,13 @@ def add_commands(commands: Any) -> None:
     p.add_argument("--force", action="store_true", help="train even if the file exists")
     p.set_defaults(run=_train_ko)
 
-    p = command(commands, "train-dpc", "train policies, by default all")
-    p.add_argument("--method", type=names, metavar="M[,M]", help=f"default: {','.join(trainable())}")
+    p = command(commands, "train-dpc", "train policies")
+    p.add_argument(
+        "--method",
+        type=names,
+        metavar="M[,M]",
+        help=f"default: of {','.join(trainable())} those for the case",
+    )
     declare(p, "--regime", "--case", "--seed", "--results")
     p.add_argument("--model", default="", help=f"to train on: {MODEL_HELP}; default: {TRAINED[0]}")
     budget = p.add_mutually_exclusive_group()

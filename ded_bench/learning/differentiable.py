@@ -22,7 +22,7 @@ from ded_bench.surrogates.koopman import hat_functions
 try:
     import torch
 except ModuleNotFoundError:
-    problem = "what is differentiated needs PyTorch: pip install 'ded-bench[train]'"
+    problem = "what is differentiated needs PyTorch: pip install torch"
     raise InputError("torch", "", problem) from None
 
 

@@ -47,7 +47,7 @@ def add_commands(commands: Any) -> None:
         "--method",
         type=names,
         metavar="M[,M]",
-        help=f"default: of {','.join(trainable())} those for the case",
+        help=f"default: all of {','.join(trainable())} that plan on the case",
     )
     declare(p, "--regime", "--case", "--seed", "--results")
     p.add_argument("--model", default="", help=f"to train on: {MODEL_HELP}; default: {TRAINED[0]}")

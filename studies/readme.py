@@ -12,7 +12,7 @@ import pandas as pd
 
 from ded_bench.analysis.online_summary import practice_lines
 from ded_bench.analysis.reference import result_lines
-from ded_bench.analysis.summary import GROUP, titled
+from ded_bench.analysis.summary import GROUP
 from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.problem.scenario import QUALITIES
 from ded_bench.report.sources import Sources, read_sources
@@ -85,7 +85,7 @@ def practice() -> str:
     """Today's practice and other plans on islands, in the longest scenarios, loads as announced."""
     rows = []
     for case in ISLANDS:
-        lines = titled(practice_lines(run(case).practice))
+        lines = practice_lines(run(case).practice)
         lines = lines[(lines["regime"] == "TO") & (lines["forecast"] == QUALITIES[0])]
         lines = lines[(lines["minutes"] == lines["minutes"].max()) & (lines["settings"] != "every=300")]
         for line in lines.sort_values("mean_peak_mhz", ascending=False).to_dict("records"):

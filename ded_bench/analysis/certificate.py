@@ -1,4 +1,4 @@
-"""A statistical certificate of a policy: how surely it meets every limit near the condensed optimum.
+"""A statistical certificate of a policy: how surely it meets every limit near a linear program's optimum.
 
 m fresh instances are drawn from seeds that nothing else uses. On each, the policy and a reference
 method answer, both answers are re-simulated on the plant, and a *success* is a schedule that meets
@@ -201,11 +201,11 @@ def certify(
     versions = [str(get_method(method).version) for method, _ in candidate.pair]
     decisive = "|".join([case.fingerprint, str(seed), *versions, *facts.values()])
     fingerprint = hashlib.sha256(decisive.encode()).hexdigest()[:12]
-    done = {r.index: r for r in ROWS.existing(path) if r.fingerprint == fingerprint and r.index < count}
+    done = {r.index: r for r in ROWS.existing(path) if r.fingerprint == fingerprint}
     missing = [i for i in range(count) if i not in done]
     chunks = [tuple(missing[start : start + CHUNK]) for start in range(0, len(missing), CHUNK)]
     calls = [(judge, (case, candidate, seed, chunk)) for chunk in chunks]
-    bar = tqdm(total=count, initial=len(done), unit="instance", disable=None, desc="certify")
+    bar = tqdm(total=count, initial=count - len(missing), unit="instance", disable=None, desc="certify")
     with bar, Workers(workers) as pool:
         for _, made in pool.imap(calls, chunks):
             if not isinstance(made, list):
@@ -213,7 +213,7 @@ def certify(
             done |= {row.index: dataclasses.replace(row, fingerprint=fingerprint) for row in made}
             ROWS.write(path, [done[index] for index in sorted(done)])
             bar.update(len(made))
-    rows = ROWS.frame(done.values())
+    rows = ROWS.frame(done[index] for index in range(count))
     limits = meets_limits(rows, criteria.tolerance_hz, criteria.tolerance_pu)
     near = 100.0 * (rows["objective"] / rows["reference"] - 1.0) <= criteria.gap_percent
     successes = int((limits & near).sum())

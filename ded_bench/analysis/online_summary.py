@@ -7,7 +7,7 @@ from typing import Any
 import pandas as pd
 
 from ded_bench.analysis import summary
-from ded_bench.analysis.summary import GROUP, named
+from ded_bench.analysis.summary import GROUP, named, titled
 from ded_bench.problem.scenario import QUALITIES
 from ded_bench.results.online_results import ONLINE, OnlineResults
 
@@ -65,8 +65,11 @@ def practice_rows(results: OnlineResults, case: str) -> pd.DataFrame:
 def practice_lines(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, kind of forecast, length, method, period and latency of `practice_rows`."""
     by = ["forecast", "minutes", *LOOP]
-    made = [dict(zip(by, key, strict=True)) | _beside(rows) for key, rows in frame.groupby(by, sort=False)]
-    return pd.DataFrame(made, columns=[*by, *_beside(frame[:0])])
+    made = [
+        dict(zip(by, key, strict=True)) | _beside(rows)
+        for key, rows in frame.groupby(by, sort=False, dropna=False)
+    ]
+    return _titled(pd.DataFrame(made, columns=[*by, *_beside(frame[:0])]))
 
 
 def _beside(rows: pd.DataFrame) -> dict[str, Any]:
@@ -94,7 +97,17 @@ def _predicted(results: OnlineResults, case: str) -> pd.DataFrame:
 def own_latency(frame: pd.DataFrame) -> pd.DataFrame:
     """One line per regime, method, period and latency."""
     made = [dict(zip(LOOP, key, strict=True)) | _line(rows) for key, rows in frame.groupby(LOOP, sort=False)]
-    return pd.DataFrame(made, columns=[*LOOP, *_line(frame)])
+    return _titled(pd.DataFrame(made, columns=[*LOOP, *_line(frame)]))
+
+
+def _titled(lines: pd.DataFrame) -> pd.DataFrame:
+    """With a column `title`, which tells plant and start of a plan where these differ between lines."""
+    told = titled(lines)
+    if told["plant"].nunique() > 1:
+        told["title"] += " on " + told["plant"]
+    if told["warm"].nunique() > 1:
+        told["title"] += [" warm" if warm else " cold" for warm in told["warm"]]
+    return told
 
 
 def _line(rows: pd.DataFrame) -> dict[str, Any]:

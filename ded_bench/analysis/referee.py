@@ -7,7 +7,6 @@ keep the bounds of its regime, with an allowance for what two simulators may dif
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import subprocess
@@ -67,8 +66,9 @@ class RefereeRow:
     difference_hz: float | None = None
     error: str = ""
     andes: str = ""
-    fingerprint: str = ""
+    fingerprint: str = ""  # of the schedule and the grid
     method_version: int = 0
+    row: str = ""  # fingerprint of the results' row; empty: unknown
 
     @property
     def key(self) -> Key:
@@ -86,9 +86,9 @@ def verdict(bounds: Bounds, omega: Array) -> dict[str, Any]:
         bounds: of a regime.
         omega: deviations of the generators, shape (n, n_gen), rad/s.
     """
-    still = dataclasses.replace(bounds, limit=np.zeros_like(bounds.limit))
+    still = bounds.tightened(part=1.0)
     allowance = np.maximum(RELATIVE * bounds.limit, 2 * np.pi * ABSOLUTE_HZ)
-    allowed = dataclasses.replace(bounds, limit=bounds.limit + allowance)
+    allowed = bounds.tightened(by=-allowance)
     peaks = {f"peak_{kind}_hz": peak for kind, peak in still.excess_hz(omega).items()}
     return peaks | {"confirmed": not any(allowed.excess_hz(omega).values())}
 
@@ -219,7 +219,7 @@ def referee(
 
     def judge(row: Row, schedule: Schedule, name: str) -> RefereeRow:
         cells = judged(case, instances[row.instance], schedule, row.regime, grid, python)
-        cells |= {"fingerprint": name, "method_version": row.method_version}
+        cells |= {"fingerprint": name, "method_version": row.method_version, "row": row.fingerprint}
         return RefereeRow(**row.key._asdict(), plant=PLANT, **cells)
 
     with ThreadPoolExecutor(workers) as pool:

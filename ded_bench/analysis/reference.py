@@ -140,7 +140,7 @@ def _against(lines: pd.DataFrame, name: str, failures: str = "failures") -> NDAr
     return np.select([~known, behind, ours < papers], ["", "behind", "ahead"], "equal")
 
 
-#: References of cases without a paper's numbers: the first that has feasible rows, more than infeasible ones.
+#: References of cases without a paper's numbers: the first that has feasible rows, no fewer than others.
 ACCURATE = ("ded-radau", "ded-slp")
 #: What stands for a method where none of these has objectives: the best feasible row of each instance counts.
 BEST = ""

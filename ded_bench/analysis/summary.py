@@ -70,7 +70,7 @@ def newest(frame: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     is_new = dated["made"] == dated.groupby(GROUP)["made"].transform("last")
     notes = [
         f"{len(old)} rows of {title(*key)} {regime} are of an older model, policy or version and left out; "
-        f"those of {old['last'].iloc[0]} count."
+        f"those of {old['last'].iloc[0] or 'the newest version'} count."
         for regime, key, old in groups(dated[~is_new])
     ]
     rows = dated[is_new].drop_duplicates([*GROUP, "instance"], keep="last").sort_index()

@@ -10,7 +10,7 @@ import pandas as pd
 
 from ded_bench.analysis.online_summary import own_latency
 from ded_bench.analysis.reference import choose_reference, read_paper
-from ded_bench.analysis.summary import HEAD, gaps, named, outcome, own_first, titled
+from ded_bench.analysis.summary import HEAD, gaps, named, newest, outcome, own_first
 from ded_bench.cli.arguments import counted, say
 from ded_bench.problem.case import Case
 from ded_bench.report.columns import ONLINE, OUTCOME
@@ -26,9 +26,9 @@ _LOOP = (*HEAD, "latency_s", "n", "failures", "increase_percent_mean", "max_exce
 
 def tell_solved(case: Case, results: Results, rows: Sequence[Row], out: TextIO) -> None:
     """Print what became of some rows of a results folder."""
-    everything = results.frame()
-    paper = read_paper(case.folder)
-    reference = choose_reference(everything[everything["case"] == case.id], paper, reference_objectives(case))
+    everything = named(results.frame())
+    counting, _ = newest(everything[everything["case"] == case.id])
+    reference = choose_reference(counting, read_paper(case.folder), reference_objectives(case))
     found = outcome(gaps(named(ROWS.frame(rows)), reference.objectives))
     print(_text(PageTable(own_first(found), OUTCOME)), file=out)
     better = "`ded-bench bench` takes better ones"
@@ -43,7 +43,7 @@ def tell_operated(rows: Sequence[OnlineRow], paths: ResultsFolder) -> None:
     )
     columns = tuple(column for column in ONLINE if column.name in _LOOP)
     for forecast, part in frame.groupby("forecast", sort=False):
-        print(f"forecast {forecast}:\n{_text(PageTable(titled(own_latency(part)), columns))}")
+        print(f"forecast {forecast}:\n{_text(PageTable(own_latency(part), columns))}")
     _tell_failures((row for row in rows if row.error), paths)
 
 

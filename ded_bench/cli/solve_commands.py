@@ -127,6 +127,9 @@ def _score(a: argparse.Namespace) -> int:
         option = "--schedules" if a.schedules else "--update"
         raise InputError("--plant", a.plant, f"is not for {option}, whose rows are of the case's own plant")
     if a.results:
+        for option in ("regime", "limit", "name", "out"):
+            if getattr(a, option) is not None:
+                raise InputError(f"--{option}", "", "is not for --results, whose rows are all judged")
         return _score_results(a)
     if not a.regime:
         raise InputError("--regime", "", "is needed to judge a schedule")
@@ -279,6 +282,8 @@ def _score_folder(a: argparse.Namespace) -> int:
 
 def _chosen(a: argparse.Namespace) -> Selection:
     """The instances of `--instance` or of `--split`; those not shipped are checked against the physics."""
+    if a.instance and a.limit:
+        raise InputError("--limit", str(a.limit), "is of a split, not of --instance")
     if not a.instance:
         chosen = select_split(a.case or DEFAULT_CASE, a.split, a.limit, servable)
     else:

@@ -242,8 +242,9 @@ class Instance(Fingerprinted):
         return np.array(sorted({0.0, self.horizon_s} | inner))
 
     def until(self, horizon_s: float) -> Instance:
-        """The same with a horizon of no more than so many seconds; loads are known beyond it."""
-        return self.model_copy(update={"horizon_s": min(horizon_s, self.horizon_s)})
+        """The same with a horizon of about so many seconds, a whole number of steps, if its own is longer."""
+        steps = round(horizon_s / self.dt_s)
+        return self if steps >= self.steps else self.model_copy(update={"horizon_s": steps * self.dt_s})
 
     def p_load(self, case: Case, t: Array | None = None) -> Array:
         """Load injections at times `t` (default: the grid), shape (n_t, n_load), pu."""

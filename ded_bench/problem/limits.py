@@ -25,8 +25,8 @@ class Bounds:
     at_end: NDArray[np.bool_]  # (n_out,)
     kinds: tuple[str, ...]  # (n_out,): `omega`, `mean`, `relative` or `end`
 
-    def tightened(self, by: float = 0.0, part: float = 0.0) -> Bounds:
-        """Bounds that are smaller by a part of them, and by so many rad/s."""
+    def tightened(self, by: float | Array = 0.0, part: float = 0.0) -> Bounds:
+        """Bounds that are smaller by a part of them, and by so many rad/s: one number, or one an output."""
         return replace(self, limit=(1.0 - part) * self.limit - by)
 
     def beyond(self, outputs: Array, ended: bool = True) -> Array:

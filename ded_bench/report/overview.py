@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from ded_bench.analysis.online_summary import own_latency
-from ded_bench.analysis.summary import GROUP, findings, groups, main_lines, records, summary, titled
+from ded_bench.analysis.summary import GROUP, findings, groups, main_lines, records, summary
 from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.plants.plant import plant_of
@@ -46,9 +47,11 @@ def write_overview(folders: Sequence[Path], out: Path, cases: Sequence[Case] = (
         The files written.
 
     Raises:
-        InputError: a folder holds no results, or not those of one case that is known.
+        InputError: a folder holds no results, or not those of one case that is known; two are of one case.
     """
     grids = [read_grid(folder, cases) for folder in folders]
+    if twice := [case for case, n in Counter(grid.case.id for grid in grids).items() if n > 1]:
+        raise InputError("--results", twice[0], "has more than one folder")
     grids.sort(key=lambda grid: len(grid.case.generators))
     found, said = points(grids), list[str]()
     for grid in grids:  # of default settings, in its tightest regime
@@ -85,7 +88,7 @@ def _parts(grids: Sequence[Sources], found: pd.DataFrame) -> dict[str, list[Bloc
     def side_by_side(file: str, cell: Callable[[dict[str, Any]], str], caption: str) -> list[Block]:
         return table(file, across(found, cell), cases, caption)
 
-    operated = pd.concat([titled(own_latency(grid.online)).assign(case=grid.case.id) for grid in grids])
+    operated = pd.concat([own_latency(grid.online).assign(case=grid.case.id) for grid in grids])
     excess = "Largest excess over the frequency bound, Hz"
     loop = "The closed loop: methods at their own latency, forecasts as announced"
     return {
@@ -111,7 +114,8 @@ def read_grid(folder: Path, cases: Sequence[Case] = ()) -> Sources:
     """Read the results of one case: one of these, or one that ships.
 
     Raises:
-        InputError: no results, several cases or one that is unknown, or a table that is wrong.
+        InputError: no results, several cases or one that is unknown, rows of validation instances alone, or
+            a table that is wrong.
     """
     path = ResultsFolder(folder).results
     if not path.is_file():
@@ -120,7 +124,10 @@ def read_grid(folder: Path, cases: Sequence[Case] = ()) -> Sources:
     if len(names) != 1:
         raise InputError(path, "case", f"is not one: {', '.join(names) or 'no rows'}")
     case = next((case for case in cases if case.id == names[0]), None) or Case.load(names[0])
-    return read_sources(case, folder)
+    sources = read_sources(case, folder)
+    if not len(sources.judged):
+        raise InputError(path, "split", "is validation in all rows, which serve choices: nothing to compare")
+    return sources
 
 
 def sizes(grids: Sequence[Sources]) -> pd.DataFrame:

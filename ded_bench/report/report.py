@@ -141,7 +141,7 @@ def idealisation(case: Case) -> str:
 def _in_operation(sources: Sources) -> Iterator[PageTable]:
     """What plans do to an island in operation, beside today's practice, where rows have it."""
     if sources.case.slack is None and len(sources.practice):
-        lines = titled(practice_lines(sources.practice)).sort_values(
+        lines = practice_lines(sources.practice).sort_values(
             ["regime", "forecast", "minutes"], kind="stable", ascending=[True, False, True]
         )
         caption = (
@@ -214,6 +214,8 @@ def alarms(sources: Sources) -> list[str]:
     solve = f"ded-bench solve --case {case.place} --method {method} --regime {','.join(case.regimes)}"
     if not len(sources.rows):
         return [f"No rows yet: `{solve}` makes some."]
+    if not len(judged):
+        return ["All rows are of validation instances, which serve choices: no table is about them."]
     if not judged["objective"].notna().any():
         return ["No row has a score: every method failed, or nothing was scored yet (see the column error)."]
     if judged["gap_percent"].notna().any():
@@ -294,7 +296,7 @@ def trained(sources: Sources, _: Mapping[str, list[Picture]]) -> list[Block]:
 
 def closed_loop(sources: Sources, pictures: Mapping[str, list[Picture]]) -> list[Block]:
     """Nothing without rows."""
-    own = titled(own_latency(sources.online))
+    own = own_latency(sources.online)
     if not len(own):
         return []
     caption = "Methods in the closed loop at their own latency, forecasts as announced"

@@ -24,7 +24,7 @@ from ded_bench.problem.schedule import Trajectory
 from ded_bench.report.columns import TRAINING
 from ded_bench.results.folder import ResultsFolder
 from ded_bench.results.online_results import OnlineResults
-from ded_bench.results.rows import VALIDATED, Key, Results, Row, reference_objectives
+from ded_bench.results.rows import VALIDATED, Key, Results, reference_objectives
 from ded_bench.results.timing import TIMING, TimingRow, timing_summary
 
 
@@ -133,13 +133,20 @@ def read_sources(case: Case, folder: Path) -> Sources:
     reference = choose_reference(counting, paper, reference_objectives(case))
     newest_of = everything.groupby("method")["method_version"].max().to_dict()
 
-    def is_of_today(one: Row | RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
+    def is_of_today(one: RefereeRow | TimingRow) -> bool:  # it is about these answers; 0 is unknown
         return one.method_version in (0, newest_of.get(one.method, one.method_version))
+
+    def is_about(fingerprint: str, key: Key) -> bool:  # this row, not one that it replaced
+        return key in results.rows and results.rows[key].fingerprint == fingerprint
 
     elsewhere = [r for r in VALIDATED.existing(paths.validated) if r.plant == "detailed" != case.plant_name]
     judgements: dict[str, dict[Key, bool | None]] = {
-        "validated": {r.key[0]: r.feasible for r in filter(is_of_today, elsewhere)},
-        "confirmed": {r.key: r.confirmed for r in filter(is_of_today, REFEREE.existing(paths.referee))},
+        "validated": {r.key[0]: r.feasible for r in elsewhere if is_about(r.fingerprint, r.key[0])},
+        "confirmed": {
+            r.key: r.confirmed
+            for r in filter(is_of_today, REFEREE.existing(paths.referee))
+            if not r.row or is_about(r.row, r.key)
+        },
     }
 
     calls = [call for call in TIMING.existing(paths.timing) if call.case == case.id and is_of_today(call)]

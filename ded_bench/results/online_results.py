@@ -131,4 +131,4 @@ def keep_trajectory(path: Path, trajectory: Trajectory) -> None:
     arrays = {name: getattr(trajectory, name)[::stride] for name in names}
     if AGC_COLUMN in trajectory.columns:
         arrays[AGC_COLUMN] = trajectory.columns[AGC_COLUMN][::stride]
-    write_arrays(path, arrays, {"kept_s": KEPT_S})
+    write_arrays(path, arrays, {})

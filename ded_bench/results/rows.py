@@ -255,16 +255,21 @@ OBJECTIVES = Table(Objective)
 
 
 def objectives_of(rows: Iterable[Row]) -> list[Objective]:
-    """The scored rows with default settings and nothing trained, by regime, method and instance."""
-    found = [
-        Objective(row.case, row.instance, row.regime, row.method, row.objective, row.problems_version)
-        for row in rows
+    """The scored rows with default settings and nothing trained, by regime, method and instance.
+
+    Of rows that differ in their time limits the newest counts.
+    """
+    found = {
+        (row.regime, row.method, row.instance, row.case): Objective(
+            row.case, row.instance, row.regime, row.method, row.objective, row.problems_version
+        )
+        for row in sorted(rows, key=lambda row: row.date)
         if row.objective is not None
         and row.settings == "default"
         and not (row.model or row.policy)
         and row.split != "validation"  # their rows serve choices, not comparisons
-    ]
-    return sorted(found, key=lambda o: (o.regime, o.method, o.instance))
+    }
+    return [found[place] for place in sorted(found)]
 
 
 def reference_objectives(case: Case) -> list[Objective]:

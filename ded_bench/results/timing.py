@@ -22,10 +22,9 @@ PARTS = ("build_s", "setup_s", "solve_s", "time_s")
 class TimingRow(Made):
     """One call of one method, wall-clock seconds.
 
-    `settings` are those that matter outside the closed loop. `call_s` is the whole call as its process saw
-    it, `load_average` the machine's over the last minute, when the call ended: at most about 1 if bench was
-    alone. `peak_memory_mib` is the most that its process had held by the end of the call, all that it imports
-    included.
+    `call_s` is the whole call as its process saw it, `load_average` the machine's over the last minute when
+    it ended: at most about 1 if bench was alone. `peak_memory_mib` is the most that its process had held by
+    the end of the call, all that it imports included.
     """
 
     run: str

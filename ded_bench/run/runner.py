@@ -77,8 +77,9 @@ def run(
         limits = [limit and limit + GRACE_S for limit in (task.settings.time_limit_s for task in todo)]
         with tqdm(total=len(todo), unit="row", disable=None, desc="solve") as bar:
             for task, answer in pool.imap(calls, todo, limits):
-                lost = Answered(failed(answer), None, "" if scheduler else host(), trace_of(answer))
-                solution, verdict, where, trace = answer if isinstance(answer, Answered) else lost
+                if not isinstance(answer, Answered):  # its worker was lost, or takes too long
+                    answer = Answered(failed(answer), None, "" if scheduler else host(), trace_of(answer))
+                solution, verdict, where, trace = answer
                 if trace:
                     results.paths.log_failure(f"{task.method} {task.regime} {task.instance.id}", trace)
                 row = unscored_row(task, solution, plant, pool.count, problems_version, where)

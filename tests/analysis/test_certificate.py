@@ -89,8 +89,10 @@ def rows_of(folder: Path, regime: str) -> list[certificate.CertificateRow]:
     return ROWS.read(path)
 
 
-def run(case: Case, folder: Path, regime: str, seed: int = 0, **criteria: float) -> certificate.Certificate:
-    return certify(case, candidate(regime), folder, Criteria(**criteria), count=4, seed=seed)
+def run(
+    case: Case, folder: Path, regime: str, seed: int = 0, count: int = 4, **criteria: float
+) -> certificate.Certificate:
+    return certify(case, candidate(regime), folder, Criteria(**criteria), count=count, seed=seed)
 
 
 def test_both_methods_are_re_simulated_on_fresh_instances(calls, threebus: Case, tmp_path: Path) -> None:
@@ -135,6 +137,8 @@ def test_an_interrupted_certificate_goes_on(
     again = run(threebus, tmp_path, regime)
     assert again.model_copy(update={"date": first.date}) == first
     assert set(calls().values()) == {2}
+    run(threebus, tmp_path, regime, count=1)
+    assert len(rows_of(tmp_path, regime)) == 4  # fewer are asked for, and none is lost
     run(threebus, tmp_path, regime, seed=1)  # other instances: rows of these do not count
     assert sum(calls().values()) == 16
     with monkeypatch.context() as patch:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ded_bench.analysis.online_summary import online_rows, own_latency, practice_rows
+from ded_bench.analysis.online_summary import online_rows, own_latency, practice_lines, practice_rows
 from ded_bench.results.online_results import OnlineResults, OnlineRow
 
 
@@ -68,6 +68,22 @@ def test_rows_of_an_older_policy_or_another_plant_are_not_averaged_with_the_newe
     kept.table.add([old, row("a", 0.5, 109.0, **new), row("a", 0.5, 150.0, plant="detailed", **new)])
     lines = own_latency(online_rows(kept, "here"))
     assert sorted(lines["increase_percent_mean"]) == pytest.approx([9.0, 50.0])
+    titles = dict(zip(lines["increase_percent_mean"].round(), lines["title"], strict=True))
+    assert titles == {9.0: "DED-ADMM on lossless", 50.0: "DED-ADMM on detailed"}
+
+
+def test_lines_tell_from_what_a_plan_started_where_they_differ(tmp_path):
+    kept, own = OnlineResults(tmp_path), {"latency_source": "timing"}
+    kept.table.add([row("a", 0.5, 101.0, **own), row("a", 0.5, 102.0, warm=False, **own)])
+    lines = own_latency(online_rows(kept, "here"))
+    assert lines["title"].tolist() == ["DED (SLP) warm", "DED (SLP) cold"]
+
+
+def test_failures_of_practice_stand_where_nobody_came_to_the_end(tmp_path):
+    kept = OnlineResults(tmp_path)
+    kept.table.add([row("a", 0.5, None, plans=0, error="loses synchronism")])
+    lines = practice_lines(practice_rows(kept, "here"))
+    assert lines[["n", "failures"]].to_numpy().tolist() == [[0, 1]]
 
 
 def test_practice_is_static_dispatch_every_minute_at_once(tmp_path):

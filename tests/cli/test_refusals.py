@@ -161,6 +161,10 @@ def test_a_results_folder_that_cannot_be_checked(problem: Path, tmp_path: Path, 
     assert "atlantis" in refused(capsys, "score", "--results", tmp_path / "odd")
     assert "--update" in refused(capsys, "score", "--schedule", "a.csv", "--regime", "NO", "--update")
     assert "--regime" in refused(capsys, "score", "--schedule", "a.csv")
+    for option in ("--regime", "--limit", "--name", "--out"):
+        line = refused(capsys, "score", "--results", tmp_path / "odd", option, "1")
+        assert line.startswith(f"ded-bench: {option}: is not for --results")
+    assert "--limit" in refused(capsys, *SOLVE, "--instance", "9bus-0001", "--limit", "1")
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "/proc/none"])

@@ -49,6 +49,14 @@ def test_the_grid_has_one_point_more_than_steps(case, quiet_instance):
     assert quiet_instance(case, horizon_s=7, dt_s=7).steps == 1
 
 
+def test_a_shorter_horizon_is_a_whole_number_of_steps(case, quiet_instance):
+    """30 s are 187.5 steps of 0.16 s."""
+    instance = quiet_instance(case, horizon_s=48.0, dt_s=0.16)
+    shorter = instance.until(30.0)
+    assert shorter.horizon_s == shorter.grid[-1] == pytest.approx(30.0, abs=0.08 + 1e-9)
+    assert instance.until(50.0) is instance
+
+
 # instance/2.
 
 POINTS = [[0.0, -0.9], [1.5, -0.9], [3.5, -0.96], [60.0, -0.96]]

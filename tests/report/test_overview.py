@@ -75,6 +75,13 @@ def test_folders_without_results_of_one_shipped_case_are_refused(folders, threeb
     with pytest.raises(InputError, match="threebus: no such case"):
         read_grid(tmp_path / "own")
     assert read_grid(tmp_path / "own", [threebus]).case == threebus
+    Results(tmp_path / "chosen").add([dataclasses.replace(row, split="validation")])
+    with pytest.raises(InputError, match="split: is validation in all rows"):
+        read_grid(tmp_path / "chosen")
+    assert (
+        main(["overview", "--results", str(folders[0]), str(folders[0]), "--out", str(tmp_path / "out")]) == 2
+    )
+    assert "--results: 9bus: has more than one folder" in capsys.readouterr().err
     assert main(["overview", "--results", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
     assert "typo/results.csv: is missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -8,12 +8,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from ded_bench.analysis.referee import REFEREE, RefereeRow
 from ded_bench.files.errors import InputError
 from ded_bench.methods.solution import Settings
 from ded_bench.problem.benchmark import select_split
-from ded_bench.problem.case import Case
+from ded_bench.problem.case import SHIPPED_CASES, Case
 from ded_bench.report.report import write_report
-from ded_bench.results.rows import Results, Row
+from ded_bench.results.rows import VALIDATED, Results, Row, ValidatedRow
 from ded_bench.run.runner import run
 from ded_bench.run.tasks import make_tasks
 from tests.detailed_cases import MIXED
@@ -58,6 +59,34 @@ def test_without_the_reference(threebus: Case, problem: Path, tmp_path: Path, ro
     assert "Nobody ran DED (SLP): gaps are to the best feasible schedule" in text
     assert "(figures/schedule_NO.png)" in text
     assert said[0].startswith("NO: 1 of 1 methods and settings keep every limit")
+
+
+@pytest.mark.usefixtures("sketched")
+def test_verdicts_are_of_the_rows_that_are_there(tmp_path: Path) -> None:
+    """Not of those that they replaced; a referee's row that does not say which counts."""
+    case = Case.load(SHIPPED_CASES / "two-area")
+    facts = {"objective": 1.0, "feasible": True, "feasible_strict": True, "case": case.id}
+    rows = [Row(name, "test", "TO", "ed", "default", "Optimal", fingerprint=name, **facts) for name in "abc"]
+    results = Results(tmp_path)
+    results.add(rows)
+    judged = [ValidatedRow(**vars(row) | {"plant": "detailed"}) for row in rows]
+    VALIDATED.write(results.paths.validated, [judged[0], dataclasses.replace(judged[1], fingerprint="old")])
+    refereed = [
+        RefereeRow(**row.key._asdict(), plant="detailed", confirmed=True, row=made_of)
+        for row, made_of in zip(rows, ("a", "old", ""), strict=True)
+    ]
+    REFEREE.write(results.paths.referee, refereed)
+    write_report(case, tmp_path)
+    made = pd.read_csv(tmp_path / "tables" / "summary.csv").iloc[0]
+    assert (made["carried"], made["refereed"]) == ("1 of 1", "2 of 2")
+
+
+@pytest.mark.usefixtures("sketched")
+def test_rows_that_serve_choices_alone_are_no_failures(threebus: Case, tmp_path: Path) -> None:
+    row = Row("x", "validation", "TO", "ed", "default", "Optimal", objective=1.0, case=threebus.id)
+    Results(tmp_path).add([row])
+    write_report(threebus, tmp_path)
+    assert "All rows are of validation instances" in (tmp_path / "report.md").read_text()
 
 
 @pytest.mark.usefixtures("sketched")

@@ -34,6 +34,13 @@ def test_default_settings_only_and_no_instances_that_served_choices() -> None:
     ]
 
 
+def test_of_rows_with_several_time_limits_the_newest_counts() -> None:
+    dates = "2026-01-02T00:00:00Z", "2026-01-01T00:00:00Z"
+    new, old = (dataclasses.replace(ROW, date=date) for date in dates)
+    rows = [new, dataclasses.replace(old, objective=3.0, time_limit_s=1.0)]
+    assert objectives_of(rows) == objectives_of(rows[:1])
+
+
 def test_a_case_has_those_of_its_reference_run(threebus: Case, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(folder, "REFERENCE_RUNS", tmp_path)
     assert reference_objectives(threebus) == []

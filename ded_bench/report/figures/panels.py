@@ -226,6 +226,7 @@ def shown_scenario(sources: Sources) -> tuple[str, list[Shown]]:
     """
     files, rows = sources.results.paths, sources.online if sources.case.slack else sources.practice
     rows = rows[(rows["regime"] == sources.tightest) & (rows["forecast"] == QUALITIES[0])]
+    rows = rows[rows["plant"] == sources.case.plant_name]
     rows = where(rows, (files.trajectory(key).is_file() for key in rows["key"]))
     if not len(rows):
         return "", []

@@ -203,7 +203,8 @@ def _look_back(case: Case, asked_for: Sequence[Operation], results: OnlineResult
     wanted = [
         (scenario, HindsightRow(*key, **_made(case, key[2], scenario))) for key, scenario in asked.items()
     ]
-    missing = [one for one in wanted if not _is_there(results.hindsight, one[1])]
+    rows = results.hindsight.rows
+    missing = [one for one in wanted if not _is_there(results.hindsight, one[1]) or _is_old(rows[one[1].key])]
     calls = ((find_hindsight, (case, *one, results.files)) for one in missing)
     for (_, row), answer in tqdm(
         pool.imap(calls, missing), total=len(missing), unit="scenario", disable=None, desc="hindsight"
@@ -213,9 +214,14 @@ def _look_back(case: Case, asked_for: Sequence[Operation], results: OnlineResult
 
 
 def _is_there(table: KeyedTable[Any, Any], row: OnlineRow | HindsightRow) -> bool:
-    """Whether a row was made, by no older version, and did not fail."""
+    """Whether a row was made, by no older version if it says which, and did not fail."""
     made = table.made_from(row.key, row.fingerprint, row.method_version)
     return made and table.rows[row.key].objective is not None
+
+
+def _is_old(row: HindsightRow) -> bool:
+    """Whether another version of its method would find it today; 0 is unknown."""
+    return row.method_version not in (0, get_method(row.method).version)
 
 
 def _compared(case: Case, o: Operation, row: OnlineRow, results: OnlineResults) -> OnlineRow:

@@ -100,6 +100,11 @@ def test_what_is_there_is_not_made_again(threebus, scenarios, first_run, tmp_pat
     again = operate(threebus, wanted, results, on_row=made.append)
     assert len(made) == 1
     assert [row.objective for row in again] == [row.objective for row in first_run[0]]
+    stored = [row.objective for row in results.hindsight.rows.values()]
+    old = [dataclasses.replace(row, objective=1.0) for row in results.hindsight.rows.values()]
+    results.hindsight.add([dataclasses.replace(row, method_version=row.method_version + 1) for row in old])
+    operate(threebus, wanted, results)  # hindsight of another version does not count
+    assert [row.objective for row in results.hindsight.rows.values()] == stored
     changed = operations(threebus, scenarios, limit_s=30.0)
     assert not any(results.table.made_from(o.row.key, o.row.fingerprint) for o in changed)
 

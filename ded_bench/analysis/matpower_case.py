@@ -31,7 +31,7 @@ from ded_bench.problem.lossless_case import LosslessCase, lossless
 from ded_bench.problem.quantities import Array
 from ded_bench.problem.sampling import rounded
 
-_COMMENT = re.compile(r"%[^\n]*|\.\.\.[^\n]*\n")
+_COMMENT = re.compile(r"('[^'\n]*')|%[^\n]*|\.\.\.[^\n]*\n")  # in a string a % is none
 _STATEMENT = re.compile(
     r"\s*(?:function\b[^\n]*|(?:end|return)\s*;?(?=\s|$)"
     r"|\w+\.(?P<name>[\w.]+)\s*="
@@ -45,7 +45,7 @@ def read_matpower(path: str | Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         InputError: the file cannot be read, or has anything but assignments, whose effect would be missing.
     """
-    text = _COMMENT.sub("", read_text(path))
+    text = _COMMENT.sub(r"\1", "\n".join(_outside_blocks(read_text(path))))
     found, place = {}, 0
     while text[place:].strip():
         statement = _STATEMENT.match(text, place)
@@ -58,6 +58,17 @@ def read_matpower(path: str | Path) -> dict[str, NDArray[np.float64]]:
             rows = [line.replace(",", " ").split() for line in lines if line.strip(" ,\t\r")]
             found[statement["name"]] = _matrix(path, statement["name"], rows)
     return found
+
+
+def _outside_blocks(text: str) -> Iterator[str]:
+    """Lines that stand in no block comment: %{ and %}, each alone on its line, which may be nested."""
+    depth = 0
+    for line in text.splitlines():
+        depth += line.strip() == "%{"
+        if not depth:
+            yield line
+        elif line.strip() == "%}":
+            depth -= 1
 
 
 def _matrix(path: str | Path, name: str, rows: list[list[str]]) -> NDArray[np.float64]:

@@ -80,7 +80,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with code 2."""
-        self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists what there is)\n")
+        self.exit(2, f"{self.prog}: {in_one_line(message)} (`{self.prog} --help` lists what there is)\n")
 
 
 class WithDefaults(argparse.RawDescriptionHelpFormatter):
@@ -152,10 +152,14 @@ def chosen_methods(
 
 def say(sentence: str) -> None:
     """Tell on stderr: what went wrong, or what is about to be done, before imports and work take seconds."""
-    line = "".join(sign if sign.isprintable() else " " for sign in sentence)
     if sys.stderr:
         with contextlib.suppress(OSError, ValueError):  # nobody listens
-            print(f"ded-bench: {line}", file=sys.stderr, flush=True)
+            print(f"ded-bench: {in_one_line(sentence)}", file=sys.stderr, flush=True)
+
+
+def in_one_line(text: str) -> str:
+    """The text with spaces for what cannot be printed."""
+    return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
 def counted(n: int, noun: str) -> str:

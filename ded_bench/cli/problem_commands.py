@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 import textwrap
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from ded_bench.problem.benchmark import (
     write_scenarios,
 )
 from ded_bench.problem.case import SHIPPED_CASES, Case, case_file
-from ded_bench.problem.quantities import check_whole_steps
+from ded_bench.problem.quantities import NAME, check_whole_steps
 from ded_bench.problem.sampling import DURATION_S, SCENARIOS
 
 if TYPE_CHECKING:
@@ -134,11 +135,14 @@ def _path(a: argparse.Namespace) -> int:
 def _import(a: argparse.Namespace) -> int:
     from ded_bench.analysis.matpower_case import imported
 
-    path = a.out / "case.json"
+    path, name = a.out / "case.json", a.out.resolve().name
     if path.exists():
         raise InputError(path, "", "is there already")
+    if not re.fullmatch(NAME, name):
+        problem = f"{name!r} cannot name a case: letters, digits, and after one of these also _ . -"
+        raise InputError("--out", str(a.out), problem)
     try:
-        case = imported(a.file, a.dynamics, a.out.resolve().name, Case.load(a.like) if a.like else None)
+        case = imported(a.file, a.dynamics, name, Case.load(a.like) if a.like else None)
     except SimulationError as error:
         say(f"{a.file}: the lossless grid has no equilibrium: {error}")
         return 1

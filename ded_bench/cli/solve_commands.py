@@ -47,7 +47,7 @@ def add_commands(commands: Any) -> None:
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=positive, metavar="N", help="processes here (default: 1)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
-    limit = "per solve; 60 s later it is killed"
+    limit = "per solve; 120 s later it is killed"
     p.add_argument("--time-limit", type=positive_number, metavar="S", help=limit)
     p.set_defaults(run=_solve)
 

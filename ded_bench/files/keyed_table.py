@@ -60,6 +60,14 @@ class KeyedTable(Generic[K, T]):
         row = self.rows.get(key)
         return row is not None and row.fingerprint == fingerprint and row.method_version >= version
 
+    def asked(self, keys: Iterable[K]) -> list[T]:
+        """The rows of some keys, all of which were added; InputError if somebody took them away since."""
+        keys = list(keys)
+        if lost := sum(key not in self.rows for key in keys):
+            problem = f"has lost {lost} of {len(keys)} rows: it was replaced or deleted meanwhile; run again"
+            raise InputError(self.path, "", problem)
+        return [self.rows[key] for key in keys]
+
     def reload(self) -> None:
         """Read what other processes have added; InputError if the file is wrong."""
         regular_size(self.path)

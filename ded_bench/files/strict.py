@@ -142,7 +142,10 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             file.write(gzip.compress(data, 3, mtime=0) if path.suffix == ".gz" else data)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        try:
+            os.replace(temporary, path)
+        except OSError as error:  # it names the temporary file
+            raise OSError(error.errno, error.strerror, str(path)) from None
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

@@ -30,7 +30,8 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -87,9 +88,20 @@ class Foreign:
 
     @property
     def Options(self) -> type[Any]:  # noqa: N802  (the name that our modules use)
-        """What a `prepare` declares in its module; else there are none."""
+        """What a `prepare` declares in its module; else there are none.
+
+        Raises:
+            InputError: a field has no default, or a type that there is not.
+        """
         declared = getattr(self.module, "Options", None) if self._prepares else None
-        return declared if isinstance(declared, type) and dataclasses.is_dataclass(declared) else NoOptions
+        if not (isinstance(declared, type) and dataclasses.is_dataclass(declared)):
+            return NoOptions
+        for field in dataclasses.fields(declared):
+            if field.default is dataclasses.MISSING:
+                raise InputError("--method", self.target, f"its Options.{field.name} has no default")
+        with _refusing(self.target, "types of its Options cannot be read"):
+            typing.get_type_hints(declared)
+        return declared
 
     def prepare(self, case: Case, regime: str, settings: Settings) -> Solver:
         """Return the function that solves one instance and checks what comes back.
@@ -109,9 +121,15 @@ class Foreign:
         return ForeignSolver(case, inner)
 
     def artifacts(self, case: Case, regime: str, settings: Settings) -> tuple[Artifact, ...]:
-        """One: what the module says of itself, then a hash of the sources of its package."""
-        own = getattr(self.module, "artifact", None)
-        said = str(own(case, regime, settings)) if callable(own) else ""
+        """One: what the module says of itself, then a hash of the sources of its package.
+
+        Raises:
+            InputError: the module's `artifact` raises.
+        """
+        own, said = getattr(self.module, "artifact", None), ""
+        if callable(own):
+            with _refusing(self.target, "its artifact() failed"):
+                said = str(own(case.model_copy(deep=True), regime, settings))
         return (Artifact("code", self.target, said + _sources(self.module)),)
 
     @property
@@ -145,13 +163,8 @@ def load(target: str) -> Foreign:
     module_name, _, name = target.partition(":")
     if str(Path.cwd()) not in sys.path and "" not in sys.path:
         sys.path.append(str(Path.cwd()))  # last: nothing installed is shadowed
-    try:
-        with contextlib.redirect_stdout(sys.stderr):  # the command line's own output is rows
-            module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # anything may happen in someone's module
-        first = (str(error).strip().splitlines() or ["no message"])[0]
-        reason = f"{type(error).__name__}: {first}"[:200]
-        raise InputError("--method", target, f"{module_name} cannot be imported ({reason})") from None
+    with _refusing(target, f"{module_name} cannot be imported"):
+        module = importlib.import_module(module_name)
     function = getattr(module, name, None)
     if not callable(function):
         place = getattr(module, "__file__", None) or module_name
@@ -159,6 +172,18 @@ def load(target: str) -> Foreign:
     foreign = Foreign(target, module, function)
     _check_signature(foreign)
     return foreign
+
+
+@contextlib.contextmanager
+def _refusing(target: str, problem: str) -> Iterator[None]:
+    """Turn whatever happens in someone's module into an InputError; what it prints is no output of ours."""
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except (Exception, SystemExit) as error:
+        first = (str(error).strip().splitlines() or ["no message"])[0]
+        reason = f"{type(error).__name__}: {first}"[:200]
+        raise InputError("--method", target, f"{problem} ({reason})") from None
 
 
 def accept(answer: object, case: Case, instance: Instance, seconds: float) -> Solution:

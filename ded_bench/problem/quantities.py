@@ -30,7 +30,9 @@ Magnitude = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 #: s; what is faster needs no model here, and millions of steps.
 TimeConst = Annotated[float, Field(ge=1e-4, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0, le=1)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+#: What may name a case, a bus or an instance.
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+Name = Annotated[str, Field(pattern=NAME)]
 Range = tuple[Number, Number]
 MAX_STEPS = 1_000_000
 #: Of a load in one file.

@@ -41,6 +41,7 @@ from ded_bench.results.rows import Key, Row
 from ded_bench.results.timing import TIMING, WARM_UP, TimingRow, model_name
 from ded_bench.run.environment import commit, host, now, version
 from ded_bench.run.pool import Workers
+from ded_bench.run.runner import GRACE_S
 from ded_bench.run.tasks import failed, prepared
 from ded_bench.surrogates.find import MODELS
 
@@ -202,7 +203,9 @@ def _run_id(
 
 def _ask(pool: Workers, case: Case, job: Job, warm_up: Instance, instances: Sequence[Instance]) -> list[Told]:
     """Warm-up and answers; where the process died, instance by instance, to find which one kills it."""
-    ((_, answer),) = pool.imap([(timed_turn, (case, *job, warm_up, tuple(instances)))], [None])
+    limit_s = job.settings.time_limit_s
+    limit_s = limit_s and (limit_s + GRACE_S) * (1 + len(instances))
+    ((_, answer),) = pool.imap([(timed_turn, (case, *job, warm_up, tuple(instances)))], [None], [limit_s])
     if isinstance(answer, list):
         return answer
     if len(instances) == 1:

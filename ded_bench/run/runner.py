@@ -33,8 +33,9 @@ from ded_bench.run.tasks import Answered, Task, failed, pack, solve_and_score, t
 from ded_bench.solvers.status import Status
 
 #: A solve that has not ended so long after its time limit never will, and is killed. It also pays for
-#: what comes before the first solve of a process, imports and the building of the model: some seconds.
-GRACE_S = 60.0
+#: what comes before the first solve of a process: the building of the model, and once after installing what
+#: is compiled, up to a minute of CPU.
+GRACE_S = 120.0
 
 
 def run(
@@ -64,7 +65,7 @@ def run(
         The rows of all tasks, old and new, in the order of the tasks.
 
     Raises:
-        InputError: no scheduler answers.
+        InputError: no scheduler answers, or rows were taken away meanwhile.
         WorkersLostError: it answers no more, or its workers cannot run this package.
     """
     todo, plant = unfinished(tasks, results), plant_of(case).name
@@ -80,15 +81,15 @@ def run(
                 if not isinstance(answer, Answered):  # its worker was lost, or takes too long
                     answer = Answered(failed(answer), None, "" if scheduler else host(), trace_of(answer))
                 solution, verdict, where, trace = answer
-                if trace:
-                    results.paths.log_failure(f"{task.method} {task.regime} {task.instance.id}", trace)
                 row = unscored_row(task, solution, plant, pool.count, problems_version, where)
                 row = row if solution.schedule is None else scored_row(row, verdict)
                 results.keep(row, solution.schedule, case)
+                if trace:
+                    results.paths.log_failure(f"{task.method} {task.regime} {task.instance.id}", trace)
                 on_row(row)
                 bar.set_postfix_str(f"{task.method} {task.regime} {solution.status}")
                 bar.update()
-    return [results.rows[task.key] for task in tasks]
+    return results.asked(task.key for task in tasks)
 
 
 def unfinished(tasks: Sequence[Task], results: Results) -> list[Task]:

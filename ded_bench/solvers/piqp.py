@@ -75,4 +75,5 @@ def solve_form(
         status = Status.TIME_LIMIT
     else:
         status = Status.FAILED
-    return told(form, FormAnswer(status, x, result.info.iter, version, found.name, reduced_cost=price))
+    said = status.sentence if status == Status.TIME_LIMIT else found.name
+    return told(form, FormAnswer(status, x, result.info.iter, version, said, reduced_cost=price))

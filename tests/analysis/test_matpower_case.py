@@ -206,6 +206,24 @@ def test_what_is_read_of_a_file(tmp_path: Path) -> None:
         read_matpower(tmp_path / "none.m")
 
 
+def test_what_stands_in_comments_is_not_read(tmp_path: Path) -> None:
+    """Nor does a % in a string begin one."""
+    other = "%{\nmpc.baseMVA = 1;\n  %{\nmpc.branch = [1];\n  %}\nmpc.bus = [1];\n%}\n"
+    strings = "mpc.bus_name = {'A 50%'};\nmpc.ramp = 7;  % it's '%' here\nmpc.x = {'q'};\n"
+    found = read_matpower(files(tmp_path, SMALL + other + strings)[0])
+    assert found.pop("ramp") == 7.0
+    expected = read_matpower(files(tmp_path)[0])
+    assert found.keys() == expected.keys()
+    assert all(np.array_equal(found[name], expected[name]) for name in expected)
+
+
+def test_a_folder_that_cannot_name_a_case_is_named(tmp_path: Path, capsys) -> None:
+    grid, dynamics = files(tmp_path)
+    line = refused(capsys, "import", grid, "--dynamics", dynamics, "--out", tmp_path / "my grid")
+    assert "--out: " in line
+    assert "'my grid' cannot name a case" in line
+
+
 @pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize(("name", "like"), [("ieee14", ["--like", "39bus"]), ("ieee39", [])])
 def test_public_grids_to_the_end_of_the_road(

@@ -86,9 +86,12 @@ def test_others_rows_are_seen_and_kept(tmp_path: Path) -> None:
     second.compact()
     first.add([Old("c", 4)])
     assert list(old(tmp_path).rows.values()) == [Old("a", 3), Old("b", 2), Old("c", 4)]
+    assert second.asked("ba") == [Old("b", 2), Old("a", 3)]
     (tmp_path / "table.csv").unlink()
     first.reload()
     assert first.rows == {}
+    with pytest.raises(InputError, match="has lost 2 of 2 rows"):
+        first.asked("ab")
 
 
 def test_rows_may_be_added_while_one_goes_through_them(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import json
 import os
 import pickle
@@ -264,6 +265,15 @@ def test_write_atomically_replaces_the_content(tmp_path, content):
     assert [p.name for p in path.parent.iterdir()] == ["file"]
 
 
+def test_what_cannot_be_replaced_is_named(tmp_path):
+    """The file, not the temporary one."""
+    (tmp_path / "file").mkdir()
+    with pytest.raises(IsADirectoryError) as caught:
+        write_atomically(tmp_path / "file", "new")
+    assert (caught.value.filename, caught.value.filename2) == (str(tmp_path / "file"), None)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
 @pytest.mark.parametrize("failing", ["fsync", "replace"])
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, failing):
     """A full disk or a kill between write and rename: the old file stays whole, no litter remains."""
@@ -271,7 +281,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, failing):
     write_atomically(path, "old")
 
     def fail(*_: object) -> None:
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, "no space left on device")
 
     monkeypatch.setattr(os, failing, fail)
     with pytest.raises(OSError, match="no space"):

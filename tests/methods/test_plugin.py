@@ -190,6 +190,36 @@ def test_the_fingerprint_follows_the_sources_and_what_the_module_says(
     assert speaking.fingerprint.startswith("weights-7-")
 
 
+@pytest.mark.parametrize("body", ["raise KeyError('model')", "print('loading'); raise SystemExit(5)"])
+def test_an_artifact_that_fails_is_bad_input(body, tmp_path, threebus, monkeypatch, capsys) -> None:
+    """And what it does to the case is not the judge's."""
+    monkeypatch.syspath_prepend(tmp_path)
+    name, limits = f"silent_{tmp_path.name}", threebus.p_max.copy()
+    text = f"def artifact(case, regime, settings): case.p_max[:] = 9.0; {body}"
+    (tmp_path / f"{name}.py").write_text(f"{text}\ndef solve(instance, regime): ...")
+    with pytest.raises(InputError, match=r"its artifact\(\) failed \((KeyError|SystemExit)"):
+        get_method(f"{name}:solve").artifacts(threebus, "NO", Settings())
+    assert capsys.readouterr().out == ""
+    np.testing.assert_array_equal(threebus.p_max, limits)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ("n: int", r"its Options.n has no default"),
+        ("x: list = dataclasses.field(default_factory=list)", "its Options.x has no default"),
+        ("n: 'Undefined' = 3", "types of its Options cannot be read"),
+    ],
+)
+def test_options_that_cannot_be_read_are_bad_input(fields, told, tmp_path, threebus, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"optional_{tmp_path.name}"
+    declared = f"import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Options:\n    {fields}\n"
+    (tmp_path / f"{name}.py").write_text(f"{declared}def prepare(case, regime, settings): ...")
+    with pytest.raises(InputError, match=told):
+        get_method(f"{name}:prepare").canonical(Settings())
+
+
 GOOD = Schedule(np.array([0.0, 1.0]), np.array([[0.6], [0.6]]))
 END = np.array([0.0, 1.0])
 

@@ -27,6 +27,7 @@ from ded_bench.run import bench as bench_module
 from ded_bench.run import environment
 from ded_bench.run.bench import ROUNDS, Job, bench, rounds_of, runs_of, timed
 from ded_bench.run.pool import WorkerDiedError, Workers
+from ded_bench.run.runner import GRACE_S
 from ded_bench.run.tasks import prepared
 from ded_bench.solvers.status import Status
 from tests.conftest import answers_here
@@ -134,7 +135,7 @@ def test_garbage_is_not_collected_while_a_call_is_timed(fake, threebus, instance
 
 def test_only_the_instance_that_kills_its_process_is_lost(fake, run, instances, monkeypatch) -> None:
     class Fragile(Inline):
-        def imap(self, calls, labels) -> Iterator[tuple[object, object]]:
+        def imap(self, calls, labels, limits_s) -> Iterator[tuple[object, object]]:
             ((function, arguments),) = calls
             if instances[1] in arguments[-1]:
                 yield None, WorkerDiedError("died")
@@ -145,6 +146,20 @@ def test_only_the_instance_that_kills_its_process_is_lost(fake, run, instances, 
     rows = run([TO])
     assert [row.error for row in rows] == ["", "", "died", ""]
     assert [row.instance for row in rows[1:]] == [i.id for i in instances]
+
+
+def test_a_hang_is_killed_where_calls_have_a_time_limit(fake, run, instances, monkeypatch) -> None:
+    """A turn may take the limits of all its calls, the warm-up's included."""
+    given = []
+
+    class Noting(Inline):
+        def imap(self, calls, labels, limits_s) -> Iterator[tuple[object, object]]:
+            given.extend(limits_s)
+            yield from super().imap(calls, labels)
+
+    monkeypatch.setattr(bench_module, "Workers", Noting)
+    run([TO, Job("fake", "NO", Settings(time_limit_s=2.0))])
+    assert given == [None, (1 + len(instances)) * (2.0 + GRACE_S)]
 
 
 def test_median_and_quartiles_over_instances_and_rounds(fake, run) -> None:

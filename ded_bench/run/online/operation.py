@@ -127,7 +127,7 @@ def operate(
         The rows of all operations, old and new, in their order.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or rows were taken away meanwhile.
         WorkersLostError: the workers cannot run this package.
         OSError: a trajectory cannot be kept.
     """
@@ -147,11 +147,12 @@ def operate(
                 table.add([row])
                 on_row(row)
                 bar.update()
-    rows = [_compared(case, o, table.rows[o.row.key], results) for o in operations]
+    made = table.asked(o.row.key for o in operations)
+    rows = [_compared(case, o, row, results) for o, row in zip(operations, made, strict=True)]
     if later := [row for row in rows if row != table.rows[row.key]]:
         table.add(later)  # hindsight that was found after them
     table.compact()
-    return [table.rows[o.row.key] for o in operations]
+    return table.asked(o.row.key for o in operations)
 
 
 def operate_one(case: Case, operation: Operation, files: ResultsFolder) -> OnlineRow:

@@ -72,12 +72,9 @@ def load_instances(case: str | Path, split: SplitName = "test", limit: int | Non
     Raises:
         InputError: there is no such case or split, the limit is negative, or a file is missing or wrong.
     """
-    from ded_bench.files.errors import InputError
     from ded_bench.plants.plant import servable
     from ded_bench.problem.benchmark import select_split
 
-    if limit is not None and limit < 0:
-        raise InputError("limit", "", f"must be at least 0, or None for all, not {limit}")
     return [instance for instance, _ in select_split(case, split, limit, servable).instances]
 
 
@@ -86,13 +83,15 @@ def solve(
 ) -> Solution:
     """Solve one instance in this process; a method's model is built once and used again.
 
+    A policy or surrogate is read once: what replaces its file later is not seen in this process.
+
     Linear algebra runs in one thread, as in the commands: several slow these methods down.
 
     Args:
         instance: what to solve.
         method: one of ours, one that an installed package brings, or `module:function`.
         regime: one of the case's, such as `NO` or `TO`.
-        case: needed if the instance's case is not a shipped one.
+        case: needed if the instance's case is not a shipped one, or a changed copy of one.
         settings: a method's options, surrogate, policy, time limit and search folders; None: the default
             ones. Where it names no folders, models and policies are looked for in the default results
             folder, then in the reference run.
@@ -116,7 +115,7 @@ def simulate(
     Args:
         instance: its loads and its initial state.
         schedule: generator powers; arrays or nested lists, or a data frame with columns `t` and `P_<bus>`.
-        case: needed if the instance's case is not a shipped one.
+        case: needed if the instance's case is not a shipped one, or a changed copy of one.
         plant: its name, or a plant of the case; None: the case's own.
 
     Raises:
@@ -181,7 +180,7 @@ def score(
         instance: its loads and its initial state.
         schedule: as for `simulate`.
         regime: one of the case's.
-        case: needed if the instance's case is not a shipped one.
+        case: needed if the instance's case is not a shipped one, or a changed copy of one.
         plant: as for `simulate`.
 
     Raises:

@@ -26,6 +26,7 @@ from ded_bench.methods.solution import Settings
 from ded_bench.methods.training_record import LOSSES, TrainingOptions, policy_file
 from ded_bench.problem.benchmark import select_split
 from ded_bench.problem.case import Case
+from ded_bench.problem.sampling import POLICY_SEED, VALIDATION_SEED
 from ded_bench.results.folder import ResultsFolder, default_results, search_folders
 from ded_bench.run.environment import commit, version
 from ded_bench.run.pool import Workers
@@ -94,6 +95,8 @@ def _train_dpc(a: argparse.Namespace) -> int:
     regimes = a.regime or tuple(case.regimes)
     case.check_regimes(regimes)
     methods = [get_method(name) for name in a.method or trainable(case)]
+    if (most := VALIDATION_SEED - POLICY_SEED) <= a.seed:
+        raise InputError("--seed", str(a.seed), f"must be below {most}: beyond lie draws of validation")
     jobs = [(method.name, regime) for method in methods for regime in regimes]
     if a.out and len(jobs) > 1:
         raise InputError(a.out, "", "is one file; name one method and regime with --out")

@@ -243,7 +243,7 @@ def set_powers(m: pyo.ConcreteModel, case: Case, instance: Instance, p_slack: fl
             fix(variable, value)
 
 
-@functools.lru_cache(maxsize=8)  # of one model
+@functools.lru_cache(maxsize=7)  # as many as are asked for of one model, which keep it alive
 def _over_time(m: pyo.ConcreteModel, name: str) -> Expressions:
     """A variable of every point, (n_points, n_index); to look it up takes longer than to set it."""
     return by_time(m.component(name), m.p_slack_up)

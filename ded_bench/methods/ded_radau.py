@@ -105,8 +105,8 @@ _program = functools.lru_cache(maxsize=1)(RadauProgram)
 
 def default_element(case: Case) -> float:
     """Mean length of an element by the fastest mode of the linearisation at the nominal point, s."""
-    modes = plant_of(case, "lossless").nominal().modes
-    return min(LONGEST_S, LONGEST_PERIODS * 2 * np.pi / float(np.abs(modes.imag).max()))
+    fastest = float(np.abs(plant_of(case, "lossless").nominal().modes.imag).max())  # 0: all are overdamped
+    return min(LONGEST_S, LONGEST_PERIODS * 2 * np.pi / max(fastest, 1e-9))
 
 
 def element_count(case: Case, instance: Instance, length_s: float) -> int:

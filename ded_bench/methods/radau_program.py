@@ -180,6 +180,9 @@ class RadauProgram:
     def schedule(self, x: Array, instance: Instance, ends: NDArray[np.int_]) -> Schedule:
         """The generator powers of a solution, with one row per element end.
 
-        IPOPT relaxes bounds by 1e-8 of their size; powers are put back, which makes no ramp steeper.
+        IPOPT relaxes bounds by 1e-8 of their size; powers are put back, which makes no ramp steeper. P_0 is
+        given, wherever it lies.
         """
-        return Schedule(instance.grid[ends], np.clip(x[self.p_gen], self.case.p_min, self.case.p_max))
+        p = np.clip(x[self.p_gen], self.case.p_min, self.case.p_max)
+        p[0] = instance.p_initial(self.case)
+        return Schedule(instance.grid[ends], p)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,8 @@ from ded_bench.solvers.status import Status
 if TYPE_CHECKING:
     from torch import nn
 
-SCHEMA = "ded-bench/policy/1"
+#: Files of the first kind have fingerprints of their weights alone.
+SCHEMAS = "ded-bench/policy/1", "ded-bench/policy/2"
 #: Instances answered at a time.
 CHUNK = 50
 SOLVER_VERSION = f"numba {numba.__version__}, numpy {np.__version__}"
@@ -59,9 +61,12 @@ class TrainedPolicy(abc.ABC):
     """Weights with all that is needed to answer: powers on the same knots whatever the instance."""
 
     method: ClassVar[str]
+    #: Facts of the training that answers depend on.
+    deciding: ClassVar[tuple[str, ...]] = ()
     scope: Scope
     weights: Weights
     training: dict[str, Any]  # facts of the training, and of what was trained
+    schema: str = SCHEMAS[-1]
 
     @abc.abstractmethod
     def answers(self, instances: Sequence[Instance]) -> Array:
@@ -83,8 +88,12 @@ class TrainedPolicy(abc.ABC):
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """Twelve hex digits that change when any weight does."""
-        return hashlib.sha256(b"".join(w.tobytes() for w in self.weights.values())).hexdigest()[:12]
+        """Twelve hex digits that change when any weight does, or else what decides on answers."""
+        digest = hashlib.sha256(b"".join(w.tobytes() for w in self.weights.values()))
+        if self.schema != SCHEMAS[0]:
+            facts = [self.scope.horizon_s, *(self.training.get(name) for name in self.deciding)]
+            digest.update(json.dumps(facts).encode())
+        return digest.hexdigest()[:12]
 
     def __call__(self, instances: Instance | Sequence[Instance]) -> list[Schedule]:
         """Schedules of one instance or several, on the knots.
@@ -100,14 +109,14 @@ class TrainedPolicy(abc.ABC):
 
     def save(self, path: Path) -> None:
         """Write weights and header."""
-        facts = {"horizon_s": self.scope.horizon_s, "training": self.training}
+        facts = {"schema": self.schema, "horizon_s": self.scope.horizon_s, "training": self.training}
         write_arrays(path, self.weights, self._header(self.scope.case, self.scope.regime) | facts)
 
     @classmethod
     def _header(cls, case: Case, regime: str) -> dict[str, Any]:
         """What tells policies apart."""
-        own = {"schema": SCHEMA, "method": cls.method}
-        return own | {"case": case.id, "case_fingerprint": case.fingerprint, "regime": regime}
+        of_case = {"case": case.id, "case_fingerprint": case.fingerprint}
+        return {"method": cls.method} | of_case | {"regime": regime}
 
     @classmethod
     def load(cls, path: str | Path, case: Case, regime: str) -> Self:
@@ -118,6 +127,9 @@ class TrainedPolicy(abc.ABC):
                 another regime or method.
         """
         arrays, header = read_arrays(path)
+        schema = str(header.get("schema"))
+        if schema not in SCHEMAS:
+            raise InputError(path, "schema", f"is {schema[:60]!r}, but one of {', '.join(SCHEMAS)} is needed")
         for name, value in cls._header(case, regime).items():
             if header.get(name) != value:
                 raise InputError(path, name, f"is {str(header.get(name))[:60]!r}, but {value!r} is needed")
@@ -133,7 +145,7 @@ class TrainedPolicy(abc.ABC):
             if name not in arrays or arrays[name].shape != shapes.get(name):
                 raise InputError(path, name, "is missing, unknown or has the wrong shape")
         weights = {name: arrays[name].astype(np.float32) for name in shapes}
-        return cls(Scope(case, regime, float(horizon)), weights, training)
+        return cls(Scope(case, regime, float(horizon)), weights, training, schema)
 
     @classmethod
     def find(cls, case: Case, regime: str, settings: Settings) -> Self:

@@ -60,13 +60,14 @@ class TrainingRun(abc.ABC):
         falling = LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * progress))
         return whole * falling * min(1.0, 0.05 + progress / WARM_UP)
 
-    def train(self, options: TrainingOptions, epochs: int, title: str) -> dict[str, Any]:
+    def train(self, options: TrainingOptions, epochs: int, title: str, *made_of: str) -> dict[str, Any]:
         """Train, from the checkpoint if asked; the network then has the weights to keep.
 
         Args:
             options: of the training.
             epochs: how many, unless the options say so.
             title: of the progress bar.
+            made_of: fingerprints of the case and of what else a checkpoint has to be of.
 
         Returns:
             Facts for the policy's file.
@@ -74,12 +75,12 @@ class TrainingRun(abc.ABC):
         Raises:
             InputError: the checkpoint is none, or one of another training.
         """
-        self.of = [title, options.seed]
+        self.of = [title, options.seed, *made_of]
         if options.resume and checkpoint_file(self.out).is_file():
             self.load()
         epochs, seconds = options.epochs or epochs, options.seconds
         started, busy = time.perf_counter() - self.spent, time.process_time() - self.busy
-        progress = self.epoch / epochs
+        progress = max(self.epoch / epochs, 0.0 if seconds is None else self.spent / seconds)
         with tqdm(total=epochs, initial=self.epoch, unit="epoch", disable=None, desc=title) as bar:
             while progress < 1.0:
                 batches = self.batches()

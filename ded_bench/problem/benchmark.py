@@ -198,8 +198,10 @@ def select_split(
         servable: tells which instances can be served, where some are drawn.
 
     Raises:
-        InputError: there is no such case or split, or a file is missing or wrong.
+        InputError: there is no such case or split, the limit is negative, or a file is missing or wrong.
     """
+    if limit is not None and limit < 0:
+        raise InputError("limit", "", f"must be at least 0, or None for all, not {limit}")
     case = Case.load(name)
     if split == "validation":
         count = VALIDATION_COUNT if limit is None else limit

@@ -55,7 +55,8 @@ class OnArrays:
             spent = time.perf_counter() - started
             other = ipopt.solve_form(form, max(left - spent, 1e-3))  # IPOPT wants some
             version, message = f"{answer.version}, {other.version}", f"{answer.message}, {other.message}"
-            answer = dataclasses.replace(other, version=version, message=message)
+            iterations = answer.iterations + other.iterations
+            answer = dataclasses.replace(other, iterations=iterations, version=version, message=message)
         elapsed, objective = time.perf_counter() - started, None
         if answer.status in (Status.OPTIMAL, Status.FEASIBLE):
             values[np.isnan(values)] = answer.x

@@ -120,5 +120,5 @@ def run_ipopt(
     x = objective = None
     if status in (Status.OPTIMAL, Status.FEASIBLE, Status.TIME_LIMIT):
         x, objective = result["x"].full().ravel(), float(result["f"])
-    said = stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
+    said = None if error else stats.get("iter_count"), setup_s, elapsed, objective, _IPOPT_VERSION, message
     return Outcome(status, *said), x

@@ -92,8 +92,8 @@ def tracking(
     """
     p_load = instance.p_load(case)
     target = merit_order(case, instance.cost_gen(case), instance.cost_slack(case), p_load)
-    gain = instance.dt_s / rng.uniform(*lag_s)
-    smooth = instance.dt_s / rng.uniform(*smooth_s)
+    gain = min(instance.dt_s / rng.uniform(*lag_s), 1.0)  # more would overshoot, where steps are long
+    smooth = min(instance.dt_s / rng.uniform(*smooth_s), 1.0)
     most = rng.uniform(*rate) * case.ramp * instance.dt_s
     p = np.empty_like(target)
     p[0] = instance.p_initial(case)

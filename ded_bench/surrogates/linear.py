@@ -84,10 +84,16 @@ def energy_form(case: Case) -> EnergyForm:
     energy[n:, n:] = np.linalg.cholesky(hessian - EPSILON * np.eye(n))
     dissipation = np.zeros((2 * n, 2 * n))
     dissipation[:n, :n] = np.diag(np.sqrt(np.maximum(linear.d / linear.m**2 - EPSILON, 0.0)))
-    feedthrough = np.zeros((2 * n, n + len(case.loads)))
+    return EnergyForm(skew, dissipation, energy, feedthrough_of(linear))
+
+
+def feedthrough_of(linear: Linearisation) -> Array:
+    """What changes of loads move P_s and N by at once, F, (2 n_gen, n_in)."""
+    n, n_load = linear.share.shape
+    feedthrough = np.zeros((2 * n, n + n_load))
     feedthrough[n, n:] = linear.slack_share
     feedthrough[n + 1 :, n:] = linear.share[:-1]
-    return EnergyForm(skew, dissipation, energy, feedthrough)
+    return feedthrough
 
 
 def injection_lift(case: Case) -> Array:
@@ -134,4 +140,4 @@ def linear_model(case: Case, dt_s: float | None = None) -> Koopman:
     rates[:n, :n] -= np.diag(linear.d / linear.m)
     rates[:n, n:] = -np.linalg.inv(injections_from_generators(n)) / linear.m[:, None]
     facts = {"source": "linearisation at the nominal point"}
-    return physical_model(case, "linear", rates, energy_form(case).feedthrough, facts, dt_s)
+    return physical_model(case, "linear", rates, feedthrough_of(linear), facts, dt_s)

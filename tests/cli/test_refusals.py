@@ -281,6 +281,7 @@ def test_interrupted_in_the_first_second(monkeypatch: pytest.MonkeyPatch, capsys
         (("--method", "ded", "--regime", "TO"), "is not trained"),
         (("--method", "ded-dpc", "--device", "cuda"), "ded-dpc is trained on the CPU alone"),
         (("--method", "ded-dpc", "--case", str(MIXED)), "has no lossless network"),
+        (("--method", "ded-admm", "--seed", "500000"), "must be below 500000"),
     ],
 )
 def test_trainings_that_cannot_be_meant(capsys, tmp_path: Path, monkeypatch, options, problem_said) -> None:

@@ -6,7 +6,7 @@ import casadi
 import numpy as np
 import pytest
 
-from ded_bench.methods.ded_radau import default_element, element_count, element_ends, prepare
+from ded_bench.methods.ded_radau import LONGEST_S, default_element, element_count, element_ends, prepare
 from ded_bench.methods.radau_program import POINTS, WEIGHTS, RadauProgram
 from ded_bench.methods.solution import Settings
 from ded_bench.plants.lossless.network import Network
@@ -75,6 +75,12 @@ def test_fast_modes_ask_for_short_elements(ninebus: Case) -> None:
     """An eighth of the period of the fastest mode: docs/grids.md has their frequencies."""
     assert default_element(ninebus) == 0.1
     assert default_element(Case.load("39bus")) == pytest.approx(0.125 / 1.57, rel=5e-3)
+
+
+def test_modes_that_do_not_swing_ask_for_nothing(threebus: Case, alter) -> None:
+    machine = threebus.machines["plant"].model_copy(update={"d": 1e3})
+    overdamped = alter(threebus, machines={"plant": machine.model_dump(mode="json")})
+    assert default_element(overdamped) == LONGEST_S
 
 
 def test_states_near_the_true_ones_in_high_order(case: Case, quiet_instance) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.dpc import refinement
 from ded_bench.methods.dpc.channels import Channels, Response
 from ded_bench.methods.dpc.dpc_policy import artifacts, prepare
@@ -116,3 +117,5 @@ def test_it_is_an_option_that_needs_a_model(threebus: Case, tmp_path: Path) -> N
     assert len({answer.schedule.p.tobytes() for answer in answers}) == 3
     needed = [[one.kind for one in artifacts(threebus, regime, chosen)] for chosen in settings]
     assert needed == [["policy"], ["policy", "model"], ["policy", "model"]]
+    with pytest.raises(InputError, match="but the model linear has steps of"):
+        prepare(threebus, regime, settings[1])(instance.model_copy(update={"dt_s": 2.0 * instance.dt_s}))

@@ -112,6 +112,26 @@ def test_facts_that_do_not_fit_are_refused(
         type(policy).load(path, threebus, policy.scope.regime)
 
 
+def test_a_fingerprint_follows_all_that_decides_on_answers(threebus: Case, tmp_path: Path) -> None:
+    """Those of files of the first kind, which the rows of reference runs carry, follow weights alone."""
+    policy, path = random_policy("ded-admm", threebus), tmp_path / "p.safetensors"
+    facts = [
+        policy.training | change for change in ({}, {"margin": 0.25}, {"iterations": 99}, {"seconds": 1.0})
+    ]
+    found = [dataclasses.replace(policy, training=training).fingerprint for training in facts]
+    assert len(set(found[:3])) == 3
+    assert found[3] == found[0]
+    scope = dataclasses.replace(policy.scope, horizon_s=2.0 * policy.scope.horizon_s)
+    assert dataclasses.replace(policy, scope=scope).fingerprint not in found
+    first = dataclasses.replace(policy, schema="ded-bench/policy/1")
+    first.save(path)
+    other = dataclasses.replace(type(policy).load(path, threebus, policy.scope.regime), training=facts[1])
+    assert other.fingerprint == first.fingerprint != found[0]
+    dataclasses.replace(policy, schema="ded-bench/policy/3").save(path)
+    with pytest.raises(InputError, match="schema: is 'ded-bench/policy/3'"):
+        type(policy).load(path, threebus, policy.scope.regime)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Little is drawn, and epochs are short."""
@@ -133,7 +153,7 @@ def trained(module: ModuleType, case: Case, out: Path, **options: object) -> Tra
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("method", TRAINERS)
 def test_training_keeps_the_best_repeats_and_goes_on(
-    threebus: Case, tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+    threebus: Case, tmp_path: Path, method: str, alter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = TRAINERS[method]
     whole = trained(module, threebus, tmp_path / "a.safetensors", version="1.2.3")
@@ -165,6 +185,8 @@ def test_training_keeps_the_best_repeats_and_goes_on(
     assert trained(module, threebus, tmp_path / "c.safetensors", seed=4).fingerprint != whole.fingerprint
     with pytest.raises(InputError, match="no checkpoint of this training"):
         trained(module, threebus, out, resume=True, seed=4)
+    with pytest.raises(InputError, match="no checkpoint of this training"):
+        trained(module, alter(threebus, ramp_pu_per_s=0.01), out, resume=True)
     checkpoint_file(out).write_bytes(b"no checkpoint")
     with pytest.raises(InputError, match="no checkpoint"):
         trained(module, threebus, out, resume=True)
@@ -176,3 +198,27 @@ def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path, method: 
     policy = trained(TRAINERS[method], threebus, tmp_path / "a.safetensors", epochs=100_000, seconds=0.3)
     assert 0.3 <= policy.training["seconds"] < 5.0
     assert 1 <= policy.training["epochs"] < 100_000
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("method", TRAINERS)
+def test_what_is_finished_stays_finished(threebus: Case, tmp_path: Path, method: str) -> None:
+    """Resumed, it takes no step; with more time the learning rate goes on from where it was."""
+    limited = {"epochs": 100_000, "seconds": 0.3}
+    first = trained(TRAINERS[method], threebus, tmp_path / "a.safetensors", **limited)
+    again = trained(TRAINERS[method], threebus, tmp_path / "a.safetensors", resume=True, **limited)
+    assert (again.fingerprint, again.training["steps"]) == (first.fingerprint, first.training["steps"])
+
+
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
+def test_a_resumed_training_may_have_other_instances(
+    threebus: Case, tmp_path: Path, monkeypatch, seconds
+) -> None:
+    """Of `ded-dpc`, whose time decides how many are drawn: all of them are trained on."""
+    monkeypatch.setattr(dpc_training, "FRESH_PER_SECOND", 500)
+    out, seen = tmp_path / "a.safetensors", set[int]()
+    trained(dpc_training, threebus, out, seconds=0.3)
+    monkeypatch.setattr(TrainingRun, "_take_step", lambda run, rows, progress: seen.update(rows.tolist()))
+    policy = trained(dpc_training, threebus, out, seconds=seconds, resume=True)
+    assert policy.training["instances"] == 500 * seconds
+    assert seconds < 0.3 or seen == set(range(policy.training["instances"]))

@@ -19,6 +19,7 @@ from ded_bench.results.folder import ResultsFolder
 from ded_bench.surrogates.find import find_model
 from ded_bench.surrogates.identify import (
     held_out,
+    hurried,
     identify,
     load_ramps,
     make_model,
@@ -143,6 +144,15 @@ def test_identified_model_beats_the_linearisation(case: Case) -> None:
 def test_identification_is_repeatable(threebus: Case) -> None:
     model, again, other = (identify(threebus, seed, count=8) for seed in (5, 5, 6))
     assert model.fingerprint == again.fingerprint != other.fingerprint
+
+
+def test_schedules_to_learn_from_keep_ramps_where_steps_are_long(case: Case, quiet_instance) -> None:
+    """Of half a second, which are longer than what smooths them."""
+    instance = quiet_instance(case, dt_s=0.5)
+    for seed in range(5):
+        schedule = hurried(case, instance, np.random.default_rng(seed))
+        steps = np.abs(np.diff(schedule, axis=0))
+        assert (steps <= case.ramp * instance.dt_s * (1.0 + 1e-9)).all()
 
 
 def test_schedules_that_the_system_cannot_follow_are_left_out(case: Case, monkeypatch) -> None:

@@ -26,6 +26,7 @@ from ded_bench.methods.trained_policy import TrainedPolicy, as_solver
 from ded_bench.plants.plant import SimulationError
 from ded_bench.problem.case import Array, Case
 from ded_bench.problem.instance import Instance
+from ded_bench.problem.lossless_case import lossless
 
 VERSION = 1
 #: Weights that were learned for fewer iterations take long steps and do not serve many.
@@ -47,6 +48,7 @@ class AdmmPolicy(TrainedPolicy):
     """Learned settings of iterations; `training` has their number, and perhaps a `margin` of the bound."""
 
     method = "ded-admm"
+    deciding = ("iterations", "margin")
 
     @functools.cached_property
     def grid(self) -> ModalGrid:
@@ -110,7 +112,9 @@ def artifacts(case: Case, regime: str, settings: Settings) -> tuple[Artifact, ..
 
 
 def check(case: Case, settings: Settings) -> None:
-    """Raise InputError if a margin is asked for on an island."""
+    """Raise InputError on an island that is given a margin, or beside a slack without a lossless network."""
+    if case.slack is not None:
+        lossless(case)
     if case.slack is None and read_options(Options, settings.options).margin is not None:
         raise InputError("--set", "margin", "policies of islands have none but the learned")
 

@@ -71,7 +71,7 @@ def train(
     check = grid.start(problems_of(case, instances[:HELD_OUT], grid.points))
     run = _AdmmTraining(network, check, options.seed, out)
     with np.errstate(over="ignore", invalid="ignore"):  # a draw may swing up without end
-        facts = run.train(options, EPOCHS, f"{AdmmPolicy.method} {regime}")
+        facts = run.train(options, EPOCHS, f"{AdmmPolicy.method} {regime}", case.fingerprint)
     facts |= {
         "batch": run.batch,
         "instances": run.step * run.batch,

@@ -108,6 +108,7 @@ def prepare(case: Case, regime: str, settings: Settings) -> Solver:
     def answer(instance: Instance) -> Array:
         grid = instance.dt_s, instance.steps
         if grid not in refiners:
+            model.check_step(instance)
             refiners[grid] = Refiner(case, model, regime, instance.grid, policy.knots)
         inputs = StackedInstances.of(case, [instance])
         return np.asarray(refiners[grid](inputs, policy.powers(inputs), steps)[0])

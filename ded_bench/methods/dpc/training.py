@@ -196,6 +196,7 @@ def train(
         instances: choose the best weights and are never trained on; they share one time grid and horizon.
     """
     model, first = options.find_model(case), instances[0]
+    model.check_step(first)
     scope = Scope(case, regime, first.horizon_s)
     response = Response.make(case, case.knot_times(first.horizon_s))
     fresh = FRESH if options.seconds is None else min(FRESH, math.ceil(FRESH_PER_SECOND * options.seconds))
@@ -211,7 +212,8 @@ def train(
     staged.normalise(channels[0])
     loss = RolloutLoss(condensed, case.omega_bound(regime))
     run = _DispatchTraining(staged, loss, data, check, options.seed, out)
-    facts = run.train(options, EPOCHS, f"{DispatchPolicy.method} {regime}") | {
+    title = f"{DispatchPolicy.method} {regime}"
+    facts = run.train(options, EPOCHS, title, case.fingerprint, model.fingerprint) | {
         "instances": len(drawn),
         "held_out": len(instances),
         "model": model.kind,
@@ -234,6 +236,13 @@ class _DispatchTraining(TrainingRun):
         super().__init__(network, optimiser, seed, out)
         self.judge, self.data, self.check = loss, data, check
         self.penalty = torch.zeros(len(data.cost))  # of each instance when it was last seen
+
+    def load(self) -> None:
+        """See `TrainingRun.load`; there may be more instances than then, or fewer."""
+        super().load()
+        known, self.penalty = self.penalty, torch.zeros(len(self.data.cost))
+        count = min(len(known), len(self.penalty))
+        self.penalty[:count] = known[:count]
 
     def batches(self) -> Sequence[Tensor]:
         """Rows of the next epoch: all, the hard ones repeatedly, shuffled."""

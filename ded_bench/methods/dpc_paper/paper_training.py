@@ -124,6 +124,7 @@ def train(
         instances: to train on; they share one time grid.
     """
     model, first = options.find_model(case), instances[0]
+    model.check_step(first)
     with tensors_on(options.device):
         condensed = CondensedRollout.make(model, first.grid, case.knot_times(first.horizon_s))
         data = Batch.of(case, model, instances)
@@ -132,7 +133,8 @@ def train(
         torch.manual_seed(options.seed)
         network = PaperNetwork(n_channels(case), case.p_min, case.p_max)
     run = PaperTraining(network.to(options.device), loss, data, options.seed, out)
-    facts = run.train(options, EPOCHS, f"{PaperPolicy.method} {regime}") | {
+    title = f"{PaperPolicy.method} {regime}"
+    facts = run.train(options, EPOCHS, title, case.fingerprint, model.fingerprint) | {
         "instances": len(instances),
         "held_out": 0,
         "model": model.kind,

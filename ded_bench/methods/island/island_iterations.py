@@ -149,7 +149,7 @@ class IslandGrid:
 
     def _raised(self, cost: Array, demand: Array, part: Array) -> Array:
         """Some machines raised from their lower limits, one after another, (n_knots, n_part)."""
-        low, high, order = self.case.p_min[part], self.case.p_max[part], np.argsort(cost[part])
+        low, high, order = self.case.p_min[part], self.case.p_max[part], np.argsort(cost[part], kind="stable")
         reach = (high - low)[order]
         below = np.cumsum(reach) - reach
         powers = np.tile(low, (len(demand), 1))

@@ -50,6 +50,7 @@ class IslandPolicy(TrainedPolicy):
     """Learned settings; `training` has rounds, iterations, those of mending, substeps, and if it is quick."""
 
     method = "ded-admm"
+    deciding = ("rounds", "iterations", "mending", "substeps", "quick")
 
     @functools.cached_property
     def grid(self) -> IslandGrid:

@@ -199,6 +199,8 @@ def _case_of(instance: Instance, case: Case | None) -> Case:
     from ded_bench.files.errors import InputError
 
     if case is not None:
+        if not hasattr(case, "generators"):
+            raise InputError("case", "", f"must be a Case, such as Case.load({str(case)[:40]!r})")
         return case
     if (shipped := _shipped(instance.case)) is None:
         raise InputError(f"instance {instance.id}", "case", f"{instance.case!r} is no shipped case: give it")

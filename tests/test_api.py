@@ -141,6 +141,11 @@ def test_functions_are_those_of_the_floors(ninebus: Case, quiet_instance, consta
     assert np.array_equal(ours.omega, theirs.omega)
 
 
+def test_a_name_is_no_case(quiet_instance, ninebus: Case) -> None:
+    with pytest.raises(InputError, match=r"must be a Case, such as Case.load\('9bus'\)"):
+        ded_bench.solve(quiet_instance(ninebus), "ed", "TO", case="9bus")
+
+
 def test_solve_answers_like_the_method(threebus: Case, quiet_instance) -> None:
     instance = quiet_instance(threebus, horizon_s=0.5)
     solution = ded_bench.solve(instance, "ded", "NO", case=threebus)

@@ -277,7 +277,7 @@ def _sample(
 def _task(case: Case, row: Row, instances: Mapping[str, Instance], folder: Path) -> Task | str:
     """The task that makes a row, or why the folder has not what made it."""
     model = model_name(row.model)
-    if row.method not in registered():
+    if "." not in row.method and row.method not in registered():
         return "no method has this name"
     if model not in ("", *MODELS):
         return f"made with a model of its own ({model})"

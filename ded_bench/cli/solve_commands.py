@@ -212,7 +212,8 @@ def _reproduce(a: argparse.Namespace) -> int:
     say(f"solving up to {a.sample} rows of each method, settings, model and regime in {a.results} again")
     from ded_bench.analysis.compare import reproduce
 
-    found = reproduce(case, instances, results, a.method, a.sample, a.workers, say)
+    methods = [name.replace(":", ".") for name in a.method]  # as rows of own methods have it
+    found = reproduce(case, instances, results, methods, a.sample, a.workers, say)
     print(found.replace({"model": {"": "-"}}).to_string(index=False, float_format="{:.1e}".format))
     count, differ = int(found["rows"].sum()), int(found["differ"].sum())
     print(f"{counted(count, 'row')} solved again, {differ} differ")
@@ -224,7 +225,8 @@ def _referee(a: argparse.Namespace) -> int:
     from ded_bench.analysis.referee import referee
 
     results, case, instances = _rows_of(a)
-    rows = referee(case, instances, results, a.method, a.limit, a.python, a.workers)
+    methods = [name.replace(":", ".") for name in a.method]  # as rows of own methods have it
+    rows = referee(case, instances, results, methods, a.limit, a.python, a.workers)
     verified = [row for row in rows if results.rows[row.key].feasible and not row.error]
     print(
         f"{counted(len(rows), 'row')} in {results.paths.referee}, {sum(bool(row.error) for row in rows)} "

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.knots import control_times
 from ded_bench.plants.plant import Plant, plant_of, servable, simulate
 from ded_bench.plants.time_varying import TimeVarying
 from ded_bench.problem.benchmark import SplitName, select_split
 from ded_bench.problem.case import Array, Case, Indices
 from ded_bench.problem.instance import BETWEEN, Instance
-from ded_bench.problem.schedule import Schedule
+from ded_bench.problem.schedule import Schedule, as_schedule
 from ded_bench.surrogates.koopman import hat_functions
 
 
@@ -46,11 +47,15 @@ def split_arrays(
         times: at which loads are wanted, (n_t,), s; None: the case's knots.
 
     Raises:
-        InputError: there is no such case or split, or a file is missing or wrong.
+        InputError: there is no such case or split, a file is missing or wrong, the limit is negative, or a
+            time is not within the case's horizon.
     """
     chosen = select_split(case, split, limit, servable)
     own, instances = chosen.case, tuple(instance for instance, _ in chosen.instances)
-    t = own.knot_times(own.sampling.horizon_s) if times is None else np.asarray(times, dtype=np.float64)
+    horizon_s = own.sampling.horizon_s
+    t = own.knot_times(horizon_s) if times is None else np.asarray(times, dtype=np.float64)
+    if t.ndim != 1 or not ((t >= 0.0) & (t <= horizon_s + 1e-9)).all():
+        raise InputError("times", "", f"must be a row of numbers from 0 to {horizon_s:g}")
     shapes = len(t), len(own.loads)
     return SplitArrays(
         own,
@@ -97,7 +102,7 @@ def linearise(
         SimulationError: the plant cannot follow the schedule.
         InputError: as `simulate`.
     """
-    chosen = plant_of(case, plant)
+    chosen, schedule = plant_of(case, plant), as_schedule(schedule, case)
     trajectory = simulate(case, instance, schedule, chosen)
     return chosen.linearise_along(trajectory, model_points(case, instance, schedule, interval_s))
 
@@ -118,6 +123,7 @@ def condense(
         SimulationError: the plant cannot follow the schedule.
         InputError: as `simulate`.
     """
+    schedule = as_schedule(schedule, case)
     model = linearise(case, instance, schedule, plant, interval_s)
     t, n_gen = instance.grid[model.points], len(case.generators)
     hats = hat_functions(t, schedule.t)
@@ -137,7 +143,13 @@ def condense(
 
 
 def model_points(case: Case, instance: Instance, schedule: Schedule, interval_s: float) -> Indices:
-    """Grid points of a model's knots, strictly increasing from the first to the last."""
+    """Grid points of a model's knots, strictly increasing from the first to the last.
+
+    Raises:
+        InputError: the interval is no length of time.
+    """
+    if not interval_s > 0.0:
+        raise InputError("interval_s", "", f"must be above 0, not {interval_s}")
     dt_s, last = instance.dt_s, instance.steps
     times = np.arange(0.0, instance.horizon_s, interval_s), schedule.t, control_times(case, instance)
     places = np.concatenate(times) / dt_s  # a row between grid points is a bend at both of them

@@ -94,6 +94,7 @@ def _lossless(plant: LosslessPlant) -> CasadiModel:
     force = (u - f[network.generators.tolist()] - network.d * x[n:]) / network.m
 
     def start(instance: Instance) -> tuple[Array, Array, Array]:
+        instance.check_case(case)
         state = plant.initial(instance)
         at = state.theta[network.generators], state.omega
         return np.concatenate(at), state.theta[network.algebraic], np.empty(0)
@@ -119,6 +120,7 @@ def _detailed(plant: DetailedPlant) -> CasadiModel:
     held = -gain * casadi.dot(casadi.DM(system.data.inertia), x[DELTA * n : (DELTA + 1) * n])
 
     def start(instance: Instance) -> tuple[Array, Array, Array]:
+        instance.check_case(case)
         state = plant.initial(instance)
         turned = state.v.view(np.complex128) * np.exp(1j * (system.data.inertia @ state.x[DELTA]))
         return state.x.ravel(), turned.view(np.float64), np.array([*state.v_ref, *state.offset, state.held])

@@ -103,8 +103,10 @@ def simulated(
         are not numbers, and its gradient is zero.
 
     Raises:
-        InputError: instances, times or powers do not fit together.
+        InputError: instances, times or powers do not fit together, or powers are no tensor of real numbers.
     """
+    if not (isinstance(power, torch.Tensor) and power.is_floating_point()):
+        raise InputError("power", "", "must be a tensor of floating point numbers")
     shape = len(instances), len(t), len(case.generators)
     if tuple(power.shape) != shape:
         raise InputError("power", "", f"has the shape {tuple(power.shape)}, but needs {shape}")

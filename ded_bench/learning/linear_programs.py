@@ -52,9 +52,11 @@ def export_programs(
         How many programs there are.
 
     Raises:
-        InputError: unknown method, regime or settings, or the method solves no linear programs.
+        InputError: unknown method, regime or settings, a scenario of another case, or the method solves no
+            linear programs.
         SimulationError: the plant cannot follow.
     """
+    scenario.check_case(case)
     own = settings or Settings()
     own = own if own.search else replace(own, search=search_folders(case))
     options, arrays, now = options or LoopOptions(), {}, 0.0

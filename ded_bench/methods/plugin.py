@@ -221,7 +221,7 @@ def accept(answer: object, case: Case, instance: Instance, seconds: float) -> So
         solve_s=seconds if solve_s is None else solve_s,
         solver_objective=_number(answer.solver_objective, -math.inf, math.inf),
         solver_version=_line(answer.solver_version),
-        error=_line(answer.error),
+        error=_line(answer.error) or ("" if schedule is not None else status.sentence),
     )
 
 

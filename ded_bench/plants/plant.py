@@ -259,7 +259,12 @@ def in_threads(
         function: of one item; what it raises beside the two errors is raised here.
         items: what it is called with.
         threads: how many work at once; None: as many as there are cores.
+
+    Raises:
+        InputError: no thread is to work.
     """
+    if threads is not None and threads < 1:
+        raise InputError("threads", "", f"must be at least 1, or None for all cores, not {threads}")
 
     def answer(item: Item) -> Answer | InputError | SimulationError:
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -168,14 +168,26 @@ def _remove_others(case: Case, folder: Path, names: Iterable[str]) -> None:
 
 def _write_manifest(folder: Path, names: Iterable[str], redraws: int = 0) -> Manifest:
     """Write the manifest of some files of a folder; `redraws` stands in it only where there are any."""
-    sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
-    whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in sums.items()).encode()).hexdigest()
-    manifest = Manifest(
-        schema_="ded-bench/manifest/1", version=f"1-{whole[:12]}", files=sums, redraws=redraws
-    )
+    sums = _sums(folder, names)
+    manifest = Manifest(schema_="ded-bench/manifest/1", version=version_of(sums), files=sums, redraws=redraws)
     text = manifest.model_dump_json(by_alias=True, indent=1, exclude=None if redraws else {"redraws"})
     write_atomically(folder / MANIFEST, text + "\n")
     return manifest
+
+
+def _sums(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of each file; empty for one that is missing."""
+    paths = {name: folder / name for name in names}
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for name, path in paths.items()
+    }
+
+
+def version_of(sums: Mapping[str, str]) -> str:
+    """The version of files with these sums."""
+    whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in sums.items()).encode()).hexdigest()
+    return f"1-{whole[:12]}"
 
 
 @dataclass(frozen=True)
@@ -184,7 +196,7 @@ class Selection:
 
     case: Case
     instances: tuple[tuple[Instance, str], ...]
-    version: str  # of the problem files, from their manifest; empty without one
+    version: str  # of the problem files that the manifest names; empty without one
 
 
 def select_split(
@@ -256,8 +268,9 @@ def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selec
 
 
 def _version(folder: Path) -> str:
+    """The manifest's, as long as its files are those that it was made of; else that of files like these."""
     manifest = load_manifest(folder)
-    return manifest.version if manifest else ""
+    return version_of(_sums(folder, manifest.files)) if manifest else ""
 
 
 def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selection:

@@ -44,12 +44,12 @@ class Schedule:
 
         return interpolated(self.t, np.ascontiguousarray(self.p), times)
 
-    def write(self, path: Path, generators: tuple[str, ...]) -> None:
+    def write(self, path: str | Path, generators: tuple[str, ...]) -> None:
         """Write as CSV, compressed if the name ends in `.gz`; 15 significant digits."""
         text = io.StringIO()
         header, table = ",".join(["t", *(f"P_{g}" for g in generators)]), np.column_stack([self.t, self.p])
         np.savetxt(text, table, fmt="%.15g", delimiter=",", header=header, comments="")
-        write_atomically(path, text.getvalue())
+        write_atomically(Path(path), text.getvalue())
 
     @staticmethod
     def read(path: str | Path, case: Case, horizon_s: float) -> Schedule:

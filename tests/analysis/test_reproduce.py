@@ -43,6 +43,20 @@ def test_differences_are_told_and_limits_named(threebus: Case, quiet_instance, t
     assert results.path.read_bytes() == before
 
 
+def test_own_methods_are_solved_again(threebus: Case, quiet_instance, tmp_path: Path, monkeypatch) -> None:
+    """Named in either way."""
+    text = "from ded_bench import Schedule\n"
+    text += "def solve(instance, regime, case):\n    p = instance.p_initial(case)\n"
+    text += "    return Schedule([0.0, instance.horizon_s], [p, p])\n"
+    (tmp_path / "again_of_mine.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    instance, results = quiet_instance(threebus, id="a", horizon_s=0.2), Results(tmp_path / "out")
+    tasks = make_tasks(threebus, [(instance, "test")], ["again_of_mine:solve"], ["TO"], Settings())
+    run(threebus, tasks, results)
+    found = reproduce(threebus, {"a": instance}, results, ["again_of_mine.solve"])
+    assert found[["method", "rows", "differ"]].to_numpy().tolist() == [["again_of_mine.solve", 1, 0]]
+
+
 def test_what_compares_nothing_shows_nothing(tmp_path: Path) -> None:
     row = Row("9bus-0003", "test", "TO", "mine", "default", "Feasible", case="9bus", fingerprint="f")
     Results(tmp_path).add([row])

@@ -9,12 +9,14 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 import ded_bench.learning
 from ded_bench.files.errors import InputError
-from ded_bench.learning import condense, cost_and_excess, linearise, simulated, split_arrays
+from ded_bench.learning import condense, cost_and_excess, linearise, simulate_many, simulated, split_arrays
+from ded_bench.learning.casadi_expressions import casadi_model
 from ded_bench.plants.plant import SimulationError, plant_of, servable
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
@@ -134,6 +136,33 @@ def test_a_split_is_arrays(problem) -> None:
     np.testing.assert_array_equal(train.p_initial[2], instance.p_initial(case))
     np.testing.assert_array_equal(train.omega_initial[2], instance.omega_initial(case))
     assert train.cost_slack[2] == instance.cost_slack(case)
+    for times in ([0.0, np.nan], [-1.0, 1.0], [0.0, 1e3], 5.0):
+        with pytest.raises(InputError, match="times: must be a row of numbers from 0 to"):
+            split_arrays(problem, times=times)
+    with pytest.raises(InputError, match="limit: must be at least 0"):
+        split_arrays(problem, limit=-1)
+
+
+@pytest.mark.parametrize("power", [torch.ones((1, 2, 1), dtype=torch.int64), np.ones((1, 2, 1))])
+def test_powers_are_a_tensor_of_real_numbers(threebus: Case, quiet_instance, power) -> None:
+    instance = quiet_instance(threebus, horizon_s=0.2)
+    with pytest.raises(InputError, match="must be a tensor of floating point numbers"):
+        cost_and_excess(threebus, [instance], np.array([0.0, 0.2]), power, "TO")
+
+
+def test_intervals_threads_and_cases_that_there_are_not(
+    threebus: Case, ninebus: Case, quiet_instance
+) -> None:
+    instance = quiet_instance(threebus, horizon_s=0.2)
+    table = pd.DataFrame({"t": [0.0, 0.2], "P_plant": [0.6, 0.6]})
+    assert linearise(threebus, instance, table).p_gen.shape[1] == 1  # a data frame is a schedule
+    for interval_s in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="interval_s: must be above 0"):
+            linearise(threebus, instance, table, interval_s=interval_s)
+    with pytest.raises(InputError, match="threads: must be at least 1"):
+        simulate_many([instance], [table], threebus, threads=0)
+    with pytest.raises(InputError, match="is for case 'threebus', not '9bus'"):
+        casadi_model(ninebus).start(instance)
 
 
 def test_numpy_is_enough_but_for_gradients() -> None:

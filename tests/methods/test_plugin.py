@@ -250,6 +250,10 @@ def test_nonsense_is_a_failed_solution_that_says_why(returned, told, threebus, i
     assert solution.solve_s == 0.5
 
 
+def test_no_schedule_is_told_in_words(threebus, instance) -> None:
+    assert accept(Solution(Status.INFEASIBLE), threebus, instance, 0.0).error == Status.INFEASIBLE.sentence
+
+
 def test_what_a_table_cannot_hold_is_left_out(threebus, instance) -> None:
     strange = Solution(
         Status.FEASIBLE,

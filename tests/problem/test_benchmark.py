@@ -100,6 +100,22 @@ def test_draws_make_room_for_draws_of_their_case_alone(tmp_path: Path, threebus:
     assert found == ["threebus-0000.json", "threebus-0001.json", "threebus-s0000.json"]
 
 
+def test_files_that_were_changed_have_a_version_of_their_own(tmp_path: Path, threebus: Case) -> None:
+    """And that of the manifest again when they are as they were."""
+    version = write_benchmark(threebus, 3, 1, tmp_path).version
+    path = tmp_path / "case.json"
+    before, data = path.read_text(), json.loads(path.read_text())
+    data["regimes"]["TO"]["omega_hz"] *= 0.5
+    path.write_text(json.dumps(data))
+    changed = select_split(tmp_path, "all").version
+    assert changed.startswith("1-")
+    assert changed != version
+    path.write_text(before)
+    assert select_split(tmp_path, "all").version == version
+    (tmp_path / "instances" / "threebus-0002.json").unlink()
+    assert select_split(tmp_path, "all", 1).version not in ("", version, changed)
+
+
 def test_draws_that_are_cut_short_have_no_version(
     tmp_path: Path, threebus: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:

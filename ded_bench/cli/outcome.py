@@ -33,6 +33,8 @@ def tell_solved(case: Case, results: Results, rows: Sequence[Row], out: TextIO) 
     print(_text(PageTable(own_first(found), OUTCOME)), file=out)
     better = "`ded-bench bench` takes better ones"
     print(f"gaps are to {reference.title}; times are of this run, {better}", file=out)
+    if counting["problems_version"].nunique() > 1:
+        print("the folder's rows are of different problem files: gaps may mix them", file=out)
     _tell_failures((row for row in rows if row.objective is None), results.paths)
 
 

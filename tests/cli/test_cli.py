@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,6 +90,19 @@ def test_rows_of_validation_draws_are_judged_on_these(tmp_path: Path, capsys) ->
     assert main(road) == 0
     assert main(["score", "--results", str(tmp_path), "--case", str(MIXED)]) == 0
     assert "1 row checked" in capsys.readouterr().out
+
+
+def test_rows_of_an_edited_case_are_told_from_those_before(problem: Path, tmp_path: Path, capsys) -> None:
+    place = shutil.copytree(problem, tmp_path / "edited")
+    road = ["solve", "--case", str(place), "--method", "ed", "--regime", "TO", "--limit", "1"]
+    road += ["--out", str(tmp_path / "out")]
+    assert main(road) == 0
+    assert "different problem files" not in capsys.readouterr().out
+    data = json.loads((place / "case.json").read_text())
+    data["regimes"]["TO"]["omega_hz"] *= 2.0
+    (place / "case.json").write_text(json.dumps(data))
+    assert main([*road, "--set", "every=30"]) == 0
+    assert "the folder's rows are of different problem files" in capsys.readouterr().out
 
 
 def test_kill_in_the_middle_loses_nothing(problem: Path, tmp_path: Path) -> None:

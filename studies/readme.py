@@ -74,9 +74,8 @@ def methods() -> str:
         cells = []
         for seconds in BUDGETS.values():
             able = useful[useful["seconds"] <= seconds].sort_values(["gap_percent", "seconds"])
-            cells.append(
-                f"{able['title'].iloc[0]} ({able['gap_percent'].iloc[0]:+.2g} %)" if len(able) else "–"
-            )
+            best = able[:1].to_dict("records")
+            cells += [f"{one['title']} ({one['gap_percent']:+.2g} %, {one['n']})" for one in best] or ["–"]
         rows.append([case, *cells])
     return markdown(["Grid", *BUDGETS], rows)
 

@@ -169,7 +169,8 @@ def _remove_others(case: Case, folder: Path, names: Iterable[str]) -> None:
 def _write_manifest(folder: Path, names: Iterable[str], redraws: int = 0) -> Manifest:
     """Write the manifest of some files of a folder; `redraws` stands in it only where there are any."""
     sums = _sums(folder, names)
-    manifest = Manifest(schema_="ded-bench/manifest/1", version=version_of(sums), files=sums, redraws=redraws)
+    version = _version_of(sums)
+    manifest = Manifest(schema_="ded-bench/manifest/1", version=version, files=sums, redraws=redraws)
     text = manifest.model_dump_json(by_alias=True, indent=1, exclude=None if redraws else {"redraws"})
     write_atomically(folder / MANIFEST, text + "\n")
     return manifest
@@ -184,7 +185,7 @@ def _sums(folder: Path, names: Iterable[str]) -> dict[str, str]:
     }
 
 
-def version_of(sums: Mapping[str, str]) -> str:
+def _version_of(sums: Mapping[str, str]) -> str:
     """The version of files with these sums."""
     whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in sums.items()).encode()).hexdigest()
     return f"1-{whole[:12]}"
@@ -270,7 +271,7 @@ def select_files(paths: Sequence[str | Path], case: Case | None = None) -> Selec
 def _version(folder: Path) -> str:
     """The manifest's, as long as its files are those that it was made of; else that of files like these."""
     manifest = load_manifest(folder)
-    return version_of(_sums(folder, manifest.files)) if manifest else ""
+    return _version_of(_sums(folder, manifest.files)) if manifest else ""
 
 
 def _selection(case: Case, instances: Sequence[Instance], folder: Path) -> Selection:

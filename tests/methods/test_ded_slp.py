@@ -13,10 +13,11 @@ from ded_bench.files.strict import parse_record
 from ded_bench.methods import ded_slp, ed, knot_columns, knot_program
 from ded_bench.methods.ded_slp import prepare
 from ded_bench.methods.knot_columns import FixedSetPoints
-from ded_bench.methods.knot_program import KnotProgram
+from ded_bench.methods.knot_program import KnotProgram, Plan
 from ded_bench.methods.registry import get_method
-from ded_bench.methods.slp import Attempt, Parts
+from ded_bench.methods.slp import Attempt, Parts, Rows, solve_with_rows_added
 from ded_bench.methods.solution import Settings
+from ded_bench.methods.surrogate_program import SOFT_TOLERANCE
 from ded_bench.plants.plant import SimulationError, plant_of, simulate
 from ded_bench.plants.score import score
 from ded_bench.problem.case import Case
@@ -123,9 +124,10 @@ def test_set_points_fixed_at_limits_change_no_optimum(
     assert made.fixed.gap <= 1e-6 * made.predict(whole.x).objective
 
 
-@pytest.mark.parametrize("index", range(2))
-def test_program_is_the_model_with_every_point(case, index):
+@pytest.mark.parametrize(("index", "stage"), [(0, 1), (0, 4), (1, 2), (1, 6)])
+def test_program_is_the_model_with_every_point(case, index, stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """HiGHS on the Pyomo model with a state, a limit and |P_s| at every grid point finds the same optimum."""
+    monkeypatch.setattr(KnotProgram, "_stage", lambda _: stage)
     instance, bounds = short(case, index), case.bounds("TO")
     made = program(case, instance, bounds)
     limits = [
@@ -142,6 +144,22 @@ def test_program_is_the_model_with_every_point(case, index):
     assert outcome.objective <= prediction.objective * (1 + 1e-8)
     assert prediction.objective == pytest.approx(outcome.objective, rel=2e-4)
     assert bounds.beyond(prediction.outputs)[1:].max() <= 1e-7
+
+
+@pytest.mark.parametrize(("soft", "tolerance"), [(False, 1e-6), (True, 1e-5)])  # what may be left open
+def test_limits_within_stages_get_rows_where_they_are_needed(case, soft, tolerance, monkeypatch) -> None:
+    """Along a trajectory that comes near none of them the optimum is that of a program with all of them."""
+    instance, bounds, answers = short(case, 0), case.bounds("TO"), []
+    monkeypatch.setattr(knot_program, "HELD_AGAIN", 1e9)
+    for stage in (1, 3):
+        monkeypatch.setattr(KnotProgram, "_stage", lambda _, stage=stage: stage)
+        first = program(case, instance, bounds)
+        made = KnotProgram(case, instance, bounds, first.model, Plan(None) if soft else None, before=first)
+        left = SOFT_TOLERANCE * float(bounds.limit.min()) if soft else 1e-7
+        attempt = solve_with_rows_added(made, set(), Rows(left, left, soft), np.inf)
+        assert attempt.status == Status.OPTIMAL
+        answers.append(attempt.solution.objective)
+    assert answers[1] == pytest.approx(answers[0], rel=tolerance)
 
 
 @pytest.mark.parametrize("regime", ["NO", "TO"])

@@ -118,12 +118,29 @@ def test_rows_are_local_to_their_interval(made):
     assert last.x @ x[-1] == pytest.approx((omega - model.omega)[-1], abs=1e-10)
     assert not last.start.any()
     assert not last.end.any()
-    in_order = LocalRows(*(part[np.argsort(rows.interval, kind="stable")] for part in rows))
-    by_set_points = (model.by_set_points(in_order) * u).sum(axis=(1, 2))
-    assert by_set_points == pytest.approx(value_of(in_order, x, u), abs=1e-10)
+    by_set_points = (model.by_set_points(rows) * u).sum(axis=(1, 2))
+    assert by_set_points == pytest.approx(value_of(rows, x, u), abs=1e-10)
     first = np.array([0, 20, 37, 75, 112, 150, 151, 153, 230, 301, 350])
     stretches = np.add.reduceat(p_slack - model.p_slack, first)
     assert value_of(model.slack_rows(first), x, u) == pytest.approx(stretches, abs=1e-10)
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 100])
+def test_rows_are_carried_back_to_earlier_knots(made, every):
+    """There they give what they give in the variables of their own intervals; the last knot's, too."""
+    model, u = made.model, increments(made.model)
+    x, n = model.states(u), len(model.lengths)
+    points = np.array([399, 1, 37, 38, 152, POINTS[-1], POINTS[1]])
+    rows = model.output_rows(np.zeros(len(points), dtype=int), points)
+    first = np.append(np.arange(n) // every * every, n)
+    in_state, in_set_points = model.carried_back(rows, first)
+    begin = first[rows.interval]
+    there = np.array([u[np.minimum(k + np.arange(in_set_points.shape[1]), n)] for k in begin])
+    found = (in_state * x[begin]).sum(axis=1) + (in_set_points * there).sum(axis=(1, 2))
+    omega, _ = model.outputs(u)
+    assert found == pytest.approx((omega - model.omega)[points, 0], abs=1e-10)
+    beyond = begin[:, None] + np.arange(in_set_points.shape[1]) > np.minimum(rows.interval + 1, n)[:, None]
+    assert not in_set_points[beyond].any()
 
 
 def test_cost_rows_sum_what_is_delivered(made):

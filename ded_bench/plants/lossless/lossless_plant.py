@@ -106,16 +106,17 @@ class LosslessPlant:
         stiffness = network.linearise(trajectory.states[(points[:-1] + points[1:]) // 2]).stiffness
         dt_s = float(trajectory.t[1] - trajectory.t[0])
         step = _one_step(stiffness / network.m[:, None], network.d / network.m, 1.0 / network.m, dt_s)
-        slack = -stiffness.sum(axis=1)
+        slack, powers = -stiffness.sum(axis=1), doubled(step, np.diff(points))
         return TimeVarying(
             points=points,
             step=step,
-            across=across_intervals(doubled(step, np.diff(points)), np.diff(points)),
+            across=across_intervals(powers, np.diff(points)),
             speed=slice(n_gen, 2 * n_gen),
             slack=np.concatenate([slack, np.zeros_like(slack)], axis=1),
             omega=trajectory.omega,
             p_slack=trajectory.p_slack,
             p_gen=trajectory.p_set[points],
+            powers=powers,
         )
 
     def observed(self, state: LosslessState) -> State:

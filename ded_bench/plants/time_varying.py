@@ -89,7 +89,8 @@ class TimeVarying:
     @functools.cached_property
     def doubled(self) -> tuple[Hold, ...]:
         """Maps over 1, 2, 4, ... grid steps, see `doubled`."""
-        return self.powers or doubled(self.step, self.lengths)
+        is_current = self.powers and self.powers[0] is self.step  # a changed copy has other maps
+        return self.powers if is_current else doubled(self.step, self.lengths)
 
     def states(self, u: Array) -> Array:
         """Deviations x at the knots under input increments.

@@ -32,7 +32,7 @@ STEADY = 0.1
 AT_LIMIT, PRICED, AROUND = 1e-6, 1e-3, 8
 #: With fewer generators it saves little: nothing on 39bus, a twelfth of the time on 68bus.
 LEAST_GENERATORS = 20
-#: Intervals of a stage, at most: of 2 to 8 those that make programs of 140bus the fastest (validation draws).
+#: Intervals of a stage, at most: six save no more than four on 140bus (studies/linear_programs.md).
 LONGEST = 4
 
 

@@ -328,7 +328,9 @@ class KnotProgram:
         if unpaid <= (STAYED if is_steady else CANCELLED) * abs(predicted.objective):
             return False
         pieces = pieces_of(self.model)
-        if not is_steady:
+        if is_steady:
+            self.fixed = FixedSetPoints(old.u.shape)  # by the prices of a program that paid too little
+        else:
             owner = np.searchsorted(old.pieces, np.arange(len(size) - 1), side="right") - 1
             sums, sizes = (np.add.reduceat(values, old.pieces) for values in (predicted.p_slack, size))
             cancels = sizes - np.abs(sums) > 1e-9 * sizes

@@ -24,6 +24,9 @@ from ded_bench.solvers.status import Status
 
 #: Programs on one linear model; with priced excess a rough answer will do.
 MAX_PROGRAMS, MAX_SOFT_PROGRAMS = 15, 4
+#: What set-points that are fixed at limits may cost, as a part of the cost; else a program without the wrong
+#: ones follows.
+FIXED_COST = 1e-6
 #: A sequence that is longer does not converge.
 SEQUENCE = 15
 #: A step is tried so many times, each half as long.
@@ -170,7 +173,9 @@ def solve_with_rows_added(
         least = (rows.enough if np.isfinite(rows.enough) else rows.open) / 2
         added = program.near(prediction.outputs, least, widened) - limits
         limits |= added if excess > rows.open else set()
-        if not program.divide(answer.x, prediction) and (not added or left_open <= rows.enough):
+        is_cheapest = program.fixed.gap <= FIXED_COST * abs(prediction.objective)
+        is_divided = program.divide(answer.x, prediction)
+        if is_cheapest and not is_divided and (not added or left_open <= rows.enough):
             break
     if answer.status != Status.OPTIMAL and not (rows.soft and prediction is not None):
         return Attempt(answer.status, None, None, iterations, answer.version, answer.message)

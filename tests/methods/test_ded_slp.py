@@ -106,6 +106,27 @@ def test_what_is_fixed_wrongly_is_told_and_set_free(monkeypatch: pytest.MonkeyPa
     assert not fixed.at.any()
 
 
+def test_set_points_fixed_wrongly_are_set_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program on a surrogate is the only one: no simulation would tell."""
+    monkeypatch.setattr(knot_columns, "LEAST_GENERATORS", 1)
+    case, dearer = Case.load(CASE_FILES["fivemachine"]), 0
+    instance, bounds = short(case, 0), case.bounds("NO")
+    model, rows = program(case, instance, bounds).model, Rows(1e-7, 1e-7)
+    for generator in range(len(case.generators)):
+        costs = []
+        for is_fixed in (False, True):
+            made = KnotProgram(case, instance, bounds, model)
+            made.fixed.at[1, -1, generator] = is_fixed  # at its upper limit, at the last knot
+            answer = made.solve(np.empty((0, 3), dtype=int), np.inf)
+            costs += [made.predict(answer.x).objective]
+            made.fixed.at[1, -1, generator] = is_fixed
+            attempt = solve_with_rows_added(made, set(), rows, np.inf)
+            costs += [attempt.solution.objective]
+        dearer += costs[2] > costs[0] * (1 + 1e-5)
+        assert costs[3] == pytest.approx(costs[1], rel=2e-6)
+    assert dearer
+
+
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_set_points_fixed_at_limits_change_no_optimum(
     everywhere: bool, monkeypatch: pytest.MonkeyPatch

@@ -65,7 +65,7 @@ HELD_AGAIN = 0.75
 #: What |P_s| may cost beyond what its pieces pay for, as a part of all; validation draws have up to 1.7e-5.
 #: Where its sign was taken to stay, what shows that it did not.
 CANCELLED, STAYED = 1e-4, 1e-7
-#: Output, grid point, and the sign of the bound that it comes near, of a limit between knots.
+#: Output, grid point, and the sign of the bound that it comes near, of a limit between knots with states.
 Limit = tuple[int, int, int]
 
 
@@ -150,10 +150,10 @@ class KnotProgram:
         return self._case.slack is None
 
     def solve(self, limits: Indices, time_limit_s: float) -> FormAnswer:
-        """Solve with outputs limited, either way, at all knots and at the points chosen.
+        """Solve with outputs limited, either way, at the knots held and at the points chosen.
 
         Args:
-            limits: those between knots, rows of `Limit`, shape (n_limits, 3).
+            limits: at these points, rows of `Limit`, shape (n_limits, 3).
             time_limit_s: see `piqp.solve_form`.
         """
         limits = np.unique(limits[:, :2], axis=0)
@@ -267,7 +267,7 @@ class KnotProgram:
             return replace(answer, iterations=iterations), widened
 
     def near(self, outputs: Array, left_open: float = 0.0, widened: Array | None = None) -> set[Limit]:
-        """Points between knots at which an output comes near its bound.
+        """Points between knots, and knots not held, at which an output comes near its bound.
 
         Args:
             outputs: shape (n_points, n_out), rad/s.

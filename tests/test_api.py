@@ -107,6 +107,12 @@ def test_linear_algebra_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(found[0]) == {1}
 
 
+@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan")])
+def test_a_time_limit_is_a_positive_number(limit_s: float) -> None:
+    with pytest.raises(InputError, match="time_limit_s"):
+        Settings(time_limit_s=limit_s)
+
+
 def test_threads_share_the_cores_with_no_linear_algebra() -> None:
     def threads(_: int) -> set[int]:
         return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}

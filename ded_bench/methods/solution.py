@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from ded_bench.files.errors import InputError
 from ded_bench.methods.options import DEFAULT
 from ded_bench.problem.case import Case
 from ded_bench.problem.instance import Instance
@@ -38,13 +39,21 @@ class Solution:
 
 @dataclass(frozen=True)
 class Settings:
-    """How a method is run: its options, and what its answers may depend on besides."""
+    """How a method is run: its options, and what its answers may depend on besides.
+
+    Raises:
+        InputError: the time limit is no positive number.
+    """
 
     options: str = DEFAULT  # as `--set` takes them, see `methods.options`
     model: str = ""  # a surrogate's name or file; empty: the method's own choice
     policy: Path | None = None  # a policy's file; None: the trained one
     time_limit_s: float | None = None
     search: tuple[Path, ...] = ()  # folders where trained models and policies may lie
+
+    def __post_init__(self) -> None:
+        if self.time_limit_s is not None and not self.time_limit_s > 0.0:  # not a number is refused, too
+            raise InputError("settings", "time_limit_s", f"{self.time_limit_s} is no positive number")
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,9 @@ EXPLANATION = (
     "own reference.",
     "**Claimed → verified**: share of the instances on which the method says it succeeded, and on which the "
     "scorer finds every limit kept.",
-    "Times are medians, alone on one machine with one thread (`ded-bench bench`); memory is the most that "
-    "the method's process held, all that it imports included.",
+    "Times are medians, alone on the machine with one thread (`ded-bench bench`), and compare between grids "
+    "of one host only (see the end); memory is the most that the method's process held, all that it imports "
+    "included.",
 )
 
 

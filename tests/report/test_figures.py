@@ -86,4 +86,7 @@ def test_tradeoff_draws_a_point_per_line_hollow_if_infeasible(tmp_path: Path) ->
     assert [line.get_xydata().tolist() for line in hollow] == [[[1e-3, -0.02]]]
     assert [[18.8, 0.3]] in [line.get_xydata().tolist() for line in second.get_lines()]
     assert "every=1 *" in [text.get_text() for text in first.texts]
+    for ax in figure.axes:  # words keep off the axes' own numbers
+        for box in (word.get_window_extent() for word in ax.texts if word.get_text()):
+            assert ax.bbox.x0 <= box.x0 <= box.x1 <= ax.bbox.x1
     save_figure(figure, tmp_path / "figure.png")

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter
-from matplotlib.transforms import Bbox
+from matplotlib.transforms import Bbox, BboxBase
 
 from ded_bench.analysis.summary import title
 from ded_bench.methods.options import DEFAULT
@@ -103,7 +103,7 @@ def _word(ax: Axes, text: str, place: tuple[float, float], paint: str) -> None:
 
 
 def _keep_apart(ax: Axes) -> None:
-    """Put each word on the side of its point where it covers least of other words and points."""
+    """Put each word on the side of its point where it covers least of other words, points and the frame."""
     places = [ax.transData.transform(np.asarray(line.get_xydata())) for line in ax.get_lines()]
     taken = [Bbox.from_extents(x - 6, y - 6, x + 6, y + 6) for x, y in np.concatenate(places)]
     for word in (child for child in ax.texts if isinstance(child, Annotation) and child.get_text()):
@@ -112,8 +112,15 @@ def _keep_apart(ax: Axes) -> None:
             word.set(ha=side[0], va=side[1])
             word.xyann = side[2]
             boxes[side] = word.get_window_extent()
-        shared = {side: [Bbox.intersection(box, other) for other in taken] for side, box in boxes.items()}
-        ha, va, offset = min(SIDES, key=lambda side: sum(b.width * b.height for b in shared[side] if b))
+        covered = {side: sum(_shared(box, other) for other in taken) for side, box in boxes.items()}
+        beyond = {side: _shared(box, box) - _shared(box, ax.bbox) for side, box in boxes.items()}
+        ha, va, offset = min(SIDES, key=lambda side: covered[side] + beyond[side])
         word.set(ha=ha, va=va)
         word.xyann = offset
         taken.append(boxes[ha, va, offset])
+
+
+def _shared(one: BboxBase, other: BboxBase) -> float:
+    """Area that two boxes share."""
+    both = Bbox.intersection(one, other)
+    return float(both.width * both.height) if both else 0.0
